@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.run import check_daemon
-from daemon_bench import ENABLED, daemon_table, holding, ready_daemon, write_daemon
+from daemon_bench import ENABLED, holding, ready_daemon, write_daemon
 from model.errors import InputError
-from model.table.file import save_table
 from virtual_loop import in_virtual_time
 
 MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
@@ -71,17 +70,6 @@ def test_daemon_refuses_files_that_are_no_plain_data(
     assert time.process_time() - begin < MAX_TIME
     assert f"{tmp_path / role}{place}" in str(caught.value)
     assert not (tmp_path / "pickled").exists()
-
-
-def test_daemon_refuses_the_table_of_another_plate(tmp_path: Path) -> None:
-    """Of one that is 0.1 mm thinner."""
-    path, changes = tmp_path / "daemon.yaml", [("thickness: 1.5 mm", "thickness: 1.6 mm")]
-    save_table(daemon_table(), tmp_path / "table.npz")
-    write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n")
-    assert "3 frequencies" in check_daemon(path)
-    write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n", changes=changes)
-    with pytest.raises(InputError, match=r"table\.npz"):
-        check_daemon(path)
 
 
 @in_virtual_time

@@ -100,26 +100,6 @@ def test_faults_of_wiring_and_plate_are_told(
         assert likeliest["found"] == pytest.approx(0.9 * plate.plate.thickness, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ((), "--url"),
-        (("--url", PORT, "--measured", "measured.csv"), "--measured"),
-        (("--measured", "measured.csv", "--level", "0.1"), "--level"),
-        (("--url", PORT, "--yes", "--mesh", "8x6"), "--mesh"),
-        (("--url", PORT), "--yes"),
-        (("--url", PORT, "--yes", "--level", "0.5"), "--level"),
-        (("--url", f"other={PORT}", "--yes"), "--url"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_plays(
-    check: Check, plate: Rig, options: tuple[str, ...], words: str
-) -> None:
-    """Named by the option that is at fault."""
-    with pytest.raises(InputError, match=words):
-        check(*options, on=plate)
-
-
 def test_daemon_that_runs_keeps_its_amplifiers(check: Check, plate: Rig, tmp_path: Path) -> None:
     """Its file names the rig; refused while it holds its socket."""
     (tmp_path / "daemon.yaml").write_text("rig: rig.yaml\nsocket: d.sock\n")

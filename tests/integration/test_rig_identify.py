@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
-from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from rig_files import TWO_AMPLIFIERS, write_rig
+from rig_files import write_rig
 from typed_on_wire import PORT, typed_on_wire
 
 Identify = Callable[..., Result]
@@ -79,19 +78,3 @@ def test_plate_that_is_not_explained_is_refused_and_nothing_written(
     assert result.exit_code == 1
     assert (told["explained"], told["expected_contrast"], told["files"]) == (False, [], [])
     assert new.read_text() == before
-
-
-def test_bad_input_is_refused_before_anything_plays(tmp_path: Path, identify: Identify) -> None:
-    """Nobody said that the plate is free, same file, wrong ending, level, URL of no amplifier."""
-    rig, new = write_rig(tmp_path / "rig.yaml"), str(tmp_path / "rig2.yaml")
-    two = write_rig(tmp_path / "two.yaml", *TWO_AMPLIFIERS)
-    for file, words, options in (
-        (rig, "--yes", ("-o", new)),
-        (rig, "--output", ("-o", str(rig), "--yes")),
-        (rig, "--output|ending|yaml", ("-o", str(tmp_path / "x.npz"), "--yes")),
-        (rig, "--level", ("-o", new, "--yes", "--level", "0.5", "--url", PORT)),
-        (two, "--url", ("-o", new, "--yes", "--url", PORT)),
-    ):
-        with pytest.raises(InputError, match=words):
-            identify(file, *options)
-    assert not Path(new).exists()

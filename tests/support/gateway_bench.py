@@ -512,5 +512,6 @@ def frame(payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> bytes
 UNCONFIRMED = {
     "main": AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="read"),
     "side": AmplifierSilence(silence="may_play", may_play_for_s=0.2, cause="no reply"),
+    "rear": AmplifierSilence(silence="watchdog_elapsed", may_play_for_s=None, cause="lost"),
 }
-"""What a stop may leave: one amplifier of two is not confirmed silent."""
+"""What a stop may leave: one amplifier of three is confirmed silent."""

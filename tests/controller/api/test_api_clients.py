@@ -21,7 +21,7 @@ import controller
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
-from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError, event_line
+from controller.api.jsonrpc import ErrorCode, RpcError, event_line
 from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
@@ -320,23 +320,6 @@ def test_calls_end_within_the_timeout(tmp_path: Path) -> None:
             era.stop()
 
 
-def test_stop_names_the_amplifiers_that_are_not_silent(tmp_path: Path) -> None:
-    """Error 1006 as NotSilent, with what is known of every amplifier."""
-    amplifiers = {
-        "main": {"silence": "confirmed_silent", "may_play_for_s": None, "cause": "status read"},
-        "side": {"silence": "may_play", "may_play_for_s": 0.25, "cause": "no reply"},
-        "rear": {"silence": "watchdog_elapsed", "may_play_for_s": None, "cause": "link lost"},
-    }
-    error = {"code": 1006, "message": "-", "data": {"what": "-", "amplifiers": amplifiers}}
-    line = json.dumps({"jsonrpc": "2.0", "id": 1, "error": error}).encode() + b"\n"
-    with responding(tmp_path / "s", HELLO, line), Client.connect(tmp_path / "s") as era:
-        with pytest.raises(NotSilent, match=r"side.*0\.25 s.*rear") as caught:
-            era.stop()
-        assert caught.value.amplifiers["side"].may_play_for_s == 0.25
-        assert "main" not in str(caught.value)
-        assert caught.value.amplifiers.keys() == amplifiers.keys()
-
-
 def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
     """Before anything is sent, with the method, the key and the value."""
     with responding(tmp_path / "s", HELLO), Client.connect(tmp_path / "s") as era:
@@ -378,17 +361,6 @@ def test_peer_is_believed_only_as_root_caller_or_service(
         patch.setattr("os.geteuid", lambda: 1000)
         patch.setattr("pwd.getpwnam", lambda name: SimpleNamespace(pw_uid={"plate": 990}[name]))
         check_peer(Path("/run/x/era.sock"), connected, environment={"ERA_HAPTICS_USER": "plate"})
-
-
-async def test_connect_names_the_problem_of_a_path(tmp_path: Path) -> None:
-    """A file that is not a socket, and a socket of which no daemon listens; text or Path."""
-    (tmp_path / "rig.yaml").write_text("", encoding="utf-8")
-    with pytest.raises(Unreachable, match=r"rig\.yaml is not a socket"):
-        Client.connect(tmp_path / "rig.yaml")
-    with pytest.raises(Unreachable, match=r"nosuch\.sock; start one"):
-        Client.connect("nosuch.sock")
-    with pytest.raises(Unreachable, match=r"nosuch\.sock; start one"):
-        await AsyncClient.connect("nosuch.sock")
 
 
 def test_clients_use_the_socket_of_the_environment(

@@ -13,8 +13,7 @@ from controller.daemon.config_sections import DaemonSection
 from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
-from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
+from model.rig.file import example_rig_path
 from rig_files import TWO_AMPLIFIERS, write_rig
 
 RUNNER = CliRunner()
@@ -70,36 +69,6 @@ def test_config_paths_are_relative_to_its_folder(
     assert config.dump_folder == Path("/d")
 
 
-def test_config_reports_all_problems_at_once(folder: Path) -> None:
-    """Each with its line and key."""
-    path = written(
-        folder,
-        "tabel: x.npz\n"
-        "mode: loud\n"
-        "layout: none.yaml\n"
-        "touch:\n"
-        '  - {name: a, url: "tuioo:1"}\n'
-        '  - {name: a, url: "tuio:3333"}\n'
-        '  - {name: b, url: "tuio:3333", calibration: {turned: 45}}\n'
-        '  - {name: c, url: "tuio:3333", calibration: {mirror: x, matrix: [[1,0,0],[0,1,0]]}}\n'
-        "log: {level: loud}\n"
-        "dashboard: 0.0.0.0:80\n",
-        rig="rigg.yaml",
-    )
-    assert problems(path) == [
-        (1, "rig"),
-        (2, "tabel"),
-        (3, "mode"),
-        (4, "layout"),
-        (6, "touch[0].url"),
-        (7, "touch[1].name"),
-        (8, "touch[2].calibration.turned"),
-        (9, "touch[3].calibration.matrix"),
-        (10, "log.level"),
-        (11, "dashboard"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("rig", "more", "expected"),
     [
@@ -119,10 +88,35 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         ("rig.yaml", "learn: none/learned.npz\n", [(2, "learn")]),
         ("rig.yaml", "touch: 3\n", [(2, "touch")]),
         ("rig.yaml", "touch: [3]\n", [(2, "touch[0]")]),
+        (
+            "rigg.yaml",
+            "tabel: x.npz\n"
+            "mode: loud\n"
+            "layout: none.yaml\n"
+            "touch:\n"
+            '  - {name: a, url: "tuioo:1"}\n'
+            '  - {name: a, url: "tuio:3333"}\n'
+            '  - {name: b, url: "tuio:3333", calibration: {turned: 45}}\n'
+            '  - {name: c, url: "tuio:3333", calibration: {mirror: x, matrix: [[1,0,0],[0,1,0]]}}\n'
+            "log: {level: loud}\n"
+            "dashboard: 0.0.0.0:80\n",
+            [
+                (1, "rig"),
+                (2, "tabel"),
+                (3, "mode"),
+                (4, "layout"),
+                (6, "touch[0].url"),
+                (7, "touch[1].name"),
+                (8, "touch[2].calibration.turned"),
+                (9, "touch[3].calibration.matrix"),
+                (10, "log.level"),
+                (11, "dashboard"),
+            ],
+        ),
     ],
 )
 def test_config_refuses(folder: Path, rig: str, more: str, expected: list[tuple[int, str]]) -> None:
-    """Impossible paths, unknown amplifiers, the reserved name of clients, and wrong shapes."""
+    """Impossible paths, unknown amplifiers, reserved names, wrong shapes; all at once."""
     assert problems(written(folder, more, rig=rig)) == expected
 
 
@@ -132,32 +126,6 @@ def test_damaged_learned_file_starts_a_daemon(folder: Path, content: bytes) -> N
     (folder / "learned.npz").write_bytes(content)
     config = load_daemon_config(written(folder, "learn: learned.npz\n"))
     assert config.learn == folder / "learned.npz"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "place"),
-    [
-        ("1.5 mm", "1.5 kg", r"rig\.yaml:\d+: plate\.thickness"),
-        ("sim://", "serail:///dev/null", r"amplifiers\.main\.url .*serial://"),
-    ],
-)
-def test_config_reports_problems_of_rig_at_its_key(
-    folder: Path, old: str, new: str, place: str
-) -> None:
-    """With the place in the rig's file, and the URL that a misspelled one may have meant."""
-    text = (folder / "rig.yaml").read_text("utf-8")
-    (folder / "rig.yaml").write_text(text.replace(old, new), "utf-8")
-    with pytest.raises(ConfigError, match=place) as caught:
-        load_daemon_config(written(folder))
-    assert [(problem.line, problem.key) for problem in caught.value.problems] == [(1, "rig")]
-
-
-def test_config_refuses_rig_that_does_not_support_its_plate(folder: Path) -> None:
-    """A plate on two ERAs of one edge tips over; the problem is at the key that names the rig."""
-    rig = folder / "rig.yaml"
-    lines = rig.read_text("utf-8").splitlines(keepends=True)
-    rig.write_text("".join(line for line in lines if line[:5] not in ("  NE:", "  NW:")), "utf-8")
-    assert problems(written(folder)) == [(1, "rig")]
 
 
 @pytest.mark.parametrize("name", ["car_display", "table"])
@@ -174,38 +142,6 @@ def test_config_refuses_simulated_amplifiers_beside_others(tmp_path: Path) -> No
     """A plate is simulated as a whole or not at all."""
     write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS, ('side: {url: "sim://"}', SERIAL))
     assert problems(written(tmp_path)) == [(1, "rig")]
-
-
-@pytest.mark.parametrize(
-    ("text", "remedy"), [("plate: {}\neras: {}\n", "rig: FILE"), ("regions: {}\n", "layout: FILE")]
-)
-def test_config_refuses_another_kind_of_file(folder: Path, text: str, remedy: str) -> None:
-    """As a whole, not by each unknown key."""
-    path = folder / "daemon.yaml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=remedy) as caught:
-        load_daemon_config(path)
-    assert not isinstance(caught.value, ConfigError)
-
-
-@pytest.mark.parametrize(
-    ("text", "kind"), [("rig: r.yaml\n", "daemon"), ("regions: {}\n", "layout")]
-)
-def test_rig_refuses_another_kind_of_file(folder: Path, text: str, kind: str) -> None:
-    """As a whole, not by each unknown key."""
-    path = folder / "other.yaml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=f"must be a rig, got a {kind} file") as caught:
-        load_rig(path)
-    assert not isinstance(caught.value, ConfigError)
-
-
-def test_daemon_file_is_one_though_its_rig_is_misspelt(folder: Path) -> None:
-    """Its other keys tell, and the problems name the key that was meant."""
-    path = folder / "daemon.yaml"
-    path.write_text("rigg: rig.yaml\nlayout: l.yaml\n", encoding="utf-8")
-    checked = RUNNER.invoke(config_app, ["check", str(path)])
-    assert "did you mean rig?" in checked.output
 
 
 def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
@@ -228,24 +164,6 @@ def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
     assert a.apply(Touch(1, 0.0, 0.0)) == Touch(1, 1.0, 0.0)
     placed = c.apply(Touch(1, 0.0, 1.0))  # shown at the south-west corner
     assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
-
-
-@pytest.mark.parametrize(
-    ("calibration", "key"),
-    [
-        ("{points: [{shown: [0, 0], at: [0, 0]}]}", ".points"),
-        ("{turned: 90, points: [A, B, C]}", ""),
-        ("{points: [A, B, {shown: [0.2, 0.2], at: [0.2, 0.2]}]}", ""),  # on a line
-        ("{points: [A, B, C, {shown: [0.1, 0.2], at: [0.1, 0.1]}]}", ""),  # contradictory
-        ("{points: [A, B, {shown: [0.2 s, 0], at: [0, 0]}]}", ".points[2].shown[0]"),
-    ],
-)
-def test_calibration_by_points_refuses(folder: Path, calibration: str, key: str) -> None:
-    """Too few points, points on a line, contradictions, and other units than lengths."""
-    for name, x, y in (("A", 0, 0), ("B", 0.1, 0.1), ("C", 0.2, 0)):
-        calibration = calibration.replace(name, f"{{shown: [{x}, {y}], at: [{x}, {y}]}}")
-    text = f'touch: [{{name: a, url: "tuio:3333", calibration: {calibration}}}]\n'
-    assert problems(written(folder, text)) == [(2, f"touch[0].calibration{key}")]
 
 
 def test_default_socket_is_named_or_in_runtime_folder() -> None:

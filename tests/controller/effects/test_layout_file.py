@@ -14,20 +14,10 @@ from controller.effects.layout_file import LayoutSection, RegionSection, load_la
 from controller.effects.ramp import Ramp
 from controller.effects.texture import Texture
 from key_tables import key_rows
-from model.config.document import ConfigError
 from model.config.shapes import CircleSection, Rectangle, RectangleSection
-from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 
 EXAMPLE = Path(__file__).parents[3] / "controller" / "effects" / "example.yaml"
-
-
-def refused(path: Path, text: str) -> str:
-    """The error that a layout of the paper's plate gives."""
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
-        load_layout(path, load_rig(example_rig_path()).plate)
-    return str(caught.value)
 
 
 def test_load_layout_reads_the_example() -> None:
@@ -87,70 +77,6 @@ def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) ->
     layout = load_layout(path, load_rig(example_rig_path()).plate)
     found = [layout.region_at(x, 0.1) for x in (0.1, 0.15)]
     assert [region.name for region in found if region] == ["over", "under"]
-
-
-AT = "circle: {at: [0.1, 0.1], radius: 1 cm}"
-
-
-@pytest.mark.parametrize(
-    ("text", "place", "remedy"),
-    [
-        ("regions: {a: {on_press: buzz}}", "1: regions.a:", "rectangle, circle, polygon"),
-        ("regions:\n a: {circle: {at: [1, 0], radius: 1}}", "2: regions.a.circle:", "0.3048 m"),
-        (f"regions:\n a:\n  {AT}\n  on_press: tick", "4: regions.a.on_press:", "mean click?"),
-        ("effects: {c: {kind: silk}}", "1: effects.c.kind:", "buzz, click"),
-        ("effects: {c: {kind: click, durration: 1 s}}", "1: effects.c.durration:", "duration?"),
-        (f"regions: {{a: {{{AT}, on_move: buzz}}}}", "1: regions.a.on_move:", "on_press"),
-        (f"regions: {{a: {{{AT}, on_release: buzz}}}}", "1: regions.a.on_release:", "duration"),
-        ("effects: {c: {kind: texture, slow: 20 cm/s}}", "1: effects.c:", "0.2 m/s"),
-        ("region: {}", "1: region:", "regions?"),
-        ("effects: {c: {kind: click, band: [200, 100]}}", "1: effects.c:", "200 Hz"),
-        ("effects: {c: {kind: click, band: [9 Hz, 90 Hz]}}", "1: effects.c.band[0]:", "10 Hz"),
-        (
-            "effects: {c: {kind: click, band: [50, 90], frequency: 70}}",
-            "1: effects.c:",
-            "remove one",
-        ),
-        (f"regions: {{a: {{{AT}, frequency: 100}}}}", "1: regions.a.frequency:", "add an effect"),
-        (f"regions:\n a:\n  {AT}\n  own: true", "4: regions.a.own:", "add an effect"),
-        (f"regions: {{a: {{{AT}, level: 0}}}}", "1: regions.a.level:", "add an effect"),
-        (
-            f"regions: {{a: {{{AT}, on_press: buzz, own: true, may_share: true}}}}",
-            "1: regions.a.may_share:",
-            "remove one",
-        ),
-        ("effects: {dial: {}}\nelsewhere: dial", "2: elsewhere:", "on_move"),
-        (f"effects: {{dial: {{}}}}\nregions: {{a: {{{AT}, on_press: dial}}}}", "2: ", "on_move"),
-    ],
-)
-def test_load_layout_names_place_and_remedy(
-    tmp_path: Path, text: str, place: str, remedy: str
-) -> None:
-    """An invalid layout is refused with line, key and remedy."""
-    reported = refused(tmp_path / "layout.yaml", text)
-    assert f"layout.yaml:{place}" in reported
-    assert remedy in reported
-
-
-def test_load_layout_reports_all_problems_at_once(tmp_path: Path) -> None:
-    """Each problem has its key."""
-    reported = refused(
-        tmp_path / "layout.yaml",
-        "effects: {a: {kind: silk}, b: {kind: click, level: 90}}\n"
-        "regions: {c: {on_press: d}}\nelsewhere: e\n",
-    )
-    keys = ("effects.a.kind", "effects.b.level", "regions.c", "regions.c.on_press", "elsewhere")
-    assert [key for key in keys if f"{key}:" not in reported] == []
-
-
-@pytest.mark.parametrize("text", ["plate: {}\n", "rig: rig.yaml\n"])
-def test_load_layout_refuses_another_kind_of_file_as_a_whole(tmp_path: Path, text: str) -> None:
-    """The error names the command for a layout, and not every unknown key."""
-    path = tmp_path / "other.yaml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match="--kind layout") as caught:
-        load_layout(path, None)
-    assert "unknown key" not in str(caught.value)
 
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"

@@ -13,7 +13,7 @@ import pytest
 
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator import Estimator
-from controller.learning.messages import HEAD, Answers, Estimate, Note, Start, packed, unpacked
+from controller.learning.messages import Answers, Estimate, Note, Start, unpacked
 from controller.loop.loop import Controller
 from drivers.contents import Layer, Tone
 from model.errors import InputError
@@ -102,13 +102,6 @@ def test_answers_of_another_table_are_refused() -> None:
     in_use.replace(Answers(base.fingerprint, own, is_complete=False))
     in_use.reset()
     assert taken == [own, base]
-
-
-def test_message_has_its_length_before_it() -> None:
-    """Eight bytes, the largest first; then what it is made of again."""
-    message = packed([Note("the plate settles", is_final=True)])
-    assert int.from_bytes(message[:HEAD], "big") == len(message) - HEAD
-    assert unpacked(message[HEAD:]) == [Note("the plate settles", is_final=True)]
 
 
 def test_no_command_comes_by_a_message() -> None:

@@ -47,7 +47,6 @@ SLOWEST = (
     "test_diagnosis.py",
     "test_daemon_over_a_wire.py",
     "test_soak.py",
-    "test_daemon_faults_killed.py",
     "test_soft_amp_sound.py",
     "test_nothing_is_lost.py",
     "test_group_stops.py",
@@ -56,7 +55,6 @@ SLOWEST = (
     "test_quick_faults.py",
     "test_calibrate_on_the_bench.py",
     "test_identify.py",
-    "test_effects_felt.py",
     "test_consistency.py",
     "test_layout_check.py",
 )

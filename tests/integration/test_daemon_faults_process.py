@@ -1,4 +1,4 @@
-"""Faults of the daemon's process: paused, starved, no disk space or descriptors.
+"""`era daemon` as a process: commands, locks and children; paused, starved, full disks, killed.
 
 The far end runs in the test's process with the same clock, by which silence must be in time.
 """
@@ -15,12 +15,15 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import httpx
 import pytest
 
 import patient_daemon
+from controller.api.async_client import AsyncClient
 from controller.sources.touch import Touch, TouchFrame
-from daemon_bench import far_end, holding, until, until_state
+from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon
 from daemon_process import (
+    ERA,
     REACTION,
     WATCHDOG,
     Journal,
@@ -32,11 +35,94 @@ from daemon_process import (
     playing_daemon,
     plays_on,
     ready,
+    run_era,
     silent_from,
 )
 from examples.make_touches import tuio_datagram
+from kills import PLACES, kill_everywhere
 from sim.faults.fault_window import FaultWindow
 from tuio_messages import free_port, panel
+
+pytestmark = pytest.mark.real_time
+
+
+async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
+    """Exit status 2 with the process id of the first; at another socket it waits for the link."""
+    async with playing_daemon(tmp_path) as (daemon, era, _):
+        status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
+        assert status == 2
+        assert f"process {daemon.process.pid}" in err
+        text = (tmp_path / "daemon.yaml").read_text("utf-8")
+        (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
+        other = await asyncio.create_subprocess_exec(
+            *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
+        )
+        await until((tmp_path / "b.sock").is_socket)
+        async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
+            await until_state(waiting, "COMM_LOST")
+        other.terminate()
+        _, log = await other.communicate()
+        assert b"Traceback" not in log
+        assert (await era.status()).state == "OPERATION_ENABLED"
+        await until(lambda: any(daemon.far.summary().levels))
+
+
+async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
+    """In a library that looks at no signal, as one that waits for memory."""
+    stuck = (
+        "import ctypes, controller.daemon.run as daemon\nfrom controller.cli.main import main\n"
+        "def table(config):\n"
+        "    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)\n"
+        "    print(flush=True)\n"
+        "    lock(mutex), lock(mutex)\n"
+        "daemon._table = table\nmain()"
+    )
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", stuck, "daemon", write_daemon(tmp_path, {"main": "sim://"})),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    assert process.stdout is not None
+    assert await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+    process.terminate()
+    try:
+        assert await asyncio.wait_for(process.wait(), PATIENCE) == -signal.SIGTERM
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+
+
+def serves(port: int) -> bool:
+    """Whether connections are accepted."""
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
+
+
+async def page(port: int, path: str) -> str:
+    """Get a page."""
+    url = f"http://127.0.0.1:{port}{path}"
+    return (await asyncio.to_thread(httpx.get, url, timeout=PATIENCE)).text
+
+
+async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None:
+    """`--dashboard` prints the address of the page."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    async with far_end(tmp_path) as far:
+        options = ("--dashboard", f"127.0.0.1:{port}")
+        async with daemon_process(tmp_path, far, options=options) as daemon:
+            assert daemon.process.stdout is not None
+            line = await asyncio.wait_for(daemon.process.stdout.readline(), PATIENCE)
+            assert line.decode().startswith(f"dashboard: http://127.0.0.1:{port}/")
+            await until(lambda: serves(port))
+            assert "<html" in await page(port, "/")
+            while "era_up 1.0" not in (metrics := await page(port, "/metrics")):
+                assert "era_up 0.0" in metrics  # not connected to the daemon yet
+            daemon.process.kill()
+            await daemon.process.wait()
+            await until(lambda: not serves(port))
+
 
 pytestmark = pytest.mark.real_time
 
@@ -183,3 +269,23 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
         await plays_on("descriptors again", daemon, era, journal)
         async with await daemon.client() as other:
             await other.stop()
+
+
+pytestmark = pytest.mark.real_time
+
+KILLS = 8  # `make kill-test` takes two hundred
+
+
+async def test_channels_are_silent_in_time_when_daemon_is_killed() -> None:
+    """At most 255 ms after the last sign of life by the amplifier's own clock, and for good.
+
+    SIGKILL while starting, armed, playing or stopping; nothing arrives but what was on the wire,
+    and the next daemon at the same amplifiers requires an acknowledgement, then plays.
+    """
+    kills = await kill_everywhere(KILLS, seed=4, serial=1 / 3)
+    assert len(kills) == KILLS
+    assert {kill.wire for kill in kills} == {name for name, _, _ in PLACES}
+    assert not [kill for kill in kills if not kill.is_good]
+    # The test is void unless many were energised, and some of them audibly.
+    assert sum(kill.energised > 0 for kill in kills) >= KILLS // 3
+    assert any(kill.level > 0 for kill in kills)

@@ -1,13 +1,14 @@
-"""Several fingers on the paper's plate in virtual time, over a serial line, and what was sent."""
+"""Fingers on a layout in virtual time: real bytes on a wire, a plate in time, what is felt."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from types import MappingProxyType
 
 import numpy as np
+import pytest
 
 from chain import Chain, Position
 from committed_sets import CommittedSets
@@ -15,13 +16,18 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.observer import Applied
+from drivers import clock
+from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
+from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_table import smooth_rig
 from rig_on_wire import after_each
 from sim.far_ends.wires import Wire
+from virtual_loop import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 """Places on the paper's plate, 11 to 23 cm apart."""
@@ -59,26 +65,50 @@ class Fingers(Chain):
         self.committed = sets.all
         after_each(self.far.device, sets.note)
 
-    def contrasts(self, *, over: float = 0.25) -> Mapping[int, float]:
-        """Level of each finger's content over all others there [dB], of the last seconds.
+    def reached(
+        self, *, over: float = 0.25
+    ) -> Iterator[tuple[int, FloatArray, FloatArray, FloatArray]]:
+        """By finger weights (p,) of its points, amplitudes (f, p) of its own tones, and of others.
 
-        By the frequencies that are reported for the fingers, and the amplitudes at their tips; as
-        the table defines it: mean of the own tone over the tip, over the loudest point of the rest.
+        Of the last seconds, over threshold; its own are of the frequency reported for it.
         """
         now, bench = asyncio.get_running_loop().time(), self.far.bench
         bench.advance(now)
-        own = {each.contact.key.id: each.frequency for each in self.applied[-1].targets}
-        found = {}
+        targets = self.applied[-1].targets if self.applied else ()
+        own = {each.contact.key.id: each.frequency for each in targets}
         for name, felt in bench.felt(now - over, now).items():
-            frequency = own.get(int(name))
             thresholds = detection_threshold(np.array(felt.frequencies), bench.rig.threshold)
             amplitudes = felt.amplitude / thresholds[:, None]
-            is_own = np.isclose(felt.frequencies, frequency or 0.0, atol=0.2)
-            if is_own.sum() == 1 and len(felt.frequencies) > 1:
-                others = np.sqrt((amplitudes[~is_own] ** 2).sum(axis=0)).max()
-                level = float((amplitudes[is_own][0] * felt.weights).sum() / felt.weights.sum())
-                found[int(name)] = 20 * np.log10(level / others)
-        return found
+            is_own = np.isclose(felt.frequencies, own.get(int(name)) or 0.0, atol=0.2)
+            yield int(name), felt.weights, amplitudes[is_own], amplitudes[~is_own]
+
+    def contrasts(self, *, over: float = 0.25) -> Mapping[int, float]:
+        """Level of each finger's content over all others there [dB], of the last seconds.
+
+        As the table defines it: mean of the own tone over the tip, over the loudest point of the
+        rest.
+        """
+        return {
+            id: _db((own[0] @ weights / weights.sum()) ** 2) - _loudest(others)
+            for id, weights, own, others in self.reached(over=over)
+            if len(own) == 1 and len(others)
+        }
+
+    def levels_db_sl(self, *, foreign: bool = False) -> Mapping[int, float]:
+        """Level [dB SL] at each finger's loudest point; foreign: of what is not its own alone."""
+        return {
+            id: _loudest(others if foreign else np.concatenate([own, others]))
+            for id, _, own, others in self.reached()
+        }
+
+
+def _loudest(amplitudes: FloatArray) -> float:
+    """Level [dB SL] of tones (f, p) at the loudest point, -90 if there are none."""
+    return _db((amplitudes**2).sum(axis=0).max(initial=1e-9))
+
+
+def _db(power: float) -> float:
+    return float(10 * np.log10(power))
 
 
 @asynccontextmanager
@@ -108,3 +138,143 @@ async def fingers_on(
         fingers.at = {**at}
         await fingers.hold(held)
         yield fingers
+
+
+WIRES = {
+    "serial": Wire("serial", speed=921_600, unpluggable=True),
+    "modbus-rtu": Wire("modbus-rtu", speed=115_200, unpluggable=True),
+    "modbus-tcp": Wire("modbus-tcp"),
+    "socketcand": Wire("socketcand", speed=500_000),
+}
+"""Wires at their default speeds."""
+
+_LEAST_PAUSE, _PAUSE_STEP = 0.1, 0.0137  # s; between presses, at another phase of heartbeats
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What a finger feels from one start of a vibration on.
+
+    delay [s]: after the finger came down; applied: its report; accelerations (n, p) [m/s²];
+    weights (p,) of the points in the mean over the fingertip; threshold: name of the rig's set.
+    """
+
+    delay: float
+    applied: Applied
+    accelerations: FloatArray
+    weights: FloatArray
+    sample_rate: float
+    threshold: str
+
+    @property
+    def promised_db_sl(self) -> float:
+        """The level that the controller reported."""
+        (prediction,) = self.applied.targets
+        return prediction.level_db_sl
+
+    @property
+    def frequency(self) -> float:
+        """The only frequency that plays [Hz]."""
+        (frequency,) = {tone.frequency for tone in self.applied.pattern.excitation.values()}
+        return frequency
+
+    def level_db_sl(self, duration: float, *, since: float = 0.0) -> float:
+        """Level of the rms over a part of it [s], mean over the fingertip's points."""
+        first, last = round(since * self.sample_rate), round((since + duration) * self.sample_rate)
+        rms = np.sqrt((self.accelerations[first:last] ** 2).mean(axis=0))
+        threshold = detection_threshold(np.array(self.frequency), self.threshold)
+        return float(20 * np.log10(np.sqrt(2) * rms @ self.weights / threshold))
+
+
+@dataclass
+class Pressed:
+    """A layout on a rig and its table behind a wire; along plain ramps unless it is shaped."""
+
+    rig: Rig
+    table: LocalizationTable
+    layout: SurfaceLayout
+    wire: str
+    resting: Sequence[Position] = ()
+    is_shaped: bool = True
+
+    def press(self, *ways: Callable[[float], Position], held: float = 0.15) -> list[list[Felt]]:
+        """Press for a time [s] along each way, the position [m] by the time since the press.
+
+        Returns what starts at each press, each up to where the finger moves on.
+        """
+        with pytest.MonkeyPatch.context() as patched:
+            if not self.is_shaped:
+                plain = "controller.loop.capabilities.envelope_support"
+                patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
+            return run_virtual(self._run(ways, held))
+
+    async def _run(
+        self, ways: Sequence[Callable[[float], Position]], held: float
+    ) -> list[list[Felt]]:
+        source, timing = EffectPlayer(self.layout), Timing(self.table)
+        felt = []
+        async with _Starts.armed(
+            WIRES[self.wire], self.rig, self.table, intent_source=source, timing=timing
+        ) as chain:
+            chain.must_be_felt = False
+            chain.at = dict(enumerate(self.resting))
+            await chain.hold(0.5)
+            for number, way in enumerate(ways, start=1):
+                felt.append(await chain.press(100 + number, way, held))
+                await chain.hold(_LEAST_PAUSE + _PAUSE_STEP * number)
+        return felt
+
+
+@dataclass
+class _Starts(Chain):
+    """A chain of which every start of a vibration is known."""
+
+    starts: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Note when a tone starts."""
+        amplifier = self.far.amplifier
+
+        def note(*_: object) -> None:
+            tones = [tone for each in amplifier.outputs for tone in each]
+            origins = {tone.origin for tone in tones if tone.transition.last}
+            self.starts += sorted(origins - {*self.starts})
+
+        after_each(self.far.device, note)
+
+    async def press(self, id: int, way: Callable[[float], Position], held: float) -> list[Felt]:
+        """Press once; records end where the finger moves."""
+        self.starts.clear()
+        self.applied.clear()
+        felt, touched = list[Felt](), clock.now()
+
+        def move(since: float) -> None:
+            if self.at.get(id) not in (None, way(since)):
+                felt.extend(self._harvest(str(id), touched))
+            self.at[id] = way(since)
+
+        await self.hold(held, move)
+        felt += self._harvest(str(id), touched)
+        del self.at[id]
+        return felt
+
+    def _harvest(self, finger: str, touched: float) -> list[Felt]:
+        """What the finger has felt at its last position."""
+        now, bench, felt = clock.now(), self.far.bench, list[Felt]()
+        bench.advance(now)
+        for start in self.starts:
+            applied = min(self.applied, key=lambda each: abs(each.time - start))
+            record = bench.fingers.felt(start, now)[finger]
+            felt.append(
+                Felt(
+                    start - touched,
+                    applied,
+                    record.accelerations[record.times > start],
+                    record.weights,
+                    bench.sample_rate,
+                    bench.rig.threshold,
+                )
+            )
+        self.starts.clear()
+        self.applied.clear()
+        return felt

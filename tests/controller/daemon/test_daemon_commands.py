@@ -145,6 +145,6 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
         daemon.silence = UNCONFIRMED
         assert run(command, modules) == 3
         errors = capsys.readouterr().err
-        assert re.search(r"side.*0\.2 s.*rear", errors)
+        assert re.search(r"side .*0\.20 s.*rear", errors)
         assert "main" not in errors
     assert run(command, modules) == 3

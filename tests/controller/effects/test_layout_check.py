@@ -1,8 +1,9 @@
-"""`era layout check`: how a layout will feel, against the plate in time behind a wire."""
+"""How a layout will feel: by its check and by reports, against the plate in time behind wires."""
 
 import json
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,14 @@ from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.texture import Texture
+from long_form import in_turn
 from model.config.shapes import Circle, Rectangle
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
-from pressed_layout import Pressed
+from several_fingers import WIRES, Felt, Pressed
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -216,3 +218,67 @@ def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
     (row,) = (line.split() for line in output.splitlines() if line.startswith(" 2 strip"))
     assert float(row[2]) > 0
     assert row[3] == "-"
+
+
+PRESSES = {"modbus-rtu": 6}
+"""Equal presses, each at another phase of the heartbeats; on the other wires `FEW`."""
+FEW = 3
+PLACE, CENTRE = (0.09, 0.07), (0.09, 0.10)
+Way = Callable[[float], tuple[float, float]]
+
+
+def rest(since: float) -> tuple[float, float]:
+    """A finger that stays where it came down."""
+    return PLACE
+
+
+def step(since: float) -> tuple[float, float]:
+    """A finger that moves by 8 mm after a tenth of a second."""
+    return (PLACE[0] + (0.008 if since > 0.1 else 0.0), PLACE[1])
+
+
+@dataclass(frozen=True)
+class Case:
+    """An effect and over which part of it [s] its level is felt, and the way of the finger."""
+
+    effect: Effect
+    duration: float
+    since: float = 0.0
+    way: Way = rest
+    held: float = 0.15
+
+
+CASES = {
+    "short click": Case(Click(duration=0.020), 0.020),
+    "click": Case(Click(), 0.040),
+    "long click": Case(Click(duration=0.120, level=14.0), 0.120, held=0.2),
+    "short buzz": Case(Buzz(duration=0.300, level=16.0), 0.300, held=0.4),
+    "buzz": Case(Buzz(), 0.1, since=0.3, held=0.42),
+    "ramp": Case(Ramp(start_level=14.0, duration=0.4), 0.08, since=0.32, held=0.42),
+    "detents": Case(Detents(), 0.030, way=step, held=0.2),
+    "dial": Case(Dial(), 0.030, way=step, held=0.2),
+}
+
+
+@cache
+def pressed(case: Case, wire: str) -> list[Felt]:
+    """What equal presses feel."""
+    where = "on_move" if case.effect.is_for_motion else "on_press"
+    region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
+    layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
+    chain = Pressed(smooth_rig(), table(), layout, wire)
+    presses = chain.press(*[case.way] * PRESSES.get(wire, FEW), held=case.held)
+    assert all(len(each) == 1 for each in presses)
+    return [felt for (felt,) in presses]
+
+
+@pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
+def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
+    """Within 3 dB of what layout and report promise, all presses within 2 dB, on the plate."""
+    case = CASES[name]
+    presses = pressed(case, wire)
+    levels = [felt.level_db_sl(case.duration, since=case.since) for felt in presses]
+    assert levels == pytest.approx([case.effect.level] * len(presses), abs=3.0)
+    if name != "ramp":  # which reports each of its steps
+        assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
+    assert max(levels) - min(levels) <= 2.0

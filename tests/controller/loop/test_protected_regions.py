@@ -1,9 +1,8 @@
-"""Regions whose fingers feel their own or nothing, and regions where others are not noticed."""
+"""What reaches fingers that it is not for: regions where others are not noticed, and leaks."""
 
-import asyncio
+import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from controller.daemon.api_views import PlateView
@@ -11,8 +10,8 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
+from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Rectangle
-from model.finger.perception import detection_threshold
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
 
@@ -28,17 +27,6 @@ LAYOUT = SurfaceLayout(
 )
 
 
-def levels_at(fingers: Fingers, id: int) -> float:
-    """Level [dB SL] of all tones at the loudest point of a finger over the last quarter second."""
-    now = asyncio.get_running_loop().time()
-    bench = fingers.far.bench
-    bench.advance(now)
-    felt = bench.felt(now - 0.25, now)[str(id)]
-    thresholds = detection_threshold(np.array(felt.frequencies), bench.rig.threshold)
-    power = ((felt.amplitude / thresholds[:, None]) ** 2).sum(axis=0)
-    return float(10 * np.log10(max(power.max(initial=0), 1e-9)))
-
-
 @in_virtual_time
 async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
     """Both contents are silent while it rests, each with its reason, and play once it has lifted.
@@ -48,7 +36,7 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
     async with fingers_on(
         table(), LAYOUT, breaks="touch", at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
     ) as fingers:
-        assert levels_at(fingers, 3) < -10
+        assert fingers.levels_db_sl()[3] < -10
         silenced = fingers.silenced[-1]
         assert {each.contact.key.id for each in silenced.targets} == {1, 2}
         view = PlateView(lambda key: "effect", silenced.contacts, silenced=silenced)
@@ -58,10 +46,10 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
         del fingers.at[3]
         await fingers.hold(1.0)
         assert {each.contact.key.id for each in fingers.applied[-1].targets} == {1, 2}
-        assert levels_at(fingers, 1) > 14
+        assert fingers.levels_db_sl()[1] > 14
         fingers.at[3] = ABOVE
         await fingers.hold(1.0)
-        assert levels_at(fingers, 3) < -10
+        assert fingers.levels_db_sl()[3] < -10
 
 
 @pytest.mark.parametrize(
@@ -76,11 +64,11 @@ async def test_one_content_beside_a_protected_finger(effect: Buzz | Click, is_pl
         fingers.at[1] = LEFT
         await fingers.hold(1.0)
         assert bool(fingers.applied) is is_played
-        assert levels_at(fingers, 3) < -10
+        assert fingers.levels_db_sl()[3] < -10
         if is_played:
             (applied,) = fingers.applied
             (quiet,) = applied.quiet_levels.values()
-            assert levels_at(fingers, 3) < quiet < -10
+            assert fingers.levels_db_sl()[3] < quiet < -10
 
 
 @in_virtual_time
@@ -93,7 +81,7 @@ async def test_a_protected_finger_feels_its_own_effect() -> None:
     ) as fingers:
         verdicts = {each.contact.key.id: each.verdict for each in fingers.applied[-1].targets}
         assert verdicts == {1: "held back", 3: "own"}
-        assert levels_at(fingers, 3) > 12
+        assert fingers.levels_db_sl()[3] > 12
 
 
 @in_virtual_time
@@ -129,3 +117,66 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
         assert (first.verdict, first.effect, first.feels) == ("shared", "left", "right")
         assert (second.effect, second.feels) == ("right", "right")
         assert first.frequency_hz == second.frequency_hz
+
+
+LEAKING = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="right"),
+    ),
+    {"left": Buzz(level=14.0), "right": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+def statuses(fingers: Fingers) -> dict[int, float]:
+    """What the status says that leaks to each finger [dB SL]."""
+    contacts = tuple(
+        Contact(ContactKey("panel", id), *at, since=0.0) for id, at in fingers.at.items()
+    )
+    view = PlateView(lambda key: None, contacts, fingers.applied[-1])
+    found = {each.id: each.leak_db_sl for each in view.statuses_now(table())}
+    return {id: -math.inf if level is None else level for id, level in found.items()}
+
+
+@in_virtual_time
+async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
+    """By less than 8 mm no weights change: within a decibel of what is measured there."""
+    async with fingers_on(table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2) as fingers:
+        rested = statuses(fingers)
+        assert rested == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
+        count = len(fingers.applied)
+        fingers.at[3] = (ABOVE[0] + 0.0055, ABOVE[1] - 0.0055)
+        await fingers.hold(1.2)
+        assert len(fingers.applied) == count
+        moved = statuses(fingers)
+        assert moved == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
+        assert moved[3] > rested[3]
+
+
+@in_virtual_time
+async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
+    """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""
+    async with fingers_on(table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0) as fingers:
+        rested, count = statuses(fingers)[3], len(fingers.applied)
+        on_the_way = []
+
+        def way(since: float) -> None:
+            on_the_way.append(statuses(fingers)[3])
+            fingers.at[3] = (ABOVE[0] + 0.5 * since, ABOVE[1])
+
+        await fingers.hold(0.2, way)
+        changes = [each.time for each in fingers.applied[count:]]
+        assert 4 <= len(changes) <= 0.2 / 0.017 + 1
+        await fingers.hold(1.0)
+        assert statuses(fingers)[3] == pytest.approx(fingers.levels_db_sl(foreign=True)[3], abs=1.0)
+        assert max(on_the_way) > rested
+        assert statuses(fingers)[3] < max(on_the_way)
+
+
+@in_virtual_time
+async def test_nothing_leaks_without_fingers() -> None:
+    """The status is read when the last has lifted and its silence is not confirmed yet."""
+    async with fingers_on(table(), LEAKING, at={1: LEFT}, held=0.3) as fingers:
+        view = PlateView(lambda key: None, (), fingers.applied[-1])
+        assert view.statuses_now(table()) == []

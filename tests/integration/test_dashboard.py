@@ -148,12 +148,6 @@ async def arm(page: Page, era: Client) -> None:
     await page.until(f"{STATE} === 'OPERATION_ENABLED'")
 
 
-async def test_daemon_behind_the_page_waits_for_a_busy_machine(era: Client) -> None:
-    """Its amplifiers wait for heartbeats as long as it does: else a stall is a fault."""
-    await until_state(era, READY)
-    assert era.status().watchdog_s == patient_daemon.WATCHDOG
-
-
 async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     """ERAs, regions, the banner of a simulation, the amplifier; all requests go to the gateway."""
     assert await page.evaluate(REASON) == "simulated"

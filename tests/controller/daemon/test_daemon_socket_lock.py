@@ -3,8 +3,6 @@
 import errno
 import os
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -77,19 +75,6 @@ def test_socket_is_shared_with_group_of_its_folder(tmp_path: Path, folder: int, 
     lock.release()
 
 
-def test_socket_lock_refuses_second_daemon(tmp_path: Path) -> None:
-    """The error names the process of the first; another socket in the same folder is free."""
-    first = SocketLock(tmp_path / "a.sock")
-    with first.bind():
-        with pytest.raises(InputError, match=rf"process {os.getpid()}\b"):
-            SocketLock(first.path)
-        other = SocketLock(tmp_path / "b.sock")
-        other.bind().close()
-        other.release()
-        assert first.path.is_socket()
-    first.release()
-
-
 def test_socket_lock_says_that_a_file_system_has_no_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,22 +106,6 @@ def test_socket_lock_cannot_be_prepared_by_others(
             monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     with pytest.raises(InputError, match=str(lock)):
         SocketLock(tmp_path / "era.sock")
-
-
-def test_socket_of_killed_daemon_is_replaced(tmp_path: Path) -> None:
-    """The kernel releases the lock with its process; the socket's file is left behind."""
-    path = tmp_path / "era.sock"
-    script = (
-        "import os, sys; from pathlib import Path; "
-        "from controller.daemon.socket_lock import SocketLock; "
-        "lock = SocketLock(Path(sys.argv[1])); lock.bind(); os.kill(os.getpid(), 9)"
-    )
-    done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
-    assert done.returncode == -9
-    assert path.is_socket()
-    lock = SocketLock(path)
-    lock.bind().close()
-    lock.release()
 
 
 def test_socket_lock_refuses_folder_that_others_can_write(tmp_path: Path) -> None:

@@ -411,27 +411,23 @@ def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> 
 
 def test_requested_effect_restarts_when_requested_again() -> None:
     """An effect without an end, requested a thousand times, runs once."""
-    felt = 0
+    felt: list[float] = []
 
-    class Felt(EffectRun):
-        """Counts."""
-
-        def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
-            nonlocal felt
-            felt += 1
-            return Sensation(20.0)
-
-    class Endless(Buzz):
-        """Never ends."""
+    class Endless(Buzz, EffectRun):
+        """Never ends, and notes when it is felt."""
 
         def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-            return Felt()
+            return self
+
+        def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+            felt.append(now)
+            return Sensation(20.0)
 
     player = EffectPlayer(SurfaceLayout(effects={"hum": Endless()}, elsewhere=None))
     for number in range(1000):
         player.play("hum", finger(1), 0.001 * number, level_db_sl=None)
     player.intent([finger(1)], 2.0)
-    assert felt == 1
+    assert felt == [2.0]
 
 
 @given(

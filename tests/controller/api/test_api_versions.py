@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
+from controller.api.connection import Connection
 from controller.api.methods import METHODS
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
@@ -32,40 +34,18 @@ def with_extra_keys(content: Any, mapping_depth: int = 0) -> Any:
     return later | {"extra": [{"of": "later"}]}
 
 
-@contextlib.asynccontextmanager
-async def relay(
-    daemon: Path, path: Path, change: Callable[[dict[str, Any]], object]
-) -> AsyncIterator[None]:
-    """A second socket of a daemon, on which all its output is changed."""
-    under_way: set[asyncio.Task[None]] = set()
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        daemon_reader, daemon_writer = await asyncio.open_unix_connection(daemon, limit=1 << 20)
-
-        async def forth() -> None:
-            with contextlib.suppress(ConnectionError), contextlib.closing(daemon_writer):
-                while data := await reader.read(1 << 16):
-                    daemon_writer.write(data)
-
-        async def back() -> None:
-            with contextlib.suppress(ConnectionError), contextlib.closing(writer):
-                while line := await daemon_reader.readline():
-                    writer.write(json.dumps(change(json.loads(line))).encode() + b"\n")
-
-        under_way.update((asyncio.create_task(forth()), asyncio.create_task(back())))
-
-    server = await asyncio.start_unix_server(serve, path)
-    try:
-        yield
-    finally:
-        server.close()
-        for task in under_way:
-            task.cancel()
-        await asyncio.gather(*under_way, return_exceptions=True)
-
-
-async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -> None:
+async def test_extra_keys_of_a_later_minor_version_are_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In results and notifications at every depth: by both clients and by the gateway."""
+    made = Connection.connection_made
+
+    def speak_later(connection: Connection, transport: Any) -> None:
+        write = transport.write
+        transport.write = lambda line: write(
+            json.dumps(with_extra_keys(json.loads(line))).encode() + b"\n"
+        )
+        made(connection, transport)
 
     def use(path: Path) -> list[str]:
         with Client.connect(path) as era:
@@ -74,12 +54,12 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
             era.effects()
             return seen
 
-    later = tmp_path / "later.sock"
-    async with running_daemon(tmp_path) as bench, relay(bench.socket, later, with_extra_keys):
-        async with await AsyncClient.connect(later) as era:
+    monkeypatch.setattr(Connection, "connection_made", speak_later)
+    async with running_daemon(tmp_path) as bench:
+        async with await AsyncClient.connect(bench.socket) as era:
             await until_state(era, READY)
-            assert await asyncio.to_thread(use, later) == [READY, "state"]
-            field = DrawnField(later)
+            assert await asyncio.to_thread(use, bench.socket) == [READY, "state"]
+            field = DrawnField(bench.socket)
             drawing = asyncio.create_task(field.run())
             empty = await field.newer_than(None)
             await era.subscribe("pattern")

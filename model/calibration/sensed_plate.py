@@ -4,7 +4,6 @@ The forward model of an identification (`model.identification.forward`) with mod
 of the plate, and stiffness, damping and bolt mass of each ERA. The free plate is solved once.
 """
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,29 +12,12 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import FORM, KINDS, Space, space_of
+from model.identification.parameters import VALUE_UNITS, space_by_sheets
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import damping_from_ratio
 
-# Prior standard deviations: data sheets give moduli, thicknesses and springs, and little on losses.
-_MODULUS_STD = 0.07  # of its logarithm
-_STIFFNESS_STD = 0.10  # of its logarithm
-_LOSS_STD, _MIN_LOSS_STD = 0.7, 0.003  # of itself, and at least
-_DAMPING_STD, _MIN_DAMPING_RATIO_STD = 0.7, 0.015
-_BOLT_STD = 0.05  # of the plate's mass that an ERA carries
-_MODE_SHIFT = 0.003  # of an eigenvalue: theory and mesh
-_GAIN_STD, _MAX_GAIN = 1.0, 8.0  # of the logarithm of a channel's gain
 _LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
-_UNITS = {
-    "modulus": "Pa",
-    "loss_factor": "",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "bolt_mass": "kg",
-}
 STARTS = [
     (modulus, stiffness)
     for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
@@ -61,7 +43,7 @@ class Parameter:
     @property
     def unit(self) -> str:
         """Unit of its value."""
-        return _UNITS[self.kind]
+        return VALUE_UNITS[self.kind]
 
     @property
     def is_factor(self) -> bool:
@@ -119,7 +101,8 @@ class SensedPlate:
             highest = _HIGHEST * self.model.frequencies.max()
             lowest = _LOWEST * rig.plate.lowest_bending_frequency
             shifting = int(((natural > lowest) & (natural < highest)).sum())
-        space = _space(rig, tuple(sensor.name for sensor in self.model.sensors), shifting)
+        names = [sensor.name for sensor in self.model.sensors]
+        space = space_by_sheets(rig, names, shifting)
         eras = tuple(replace(era, gains=()) for era in rig.eras)
         return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
 
@@ -167,43 +150,5 @@ def sensed_plate(
     sensors = [Sensor(f"sensor {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = reduced_modes(rig, free) if has_form else None
-    space = _space(rig, (), None)
+    space = space_by_sheets(rig, (), None)
     return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
-
-
-def _space(rig: Rig, sensors: tuple[str, ...], form_modes: int | None) -> Space:
-    """A space with priors of a plate that was not measured, all else known but form errors."""
-    plate, count = rig.plate, len(rig.eras)
-    space = space_of(
-        rig,
-        sensors,
-        Uncertainty.none(),
-        mode_count=form_modes or 0,
-        form_of=None if form_modes is None else len(sensors),
-    )
-    share, loss = plate.mass / count, plate.loss_factor
-    damping, bolt = np.array([(era.damping, era.bolt_mass) for era in rig.eras]).T
-    # Bounds and deviations are relative to the mass that an ERA carries.
-    unit = np.array(
-        [
-            damping_from_ratio(1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=count)
-            for era in rig.eras
-        ]
-    )
-    kinds = {
-        "modulus": (_MODULUS_STD, -math.log(3.0), math.log(3.0)),
-        "stiffness": (_STIFFNESS_STD, -math.log(10.0), math.log(10.0)),
-        "loss_added": (max(_LOSS_STD * loss, _MIN_LOSS_STD), -loss, max(0.5 - loss, loss)),
-        "damping_added": (
-            np.maximum(_DAMPING_STD * damping, _MIN_DAMPING_RATIO_STD * unit),
-            -damping,
-            np.maximum(2 * unit - damping, damping),
-        ),
-        "bolt_mass": (_BOLT_STD * share, -bolt, np.maximum(5 * share - bolt, bolt)),
-        "gain": (_GAIN_STD, -_MAX_GAIN, _MAX_GAIN),
-    }
-    if form_modes is not None:
-        # Places may leave the plate, whose shapes go on by their slopes.
-        kinds |= {kind: (KINDS[kind].std, -np.inf, np.inf) for kind in (*FORM, "place")}
-        kinds["mode_shifts"] = (_MODE_SHIFT, -np.inf, np.inf)
-    return space.knowing_all_but(kinds)

@@ -20,6 +20,7 @@ from model.calibration.variable_projection import modal_assurance
 from model.choice import best_by, ranked_by
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
+from model.identification.parameters import VALUE_UNITS
 from model.rig.rig import Rig
 from model.spectral.mesh import stretched
 from model.structure.attachments import Era
@@ -42,10 +43,14 @@ class Cause:
     """
 
     key: str
-    unit: str
     what: str
     factors: tuple[float, ...]
     era: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Unit of its value."""
+        return VALUE_UNITS[self.what]
 
     @property
     def is_geometry(self) -> bool:
@@ -105,15 +110,15 @@ def causes_of(rig: Rig) -> list[Cause]:
     """Causes that are tried."""
     moduli = tuple(size**2 for size in _SIZES)
     return [
-        Cause("plate.thickness", "m", "thickness", _SIZES),
-        Cause("plate.length", "m", "length", _SIZES),
-        Cause("plate.width", "m", "width", _SIZES),
-        Cause("plate.material.E", "Pa", "modulus", moduli),
-        Cause("plate.loss_factor", "", "loss_factor", _LOSSES),
-        Cause("eras.stiffness", "N/m", "stiffness", _STIFFNESSES),
-        Cause("eras.bolt_mass", "kg", "bolt_mass", _MASSES),
+        Cause("plate.thickness", "thickness", _SIZES),
+        Cause("plate.length", "length", _SIZES),
+        Cause("plate.width", "width", _SIZES),
+        Cause("plate.material.E", "modulus", moduli),
+        Cause("plate.loss_factor", "loss_factor", _LOSSES),
+        Cause("eras.stiffness", "stiffness", _STIFFNESSES),
+        Cause("eras.bolt_mass", "bolt_mass", _MASSES),
         *(
-            Cause(f"eras.{era.name}.stiffness", "N/m", "stiffness", _STIFFNESSES, era.name)
+            Cause(f"eras.{era.name}.stiffness", "stiffness", _STIFFNESSES, era.name)
             for era in rig.eras
         ),
     ]

@@ -1,7 +1,7 @@
 """The vector of parameters x, in prior standard deviations, and the values that it stands for."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -13,6 +13,7 @@ from model.arrays import FloatArray
 from model.identification.form_errors import MASS_CELLS
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import damping_from_ratio
 from model.structure.plate import MAX_LOSS_EXPONENT
 
 MODE_SHIFTS = 12
@@ -30,7 +31,9 @@ class Kind:
     per_unit: how reports write it, for people and for programs, and how many of it are one in
     `Values`: by default per cent of logarithms; drift: how far it walks in an hour in service,
     drifts_to: how uncertain it becomes at most, by default as before it was measured; theory: what
-    another theory of the plate changes in values that are fitted to it.
+    another theory of the plate changes in values that are fitted to it. sheet, most: standard
+    deviation where data sheets alone describe a plate, by default std, and the largest deviation;
+    own_share: of what is added to a rig's value, that std in shares of the value where it is more.
     """
 
     std: float
@@ -40,6 +43,9 @@ class Kind:
     drift: float = 0.0
     drifts_to: float = 0.0
     theory: float = 0.0
+    sheet: float = 0.0
+    most: float = math.inf
+    own_share: float = 0.0
 
     @property
     def widest(self) -> float:
@@ -53,29 +59,30 @@ _LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
 
 KINDS = {
     "thickness": Kind(_BUILT.thickness, drift=0.01),
-    "modulus": Kind(0.02),
-    "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3),
+    "modulus": Kind(0.02, sheet=0.07, most=math.log(3.0)),
+    "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3, sheet=0.10, most=math.log(10.0)),
     "damping": Kind(math.log(_BUILT.damping)),
     # Of one ERA beside that of all.
     "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping), theory=0.01),
     "loss": Kind(math.log(_BUILT.damping), drift=0.1),
-    # Beside those of the rig, which may have none.
-    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0),
-    "loss_added": Kind(0.0, "", "", 1.0),
+    # Beside those of the rig, which may have none; data sheets give little, of ERAs by their ratio.
+    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0, sheet=0.015, most=2.0, own_share=0.7),
+    "loss_added": Kind(0.0, "", "", 1.0, sheet=0.003, most=0.5, own_share=0.7),
     # The power of frequency that the loss factor follows.
     "loss_exponent": Kind(0.3, "", "", 1.0),
-    "gain": Kind(_BUILT.gain, drift=0.01),
+    "gain": Kind(_BUILT.gain, drift=0.01, sheet=1.0, most=8.0),
     "phase": Kind(math.radians(_BUILT.phase_deg), *_PHASE, drift=math.radians(1)),
     # A resonance at 700 Hz with a damping ratio of 0.5.
     "inertia": Kind(1 / 0.7**2, "/kHz²", "1/kHz^2", 1.0),
     "drag": Kind(1 / 0.7, "/kHz", "1/kHz", 1.0),
     "sensor_gain": Kind(0.05),
     "sensor_phase": Kind(math.radians(5), *_PHASE),
-    "bolt_mass": Kind(0.5e-3, *_WEIGHT),
+    # By data sheets: of the plate's mass that an ERA carries.
+    "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, most=5.0),
     # Of an ERA, on each axis.
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
-    "mode_shifts": Kind(0.01, theory=3e-3),
+    "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
     "mode_losses": Kind(0.5),
     # Of each group of a finger's load.
     "fingers": Kind(0.5),
@@ -94,6 +101,18 @@ theory: on plates of 1.5 mm without shear deformation, with viscous losses
 
 FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
 """Kinds of which a plate with form errors alone has parameters."""
+
+VALUE_UNITS = {
+    "length": "m",
+    "width": "m",
+    "thickness": "m",
+    "modulus": "Pa",
+    "loss_factor": "",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "bolt_mass": "kg",
+}
+"""Units of the values of a rig that parameters change."""
 
 _AT_EDGE = 1e-6  # m
 
@@ -136,18 +155,6 @@ class Space:
         for kind in kinds:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
-
-    def knowing_all_but(self, kinds: Mapping[str, tuple[Number, Number, Number]]) -> "Space":
-        """The same where only some kinds are uncertain.
-
-        kinds: standard deviation, lower and upper bound of each, in units of `Values`.
-        """
-        columns = np.repeat([[0.0], [-np.inf], [np.inf]], self.size, axis=1)
-        for kind, (std, lower, upper) in kinds.items():
-            columns[:, self.groups[kind]] = np.array(
-                np.broadcast_arrays(std, np.divide(lower, std), np.divide(upper, std))
-            ).reshape(3, -1)
-        return replace(self, std=columns[0], lower=columns[1], upper=columns[2])
 
     def and_further(
         self,
@@ -287,6 +294,46 @@ def space_of(
     add("side", ["length", "width"] if has_form else [])
     add("poisson", ["Poisson's ratio"] if has_form else [])
     return space
+
+
+def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:
+    """Parameters of a rig of data sheets: its plate's modulus and losses, its ERAs and their gains.
+
+    form_modes: also form errors, with so many modes that shift; None for none. All else is known.
+    """
+    plate, count, has_form = rig.plate, len(rig.eras), form_modes is not None
+    space = space_of(
+        rig,
+        sensors,
+        Uncertainty.none(),
+        mode_count=form_modes or 0,
+        form_of=len(sensors) if has_form else None,
+    )
+    damping, bolt = np.array([(era.damping, era.bolt_mass) for era in rig.eras]).T
+    ratio = np.array(
+        [
+            damping_from_ratio(1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=count)
+            for era in rig.eras
+        ]
+    )
+    # The rig's value, which cannot become less than zero, and what deviations are relative to.
+    added: dict[str, tuple[Number, Number]] = {
+        "loss_added": (plate.loss_factor, 1.0),
+        "damping_added": (damping, ratio),
+        "bolt_mass": (bolt, plate.mass / count),
+    }
+    # Places may leave the plate, whose shapes go on by their slopes.
+    form = (*FORM, "place", "mode_shifts") if has_form else ()
+    columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
+    for name in ("modulus", "stiffness", "gain", *added, *form):
+        kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
+        std = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
+        lower = -value if name in added else -kind.most
+        upper = np.maximum(kind.most * unit - value, value)
+        columns[:, space.groups[name]] = np.array(
+            np.broadcast_arrays(std, lower / std, upper / std)
+        ).reshape(3, -1)
+    return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:

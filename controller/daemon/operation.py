@@ -36,7 +36,7 @@ from registry.plugins import failure_text
 _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON
 _MAX_READ_BACKS = 15
 _WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
-LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
+LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
 _NOT_CONNECTED = Stopped(False, -math.inf, "the amplifier is not connected")
 SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
 
@@ -111,7 +111,7 @@ class Operator:
         """Disarm, unless the lease of a token has ended."""
         lease = self.operation.lease
         if lease is not None and lease.token == token:
-            self.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
+            self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
 
     def note_lost(self, names: tuple[str, ...]) -> None:
         """Note which amplifiers are lost now, where that is known."""

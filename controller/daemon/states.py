@@ -13,7 +13,7 @@ State names follow CiA 402.
 
 import math
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple, Self
@@ -46,8 +46,7 @@ class Trigger(Enum):
     VERIFIED = auto()  # every amplifier was read back: disarmed, no fault, level zero
     ARM = auto()  # requested
     ARMED = auto()  # every amplifier has confirmed
-    DISARM = auto()  # requested
-    LEASE_LOST = auto()  # the arming lease was not renewed
+    DISARM = auto()  # requested, or the arming lease was not renewed
     STOP = auto()  # requested
     CLEAR = auto()  # acknowledgement requested
     FAULT = auto()  # reported by an amplifier or the control loop
@@ -142,105 +141,78 @@ class Operation:
 
 
 class Transition(NamedTuple):
-    """Next state, actions, and the condition under which the transition applies."""
+    """Next state and actions."""
 
     to: DaemonState
     actions: tuple[Action, ...] = ()
-    when: Callable[[Operation, float], bool] = lambda operation, now: True
 
 
 _SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
 ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
 """States in which amplifiers have or get high voltage."""
-_OVERTAKING = (
-    *(Trigger.STOP, Trigger.DISARM, Trigger.LEASE_LOST),
-    *(Trigger.FAULT, Trigger.LINK_LOST, Trigger.CLOSE),
-)
+_OVERTAKING = (*(Trigger.STOP, Trigger.DISARM, Trigger.FAULT, Trigger.LINK_LOST, Trigger.CLOSE),)
 """Events before which nothing may have begun that goes on after them."""
 _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
-_OPEN = (*_SILENT, *ENERGISED, *_LATCHING)
+_CLEARABLE = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
 
 
-def _is_latched(operation: Operation, now: float) -> bool:
-    return operation.is_latched
+def _from(
+    states: Iterable[DaemonState], trigger: Trigger, to: DaemonState | None, *actions: Action
+) -> dict[tuple[DaemonState, Trigger], Transition]:
+    """A transition from each of several states; to: None for the same state."""
+    return {(state, trigger): Transition(to or state, actions) for state in states}
 
 
-TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
-    (DaemonState.NOT_READY, Trigger.OPENED): (
-        Transition(DaemonState.QUICK_STOP_ACTIVE, (Action.STOP,), _is_latched),
-        Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
+TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
+    **_from([DaemonState.NOT_READY], Trigger.OPENED, DaemonState.SWITCH_ON_DISABLED, Action.VERIFY),
+    **_from([DaemonState.NOT_READY], Trigger.NOT_FOUND, DaemonState.COMM_LOST, Action.RECONNECT),
+    **_from([DaemonState.SWITCH_ON_DISABLED], Trigger.VERIFIED, DaemonState.READY_TO_SWITCH_ON),
+    **_from([DaemonState.READY_TO_SWITCH_ON], Trigger.ARM, DaemonState.SWITCHED_ON, Action.ARM),
+    **_from([DaemonState.SWITCHED_ON], Trigger.ARMED, DaemonState.OPERATION_ENABLED),
+    **_from(
+        ENERGISED,
+        Trigger.DISARM,
+        DaemonState.SWITCH_ON_DISABLED,
+        *(Action.DISARM, Action.VERIFY),
     ),
-    (DaemonState.NOT_READY, Trigger.NOT_FOUND): (
-        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
+    **_from(DaemonState, Trigger.STOP, None, Action.STOP),
+    **_from((*_SILENT, *ENERGISED), Trigger.STOP, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
+    **_from(
+        (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE),
+        Trigger.FAULT,
+        DaemonState.FAULT_REACTION_ACTIVE,
+        Action.REACT,
     ),
-    (DaemonState.SWITCH_ON_DISABLED, Trigger.VERIFIED): (
-        Transition(DaemonState.READY_TO_SWITCH_ON),
+    **_from([DaemonState.FAULT], Trigger.FAULT, None, Action.STOP),
+    **_from([DaemonState.FAULT_REACTION_ACTIVE], Trigger.REACTION_DONE, DaemonState.FAULT),
+    **_from(_CLEARABLE, Trigger.CLEAR, None, Action.CLEAR),
+    **_from(_CLEARABLE, Trigger.VERIFIED, DaemonState.SWITCH_ON_DISABLED, Action.VERIFY),
+    **_from(
+        (*_SILENT, *ENERGISED, *_LATCHING),
+        Trigger.LINK_LOST,
+        DaemonState.COMM_LOST,
+        *(Action.STOP, Action.RECONNECT),
     ),
-    (DaemonState.READY_TO_SWITCH_ON, Trigger.ARM): (
-        Transition(DaemonState.SWITCHED_ON, (Action.ARM,)),
-    ),
-    (DaemonState.SWITCHED_ON, Trigger.ARMED): (Transition(DaemonState.OPERATION_ENABLED),),
-    **{
-        (state, trigger): (
-            Transition(DaemonState.SWITCH_ON_DISABLED, (Action.DISARM, Action.VERIFY)),
-        )
-        for state in ENERGISED
-        for trigger in (Trigger.DISARM, Trigger.LEASE_LOST)
-    },
-    **{
-        (state, Trigger.STOP): (Transition(DaemonState.QUICK_STOP_ACTIVE, (Action.STOP,)),)
-        for state in (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
-    },
-    **{
-        (state, Trigger.STOP): (Transition(state, (Action.STOP,)),)
-        for state in (
-            DaemonState.NOT_READY,
-            DaemonState.FAULT_REACTION_ACTIVE,
-            DaemonState.FAULT,
-            DaemonState.COMM_LOST,
-        )
-    },
-    **{
-        (state, Trigger.FAULT): (Transition(DaemonState.FAULT_REACTION_ACTIVE, (Action.REACT,)),)
-        for state in (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
-    },
-    (DaemonState.FAULT, Trigger.FAULT): (Transition(DaemonState.FAULT, (Action.STOP,)),),
-    (DaemonState.FAULT_REACTION_ACTIVE, Trigger.REACTION_DONE): (Transition(DaemonState.FAULT),),
-    **{
-        (state, Trigger.CLEAR): (Transition(state, (Action.CLEAR,)),)
-        for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-    },
-    **{
-        (state, Trigger.VERIFIED): (Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),)
-        for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-    },
-    **{
-        (state, Trigger.LINK_LOST): (
-            Transition(DaemonState.COMM_LOST, (Action.STOP, Action.RECONNECT)),
-        )
-        for state in _OPEN
-        if state is not DaemonState.READY_TO_SWITCH_ON
-    },
     # Read back as silent: a stop would latch an amplifier that is back at once.
-    (DaemonState.READY_TO_SWITCH_ON, Trigger.LINK_LOST): (
-        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
+    **_from(
+        [DaemonState.READY_TO_SWITCH_ON, DaemonState.COMM_LOST],
+        Trigger.LINK_LOST,
+        DaemonState.COMM_LOST,
+        Action.RECONNECT,
     ),
-    (DaemonState.COMM_LOST, Trigger.LINK_LOST): (
-        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
+    **_from([DaemonState.OPERATION_ENABLED], Trigger.LINK_CHANGED, None),
+    **_from(
+        [DaemonState.COMM_LOST], Trigger.RECONNECTED, DaemonState.SWITCH_ON_DISABLED, Action.VERIFY
     ),
-    (DaemonState.OPERATION_ENABLED, Trigger.LINK_CHANGED): (
-        Transition(DaemonState.OPERATION_ENABLED),
-    ),
-    (DaemonState.COMM_LOST, Trigger.RECONNECTED): (
-        Transition(DaemonState.FAULT, when=_is_latched),
-        Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
-    ),
-    **{
-        (state, Trigger.CLOSE): (Transition(DaemonState.NOT_READY, (Action.CLOSE,)),)
-        for state in DaemonState
-    },
+    **_from(DaemonState, Trigger.CLOSE, DaemonState.NOT_READY, Action.CLOSE),
 }
-"""Transitions by state and trigger; the first whose condition holds applies."""
+"""Transitions by state and trigger; of two rows the later one holds."""
+
+_WHEN_LATCHED = TRANSITIONS | {
+    **_from([DaemonState.NOT_READY], Trigger.OPENED, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
+    **_from([DaemonState.COMM_LOST], Trigger.RECONNECTED, DaemonState.FAULT),
+}
+"""The same where a clear is required before arming."""
 
 
 def step(
@@ -248,10 +220,11 @@ def step(
 ) -> tuple[Operation, tuple[Action, ...]]:
     """Apply an event at a time [s]; return the new operation and the actions to carry out."""
     updated = _with_event(operation, event, now)
-    for transition in TRANSITIONS.get((operation.state, event.trigger), ()):
-        if transition.when(updated, now):
-            return _enter(operation, updated, transition.to, event), transition.actions
-    return operation, ()
+    table = _WHEN_LATCHED if updated.is_latched else TRANSITIONS
+    transition = table.get((operation.state, event.trigger))
+    if transition is None:
+        return operation, ()
+    return _enter(operation, updated, transition.to, event), transition.actions
 
 
 def failed(operation: Operation, cause: str) -> Operation:

@@ -18,16 +18,16 @@ from controller.daemon.states import (
 # (= for the same) and the actions in order. A dot: nothing changes. Conditions have tests of their
 # own.
 EVENTS = """
-OPENED NOT_FOUND VERIFIED ARM ARMED DISARM LEASE_LOST STOP CLEAR FAULT REACTION_DONE LINK_LOST CLOSE
-NOT_READY             SD:v   CL:n .    .    .  .     .     =:s  .   .    .  .     NR:x
-SWITCH_ON_DISABLED    .      .    RS:  .    .  .     .     QS:s .   FR:r .  CL:sn NR:x
-READY_TO_SWITCH_ON    .      .    .    SO:a .  .     .     QS:s .   FR:r .  CL:n  NR:x
-SWITCHED_ON           .      .    .    .   OE: SD:dv SD:dv QS:s .   FR:r .  CL:sn NR:x
-OPERATION_ENABLED     .      .    .    .    .  SD:dv SD:dv QS:s .   FR:r .  CL:sn NR:x
-QUICK_STOP_ACTIVE     .      .    SD:v .    .  .     .     =:s  =:c FR:r .  CL:sn NR:x
-FAULT_REACTION_ACTIVE .      .    .    .    .  .     .     =:s  .   .   FA: CL:sn NR:x
-FAULT                 .      .    SD:v .    .  .     .     =:s  =:c =:s  .  CL:sn NR:x
-COMM_LOST             .      .    .    .    .  .     .     =:s  .   .    .  =:n   NR:x
+OPENED NOT_FOUND VERIFIED ARM ARMED DISARM STOP CLEAR FAULT REACTION_DONE LINK_LOST CLOSE
+NOT_READY             SD:v CL:n .    .    .   .     =:s  .   .    .   .     NR:x
+SWITCH_ON_DISABLED    .    .    RS:  .    .   .     QS:s .   FR:r .   CL:sn NR:x
+READY_TO_SWITCH_ON    .    .    .    SO:a .   .     QS:s .   FR:r .   CL:n  NR:x
+SWITCHED_ON           .    .    .    .    OE: SD:dv QS:s .   FR:r .   CL:sn NR:x
+OPERATION_ENABLED     .    .    .    .    .   SD:dv QS:s .   FR:r .   CL:sn NR:x
+QUICK_STOP_ACTIVE     .    .    SD:v .    .   .     =:s  =:c FR:r .   CL:sn NR:x
+FAULT_REACTION_ACTIVE .    .    .    .    .   .     =:s  .   .    FA: CL:sn NR:x
+FAULT                 .    .    SD:v .    .   .     =:s  =:c =:s  .   CL:sn NR:x
+COMM_LOST             .    .    .    .    .   .     =:s  .   .    .   =:n   NR:x
 """
 STATES = {
     "NR": DaemonState.NOT_READY,

@@ -431,7 +431,8 @@ class HostRules:
             def is_joined(session: AmplifierSession = session) -> bool:
                 is_silenced = first.last_silenced >= time  # since then it may play another set
                 is_ended = not first.vibrates(time) or not first.is_open  # by its watchdog
-                return token in session.committed_tokens or is_silenced or is_ended
+                is_excused = is_silenced or is_ended or self._stalled_since is not None
+                return token in session.committed_tokens or is_excused
 
             self._deadlines.expect(
                 time,

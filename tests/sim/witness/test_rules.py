@@ -139,6 +139,15 @@ def test_watchdog_of_unknown_time_may_be_sooner_than_what_is_on_its_way(
     assert talk.found == []
 
 
+def test_loop_that_stalls_between_two_commits_sends_the_second_no_more() -> None:
+    """One amplifier plays alone until watchdogs expire, since nothing can be sent."""
+    talk = Talk(names=("m", "n")).armed().armed(address=2)
+    talk.staged(5, amplifier_violations.LOUD)
+    talk.staged(5, amplifier_violations.LOUD, address=2)
+    talk.committed(5, tokens=(5, 0, 0, 0)).told("set_stalled").rest(0.03)
+    assert talk.found == []
+
+
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
     """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
     talk = Talk().armed().rest(0.4)

@@ -22,12 +22,6 @@ def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
     np.testing.assert_allclose(turned.field[0], 1j * found.field[0], rtol=1e-9)
 
 
-def test_calibrate_refuses_what_is_no_rig() -> None:
-    """The name of a rig's file is no rig."""
-    with pytest.raises(era.InputError):
-        era.calibrate("rig.yaml", MEASURED)  # type: ignore[arg-type]
-
-
 @pytest.mark.long
 def test_calibrate_finds_the_values_of_the_example() -> None:
     """Loss factor 0.013 and SW at 19.04 kN/m, as examples/make_measured.py has them."""

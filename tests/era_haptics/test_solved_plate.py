@@ -13,12 +13,6 @@ from paper_plate import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16)]
 
-# Converged Reissner-Mindlin frequencies [Hz] on the ERAs: NGSolve 6.2, order 5.
-CONVERGED = [
-    31.6186, 67.9034, 75.4567, 106.449, 156.821, 211.972,
-    214.733, 248.396, 330.943, 357.949, 388.062, 444.871,
-]  # fmt: skip
-
 
 @pytest.fixture(scope="module")
 def plate() -> era.SolvedPlate:
@@ -33,12 +27,6 @@ def table(plate: era.SolvedPlate) -> era.LocalizationTable:
 
     frequencies = np.array([60.0, 110.0, 180.0, 250.0])
     return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), drive_mode="phased")
-
-
-def test_solved_plate_modes_are_converged(plate: era.SolvedPlate) -> None:
-    """All twelve up to the rig's 500 Hz, by another program within 0.02 %."""
-    np.testing.assert_allclose(plate.modes.natural_frequencies, CONVERGED, rtol=2e-4)
-    assert len(plate.modes.damping_ratios) == 12
 
 
 def test_solved_plate_map_equals_direct_solve() -> None:

@@ -9,8 +9,6 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from model.cli import app
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import mean_level_db_sl
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
 
@@ -61,26 +59,6 @@ def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
     assert json.dumps(given.level_db_sl) == json.dumps(plain.level_db_sl)
     amplitudes = {type(tone.amplitude) for tone in given.excitation.values()}
     assert (given.excitation, amplitudes) == (plain.excitation, {float})
-
-
-def test_query_serves_several_targets_and_a_lone_finger(table: era.LocalizationTable) -> None:
-    """Both targets reach the level; without quiet fingers there is no contrast."""
-    targets = [(0.25, 0.2), TARGET]
-    both = era.query(table, targets, quiet=(0.15, 0.11))
-    levels = [
-        mean_level_db_sl(
-            *table.amplitudes(
-                both.excitation,
-                fingertip_points(*target, table.plate),
-                contacts=[*targets, (0.15, 0.11)],
-            ),
-            fingertip_weights(*target, table.plate),
-        )
-        for target in targets
-    ]
-    assert min(levels) == pytest.approx(both.level_db_sl, abs=0.1)
-    assert both.robust_level_db_sl == pytest.approx(20.0)
-    assert era.query(table, TARGET).contrast_db is None
 
 
 def test_results_become_frames(table: era.LocalizationTable) -> None:

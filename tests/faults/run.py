@@ -48,7 +48,7 @@ _PRELOADED = (
 """Modules of others that most tests load: processes are forked once they are loaded."""
 _PRELOADED_FOR_MANY = (
     *("scipy.optimize", "scipy.interpolate", "scipy.signal", "scipy.ndimage"),
-    *("pymodbus.client", "pint", "rich.console", "matplotlib.figure"),
+    *("pint", "rich.console", "matplotlib.figure"),
 )
 """Modules that some tests load, preloaded for more than so many faults."""
 _MANY = 20

@@ -104,14 +104,6 @@ def frame_by_hand(kind: int, version: int, address: int, sequence: int, payload:
     return b"\0" + cobs_by_hand(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
 
 
-def test_crc_has_its_published_value() -> None:
-    """0xCBF43926 over "123456789", low byte first."""
-    # A frame whose CRC-covered bytes are exactly "123456789": 0x31 is type 49, 0x32 version 50.
-    stuffed = b"\x0e123456789\x26\x39\xf4\xcb"
-    frames = FrameReader().feed(b"\0" + stuffed + b"\0")
-    assert frames == [Frame(0x31, address=0x33, sequence=0x3534, payload=b"6789", version=0x32)]
-
-
 @given(FRAMES)
 def test_frame_equals_its_specification(frame: Frame) -> None:
     """Bytes and length; it is decoded again."""

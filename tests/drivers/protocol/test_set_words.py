@@ -8,29 +8,12 @@ import pytest
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import (
     Assembly,
-    Command,
-    Envelope,
-    LayerSet,
     pack_layers,
     parts,
     unpack_layers,
 )
 from drivers.protocol.table import MESSAGES, STAGED_LIFE
 
-LAYERS = (
-    LayerSet(
-        *(0, 20, 500),
-        commands=(
-            Command(0, 2200, 2000, 0),
-            Command(
-                *(3, 5010, 10000, -9000, True),
-                onset=Envelope(50, ((1000, 9000), (10000, -1))),
-            ),
-        ),
-    ),
-    LayerSet(2, 10, 0),
-    LayerSet(3, 0, 800, renew=True),
-)
 STREAM = [
     *(0x0002, 20, 500),  # layer 0, two commands
     *(0x0000, 2200, 2000, 0),
@@ -39,12 +22,6 @@ STREAM = [
     *(0x0100, 10, 0),  # layer 2, silenced
     *(0x01A0, 0, 800),  # layer 3, renewed
 ]
-
-
-def test_layers_have_the_words_written_by_hand() -> None:
-    """Two tones, one with an onset, a layer that ends, one that is renewed."""
-    assert pack_layers(LAYERS) == STREAM
-    assert unpack_layers(STREAM) == LAYERS
 
 
 @pytest.mark.parametrize(

@@ -20,13 +20,12 @@ RIG = replace(
 )
 FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 POINTS = np.random.default_rng(0).uniform(0.01, 0.2, (30, 2))
-FACTOR = 1.2  # of frequencies
 
 
 @pytest.fixture(scope="module")
 def solved() -> SensedPlate:
-    """Solved at the frequencies, and at those times the factor."""
-    return sensed_plate(RIG, POINTS, np.concatenate([FREQUENCIES, FACTOR * FREQUENCIES]))
+    """Solved as the rig has it."""
+    return sensed_plate(RIG, POINTS, FREQUENCIES)
 
 
 def _with(rig: Rig, *, modulus: float = 1.0, thickness: float = 1.0, loss: float = 1.0) -> Rig:
@@ -73,25 +72,9 @@ def _mounted(rig: Rig, *, stiffness: float, damping: float, mass: float) -> Rig:
 )
 def test_responses_are_those_of_a_new_solve(solved, other, within):
     """Relative L2 over frequencies, ERAs and points; shear and rotary inertia limit thickness."""
-    found = solved.of(other).responses()[: len(FREQUENCIES)]
+    found = solved.of(other).responses()
     exact = sensed_plate(other, POINTS, FREQUENCIES).responses()
     assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        _mounted(_with(RIG, modulus=FACTOR**2), stiffness=FACTOR**2, damping=FACTOR, mass=1.0),
-        _mounted(_with(RIG, thickness=FACTOR), stiffness=FACTOR**3, damping=FACTOR**2, mass=FACTOR),
-    ],
-    ids=["modulus", "thickness"],
-)
-def test_responses_scale_with_stiffness_and_mass(solved, other):
-    """All stiffness times s² over all mass scales frequencies by s, and accelerations by s²."""
-    at, at_scaled = np.split(solved.responses(), 2)
-    _, scaled = np.split(solved.of(other).responses(), 2)
-    np.testing.assert_allclose(scaled, FACTOR**2 * at, rtol=1e-9, atol=1e-9 * np.abs(at).max())
-    assert np.abs(at_scaled - scaled).max() > 0.1 * np.abs(at).max()
 
 
 @pytest.mark.parametrize("loss_factor", np.linspace(0.001, 0.05, 20).tolist())

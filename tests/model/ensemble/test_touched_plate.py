@@ -196,15 +196,6 @@ def test_thickness_nodes_are_those_of_a_normal_deviation(count):
     assert np.quantile(thickness_nodes(1000), 0.9) == pytest.approx(1.2816, abs=0.01)
 
 
-def test_responses_add_up_from_the_parts_of_each_era():
-    """The response to a drive is the sum of the parts that the gains multiply."""
-    touched, _, points = solved(Uncertainty())
-    weights = np.tile(np.array([1, 2j, -1, 0.5], dtype=np.complex64), (4, 1))
-    found = touched.fields(np.arange(4), np.full(4, MODELLED), weights, points)
-    parts = changed(touched, points, weights)["nominal"]
-    np.testing.assert_allclose(parts, found, rtol=1e-3, atol=1e-2)
-
-
 def felt_of(touched, points, weights, **drawn):
     """What drawn plates feel of a tone of weights (4, n) at each frequency, at all points."""
     count = len(touched.centres)

@@ -129,14 +129,6 @@ def test_figure_13_study_contains_the_maps(figures):
     assert study["correlation"].max() <= 1 + 1e-12
 
 
-def test_equal_area_points_are_cell_centres():
-    """24 x 18 cell centres on the paper's plate, half an inch apart, half of that off the edges."""
-    points = equal_area_points(make_paper_rig(12, 9).plate)
-    assert len(points) == 24 * 18
-    np.testing.assert_allclose(np.diff(np.unique(points[:, 0].round(9))), 0.0127)
-    np.testing.assert_allclose(points.min(axis=0), 0.00635)
-
-
 @pytest.mark.parametrize(
     "layout", shortly(FOUR_ERA_LAYOUTS, FOUR_ERA_LAYOUTS[:2]), ids=lambda layout: layout.name
 )

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble, lowest_modes
+from model.fem.plate import assemble
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era, PointLoad
@@ -149,15 +149,6 @@ def test_solve_free_plate_refuses_the_mesh_of_another_plate():
     for solve in (solve_free_plate, assemble):
         with pytest.raises(InputError, match=r"^mesh: .*0\.3148 x.*0\.3048 x"):
             solve(replace(PAPER, length=LENGTH + 0.01), mesh)
-
-
-def test_free_modes_begin_with_rigid_motions(free):
-    """Up and down and two tilts, then the elastic modes, of a solver of the free plate."""
-    whole = assemble(free.plate, free.mesh)
-    eigenvalues, _ = lowest_modes(whole.stiffness, whole.mass, 18, shift=1e4)
-    found = np.sort(free.modes.eigenvalues)
-    assert (found[:3] == 0).all()
-    np.testing.assert_allclose(found[3:18], eigenvalues[3:], rtol=1e-8)
 
 
 def test_receptances_equal_direct_solve(free):

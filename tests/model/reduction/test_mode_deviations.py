@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.arrays import lattice
 from model.config.document import ConfigError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
@@ -17,8 +16,6 @@ from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.build import build_table
 from model.table.verify import verify_table
-from model.vibration.excitation import Tone
-from model.vibration.maps import plate_map
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
@@ -59,16 +56,6 @@ def test_loss_varies_alike_in_modes_and_in_a_direct_solution(rig: Rig) -> None:
     free = solve_free_plate(plate, rig.mesh, frequency_max=500.0)
     found = free.acceleration(rig.eras, FREQUENCIES, POINTS)
     np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
-
-
-def test_a_map_has_them(rig: Rig) -> None:
-    """Peak acceleration of a single tone is the amplitude of the plate's response."""
-    raster = 5, 4
-    found = plate_map(rig, {rig.eras[1].name: Tone(110.0, rig.eras[1].stroke)}, raster=raster)
-    points = lattice(found.x, found.y)
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    expected = np.abs(free.acceleration(rig.eras, np.array([110.0]), points)[0, 1])
-    np.testing.assert_allclose(found.peak.ravel(), expected, rtol=1e-9)
 
 
 def test_a_table_is_verified_with_them(rig: Rig) -> None:

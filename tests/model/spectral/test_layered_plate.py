@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import linalg
 
 from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.elasticity import strip_frequencies
@@ -15,12 +14,11 @@ from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
-from model.spectral.direct import AtOneFrequency
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Bond, Laminate, Layer, Material, Plate
+from model.structure.plate import Laminate, Layer, Material, Plate
 from model.vibration.natural_modes import natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
@@ -80,39 +78,6 @@ def test_layers_of_one_material_are_the_homogeneous_plate():
     mesh = Mesh.accurate(plate, frequency_max=500.0)
     exact = homogeneous_frequencies(plate, mesh)
     np.testing.assert_allclose(found[:9], exact[:9], rtol=2e-3)
-
-
-def test_layers_on_a_liquid_core_are_freely_sliding_plates():
-    """With a core of 1 kPa the modes are those of loosely laid layers, within 0.5 %."""
-    gel = replace(PANEL[1], material=replace(ADHESIVE, E=1e3))
-    found, _ = frequencies_of(panel((PANEL[0], gel, PANEL[2])), (13, 9), cut=500.0)
-    loose = equivalent_plate(
-        Laminate((PANEL[0], gel, PANEL[2]), Bond.NONE), length=0.375, width=0.225, frequency=150.0
-    )
-    mesh = SpectralMesh(13, 9, 0.375, 0.225)
-    exact = homogeneous_frequencies(loose, mesh)
-    np.testing.assert_allclose(found[:9], exact[:9], rtol=5e-3)
-
-
-def test_complex_modes_equal_a_complex_eigenproblem():
-    """Of a core with a loss factor of 1, frequency within 0.1 % and loss within 1 %.
-
-    The eigenvalue of the dynamic stiffness, solved at its own frequency without a modal space.
-    """
-    plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]), loss_factor=0.0)
-    layered = AtOneFrequency(plate, (10, 8), 150.0)
-    modes = layered.modes(
-        (1, 1), shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * 500) ** 2, band=Band(30.0, 500.0)
-    )
-    for square, loss in list(zip(modes.eigenvalues, modes.losses, strict=True))[1:4]:
-        frequency = np.sqrt(square) / (2 * np.pi)
-        D = layered.dynamic_stiffness((1, 1), frequency)
-        inertia = plate.material.rho * plate.thickness
-        K = D / inertia + square * np.eye(len(D))
-        values = linalg.eigvals(K)
-        exact = values[np.argmin(np.abs(values - (square + 1j * loss)))]
-        assert square == pytest.approx(exact.real, rel=2e-3)
-        assert loss == pytest.approx(exact.imag, rel=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -127,20 +127,6 @@ def test_simply_supported_sandwich_equals_published_frequencies_and_losses():
         assert square.imag / square.real == pytest.approx(loss, abs=1e-3)
 
 
-def test_wave_rigidity_equals_the_formula_of_ross_ungar_and_kerwin():
-    """D of thin faces, D1 + D3 + gain g / (1 + g), with g = G / (h k²) (1/A1 + 1/A3)."""
-    face = Layer(ALUMINIUM, 1e-3)
-    core = Layer(Material("core", E=1e6, rho=1000.0, nu=0.49), 0.1e-3)
-    k = 20.0
-    A = 70e9 * 1e-3 / (1 - 0.33**2)
-    g = core.material.shear_modulus / (0.1e-3 * k**2) * (2 / A)
-    gain = A / 2 * 1.1e-3**2
-    expected = 2 * A * 1e-6 / 12 + gain * g / (1 + g)
-    found = wave_rigidity(Laminate((face, core, face)), k, 100.0)
-    assert found.real == pytest.approx(expected, rel=1e-3)
-    assert found.imag == 0
-
-
 def test_shear_corrections_are_those_of_one_layer_and_of_a_soft_core():
     """5/6 of a single layer (Reissner), 1 where shear is uniform, 3/4 where it grows from zero."""
     assert shear_corrections(PANEL[:1]) == pytest.approx([5 / 6])

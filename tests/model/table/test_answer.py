@@ -114,14 +114,6 @@ def test_one_content_is_the_answer_of_the_table():
         assert tone.amplitude == pytest.approx(pattern.excitation[name].amplitude, rel=0.02)
 
 
-def test_a_finger_alone_has_nothing_to_compare_with():
-    """One request without other fingers: a level, no contrast."""
-    found = answer(smooth_table(), [Request(NEAR)])
-    assert found.layers[0].promised_contrast_db is None
-    assert found.promised_worst_db is None
-    assert found.layers[0].verdict == "own"
-
-
 def test_frequencies_are_apart_and_within_their_bands():
     """Bands hold; bands that may be exchanged are each taken once, for a contrast no worse."""
     table, bands = smooth_table(), ((40, 110), (140, 190), (230, 320))

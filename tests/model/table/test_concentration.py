@@ -29,23 +29,6 @@ def concentration(*amplitudes, frequencies=(100.0,)):
     )
 
 
-def test_concentration_of_a_plate_that_moves_as_one():
-    """All of it is above half of the target, contrast is 0 dB, and energy goes with area."""
-    found = concentration(np.ones(len(POINTS)))
-    assert found.contrast_95_db == pytest.approx(0.0)
-    assert found.area_above_half == pytest.approx(AREA)
-    assert found.energy_share_near == pytest.approx(CIRCLE / AREA, rel=0.01)
-
-
-@pytest.mark.parametrize(("share", "contrast"), [(0.06, 20.0), (0.04, 60.0)])
-def test_concentration_ignores_a_twentieth_of_the_plate_around(share, contrast):
-    """A strip a tenth as strong as the target counts only if it is more than that."""
-    strip = POINTS[:, 0] < share * (AREA - CIRCLE) / PLATE.width
-    found = concentration(np.where(NEAR, 1.0, np.where(strip, 0.1, 0.001)))
-    assert found.contrast_95_db == pytest.approx(contrast)
-    assert found.area_above_half == pytest.approx(CIRCLE, rel=0.01)
-
-
 def test_concentration_weighs_energy_and_sums_amplitudes_over_frequencies():
     """Half the frequency is four times the energy; two quarters of the target make a half."""
     found = concentration(NEAR, ~NEAR, frequencies=(100.0, 200.0))

@@ -127,22 +127,7 @@ def test_table_problem_refuses_a_table_too_large_to_be_read():
         TableProblem(replace(rig, plate=plate), np.array([100.0, 500.0]), Grid(4, 3))
 
 
-CROSS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
-
-
-def test_fingertips_reads_the_points_of_the_disc():
-    """Reading x and y themselves gives back the points, the centre and four of the rim as well."""
-    plate = smooth_rig().plate
-    raster = Raster.for_plate(plate, frequency_max=500.0)
-    places = raster.points.astype(np.float32)
-    tips = raster.fingertips(np.array(CONTACTS), places)
-    few, fine = tips.few, tips.fine
-    expected = [fingertip_points(x, y, plate) for x, y in CONTACTS]
-    np.testing.assert_allclose(fine, expected, atol=1e-7)
-    assert few.shape == (5, 5, 2)
-    np.testing.assert_allclose(few[:, 0], CONTACTS, atol=1e-7)
-    np.testing.assert_allclose(few[0, 1:] - few[0, :1], 0.013 * CROSS, atol=1e-7)
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")

@@ -14,7 +14,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.attachments import Era
 from model.structure.materials import material
 from model.structure.plate import Plate
-from model.transients.base_motion import BaseMotions, Motion, Term, raised_cosine
+from model.transients.base_motion import BaseMotions, Motion, raised_cosine
 from model.transients.time_response import plate_in_time
 
 OMEGA = 2 * math.pi * 110.0
@@ -75,24 +75,6 @@ def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
     ):
         expected = sum(faded(fade, time) for fade in fades)
         assert moved(motions, number, era, time) == pytest.approx(expected, abs=1e-17)
-
-
-def test_terms_stand_beside_fades() -> None:
-    """A base that moves by both moves as their sum, a linear term with its slope."""
-    term = Term(1.0, 1.1, OMEGA, 1e-4 + 0j, 3e-3j)
-    motions = BaseMotions([[*terms(FADES[:1]), term]])
-    for time in (1.004, 1.05, 1.2):
-        tau = time - 1.0
-        linear = ((1e-4 + 3e-3j * tau) * cmath.exp(1j * OMEGA * tau)).imag if tau < 0.1 else 0.0
-        expected = linear + faded(FADES[0], time)
-        assert moved(motions, 0, 0, time) == pytest.approx(expected, abs=1e-17)
-
-
-def test_moments_are_those_of_one_set() -> None:
-    """Starts and ends of its terms within a window, whose begin is left out."""
-    motions = BaseMotions([terms(FADES[:1])], [terms(FADES[1:2])])
-    assert motions.moments(0, 0.0, 2.0) == [1.0, 1.02]
-    assert motions.moments(1, 1.005, 2.0) == [pytest.approx(1.015)]
 
 
 def test_terms_that_have_ended_are_left_out() -> None:

@@ -164,15 +164,6 @@ def test_bounds_are_those_of_eras_not_of_their_combinations():
     np.testing.assert_allclose(within, knots, atol=0.02)
 
 
-def test_bounded_minimum_is_unbounded_when_bounds_are_inactive():
-    """Where the free solution keeps the bounds, it is the answer, in single precision."""
-    A, b = random_form(9, 8)
-    free = np.linalg.solve(A, b)
-    b /= 1.01 * np.abs(free).max()
-    found = bounded_minimum(A, b.reshape(2, 4), np.eye(4)).ravel()
-    np.testing.assert_allclose(found, free / (1.01 * np.abs(free).max()), atol=1e-4)
-
-
 def test_bounded_minimum_of_few_rows_is_right_in_single_precision():
     """A form of three rows with decades between them, of forty unknowns, gains nearly all."""
     for seed in range(5):

@@ -180,20 +180,6 @@ def test_onset_of_many_eras_is_as_good_as_of_few():
     assert np.median(gained) > 6
 
 
-def test_onset_of_a_lone_finger_combines_six_of_many_eras():
-    """Knots of sixteen ERAs lie in six dimensions: points of the surroundings are no fingers."""
-    table = build_table(load_rig(EXAMPLES / "table.yaml"), frequencies=np.array([130.0]))
-    shaper = Shaper(table.in_time, gain_variance=VARIANCE)
-    weights = np.exp(1j * np.arange(len(table.eras)))
-    excitation = {
-        era.name: Tone(130.0, 0.1 * era.stroke, float(np.angle(weight)))
-        for era, weight in zip(table.eras, weights, strict=True)
-    }
-    onset = shaper.onset(excitation, targets=[(0.3, 0.2)])
-    knots = [np.array(onset[era.name].knots) / era.stroke for era in table.eras]
-    assert np.linalg.matrix_rank(knots, tol=1e-5) == 6
-
-
 def test_shaping_includes_the_errors_of_the_eras(setup):
     """With errors the robust onset and ending do better than those that know of no errors."""
     rig, plate, shaper, transients = setup

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_onset, shaped
+from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_onset
 from model.transients.knots import hat_accelerations
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration.excitation import Tone
@@ -87,19 +87,6 @@ def test_acceleration_equals_time_stepping(few_modes):
     stepped = stepped_acceleration(plate, [ramped, resting, knotted, resting], times, breaks=breaks)
     expected = stepped @ plate.reduced.at(points).T
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-
-
-def test_acceleration_stays_steady_after_steady_state(plate):
-    """A tone that goes on after having been steady neither grows nor fades."""
-    rig, in_time = plate
-    tone = Tone(110.0, 6e-5, 0.9)
-    going_on = shaped(
-        {"SE": BaseEnvelope(110.0, 6e-5 * np.exp(0.9j), (6e-5 * np.exp(0.9j),))}, rig.eras
-    )
-    points = fingertip_points(0.2, 0.05, rig.plate)
-    felt = Transients(in_time).acceleration(going_on, points, duration=0.2, after={"SE": tone})
-    period = round(SAMPLE_RATE / 10)  # 0.1 s are eleven periods
-    np.testing.assert_allclose(felt[period:], felt[:-period], atol=1e-6 * np.abs(felt).max())
 
 
 def test_contrast_db_equals_sampled_peaks(plate):

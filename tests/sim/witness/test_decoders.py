@@ -1,9 +1,6 @@
-"""The witness's decoders against the bytes of the pages, which were worked out by hand."""
+"""The witness's decoders against bytes that were written by hand."""
 
-import re
 import struct
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,41 +9,6 @@ from drivers.codec.modbus.crc import crc16
 from sim.witness.capture import Direction
 from sim.witness.decoded import Message, Reply, Request
 from sim.witness.watched_wire import decoder_of
-
-DOCS = Path(__file__).parents[3] / "docs" / "reference"
-STATUS = {"state": 4, "fault": 0, "flags": 1, "watchdog_left": 250, "temperature": 250}
-# What stands beside the bytes, in words: names of requests with their values, replies, Events.
-MEANINGS: dict[str, list[tuple[str, dict[str, Any]]]] = {
-    "Set": [
-        ("Set", {"session": 0x2A17, "token": 0x0102, "index": 0, "parts": 1, "now": 0}),
-        ("reply", {"token": 0x0102, "exact": 1, "staged": 1, "played": 0, "missing": 0}),
-    ],
-    "Commit": [
-        ("Commit", {"session": 0x2A17, "token": 0x0102}),
-        ("reply", STATUS | {"levels": [3300, 3200, 3600, 1800], "tokens": [0x0102] * 4 + [0] * 4}),
-    ],
-    "Hello": [("Hello", {}), ("reply", {"versions": 1 << 3, "serial_number": "SIM-a"})],
-    "Arm": [("Arm", {"session": 0x2A17, "watchdog": 250}), ("reply", STATUS | {"token": 0})],
-    "Ping of another session": [("Ping", {"session": 7}), ("refusal", {"code": 10})],
-    "Stop along 5 ms, to all": [("Stop", {"ramp": 5})],
-}
-EVENTS = {
-    "Arm": ("event", {"state": 4, "fault": 0, "channel": 255, "latch": 0}),
-    "Stop along 5 ms, to all": ("event", {"state": 5, "fault": 0, "channel": 255, "latch": 1}),
-}
-
-
-def shown(page: str) -> Iterator[tuple[str, Direction, str]]:
-    """Yield titles, directions and bytes of a page, as text."""
-    title, pieces = "", list[tuple[str, Direction, str]]()
-    for line in (DOCS / f"{page}.md").read_text(encoding="utf-8").splitlines():
-        if line.startswith("    # "):
-            title = line.removeprefix("    # ")
-        elif title and line.startswith(("    > ", "    < ")):
-            pieces.append((title, "amplifier" if line[4] == ">" else "host", line[6:]))
-        elif pieces and re.fullmatch(r"      [0-9A-F ]+", line):
-            pieces[-1] = (*pieces[-1][:2], f"{pieces[-1][2]} {line.strip()}")
-    yield from pieces
 
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:
@@ -60,55 +22,10 @@ def summary(message: Message) -> tuple[str, dict[str, Any]]:
     return message.what, {"text": message.text} if message.text else message.values
 
 
-def slcan(direction: Direction, frame: str) -> bytes:
-    """Return a frame of a page as a line of a serial adapter."""
+def can(frame: str) -> bytes:
+    """Return a frame as a line of a serial adapter."""
     identifier, *data = frame.split()
     return f"t{identifier}{len(data)}{''.join(data)}\r".encode()
-
-
-def socketcand(direction: Direction, frame: str) -> bytes:
-    """Return a frame of a page as an element of socketcand."""
-    identifier, *data = frame.split()
-    if direction == "amplifier":
-        return f"< send {identifier} {len(data)} {' '.join(data)} >".encode()
-    return f"< frame {identifier} 1.25 {''.join(data)} >".encode()
-
-
-def decoded(kind: str) -> Iterator[tuple[str, Message]]:
-    """Yield the messages of a page with their titles."""
-    page = {"serial": "serial", "slcan": "can", "socketcand": "can"}.get(kind, "modbus")
-    decoder = decoder_of(kind)
-    titles = [*dict.fromkeys(title for title, _, _ in shown(page))]  # a second apart
-    for number, (title, direction, text) in enumerate(shown(page)):
-        if page == "modbus" and ("RTU" in title) != (kind == "modbus-rtu"):
-            continue
-        if page == "can":
-            as_text = slcan if kind == "slcan" else socketcand
-            data = as_text(direction, text)
-        else:
-            data = bytes.fromhex(text)
-        for raw, message in decoder.feed(direction, titles.index(title) + 0.001 * number, data):
-            assert raw
-            if message is not None and getattr(message, "what", "event") == "event":
-                yield title, message
-
-
-@pytest.mark.parametrize("kind", ["serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand"])
-def test_bytes_of_the_pages_mean_what_stands_beside_them(kind: str) -> None:
-    """Each request, reply, refusal and Event, on every wire; none is damaged."""
-    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-    for title, message in decoded(kind):
-        found.setdefault(title, []).append(summary(message))
-    assert found
-    for title, messages in found.items():
-        named = title.replace("The commit on RTU", "Commit")
-        (begins,) = [each for each in MEANINGS if named.startswith(each)]
-        expected = MEANINGS[begins]
-        if any(name == "event" for name, _ in messages):
-            expected = [*expected[:1], EVENTS[begins], *expected[1:]]
-        assert [name for name, _ in messages] == [name for name, _ in expected], title
-        for (_, values), (_, must) in zip(messages, expected, strict=True):
-            assert {name: values[name] for name in must} == must
 
 
 def tcp(number: int, pdu: str) -> bytes:
@@ -120,11 +37,6 @@ def tcp(number: int, pdu: str) -> bytes:
 def rtu(adu: str) -> bytes:
     """Return an ADU of RTU with its checksum."""
     return bytes.fromhex(adu) + crc16(bytes.fromhex(adu))
-
-
-def can(frame: str) -> bytes:
-    """Return a frame as a line of a serial adapter."""
-    return slcan("amplifier", frame)
 
 
 Heard = tuple[str, bytes, str, dict[str, Any]]

@@ -32,28 +32,6 @@ def test_every_rule_of_the_page_is_found_broken() -> None:
     assert {rule for rule, _ in BROKEN.values()} == listed
 
 
-def test_sound_conversation_breaks_no_rule() -> None:
-    """Armed, played in two layers, achieved, silenced, stopped, cleared, armed again, disarmed."""
-    talk = Talk().armed().playing()
-    talk.staged(6, hand.layer(1, hand.tone(1, 150, 0.3, 90.0), valid_for=200))
-    talk.committed(6, levels=(5000, 30), tokens=(5, 6, 0, 0)).rest(0.03)
-    both: dict[str, Any] = {"token": 6, "levels": (5000, 3000)}
-    talk.says(**both | {"tokens": (5, 6, 0, 0)})
-    achieved = [6, *hand.layer(1, hand.tone(1, 150, 0.3, 90.0), valid_for=200)]
-    talk.exchange(hand.GET_ACHIEVED, (1,), achieved)
-    talk.exchange(hand.SET, hand.part(7, hand.layer(1, valid_for=300, renew=True)), hand.taken(7))
-    talk.committed(7, levels=(5000, 3000), tokens=(5, 6, 0, 0))
-    talk.rest(0.2).says(**both | {"token": 7, "tokens": (5, 6, 0, 0)})
-    talk.rest(0.2).says(token=7, levels=(5000, 0), tokens=(5, 0, 0, 0))
-    talk.exchange(hand.SILENCE, (9, 5), hand.status(token=7, levels=(5000, 0)))
-    talk.rest(0.02).says(token=7)
-    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, token=7))
-    talk.exchange(hand.CLEAR, (1,), hand.status(hand.SWITCHED_OFF, latch=1, token=7))
-    talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
-    talk.exchange(hand.DISARM, (50,), hand.status(hand.SWITCHED_OFF, latch=1))
-    assert talk.found == []
-
-
 @pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])
 def test_request_may_have_waited_in_a_transport(after: float, broken: list[str]) -> None:
     """A host gives a request up 30 ms after it wrote it, of which its bytes waited for 2 ms."""
@@ -65,19 +43,6 @@ def test_request_may_have_waited_in_a_transport(after: float, broken: list[str])
     talk.sequence += 1
     talk.replies(hand.GET_STATUS, hand.status())
     assert talk.found == broken
-
-
-def test_stop_may_overtake_a_heartbeat() -> None:
-    """It waits for 8 ms for the reply, which comes with its own."""
-    talk = Talk().armed().playing()
-    talk.sends(hand.PING, (9,))
-    talk.rest(0.008).sends(hand.STOP, (5,))
-    playing: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
-    talk.sequence -= 1
-    talk.replies(hand.PING, hand.status(tokens=(5, 0, 0, 0), **playing))
-    talk.sequence += 1
-    talk.rest(0.001).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, **playing))
-    assert talk.rest(0.006).says(hand.STOPPED, kind=hand.GET_STATUS, token=5, latch=1).found == []
 
 
 @pytest.mark.parametrize(("left", "broken"), [(240, []), (231, []), (225, ["watchdog"])])
@@ -97,15 +62,6 @@ def test_reply_is_not_late_by_the_delay_of_the_witness(delay: float, broken: lis
         talk.witness.delayed(talk.time, delay)
     talk.replies(hand.GET_STATUS, hand.status(left=199))
     assert talk.found == broken
-
-
-def test_commit_without_a_reply_shows_in_the_next_status() -> None:
-    """A broadcast, and one whose reply is lost: the token says that it was carried out."""
-    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
-    talk.sends(hand.COMMIT, (9, 5), address=0)
-    talk.says(kind=hand.GET_STATUS, left=247, token=5, levels=(40, 0), tokens=(5, 0, 0, 0))
-    talk.rest(0.03).says(token=5, levels=(5000, 0), tokens=(5, 0, 0, 0))
-    assert talk.found == []
 
 
 def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:

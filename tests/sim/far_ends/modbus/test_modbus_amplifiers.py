@@ -6,7 +6,6 @@ import tty
 
 import minimalmodbus
 import pytest
-from pymodbus.client import AsyncModbusTcpClient
 
 from drivers.protocol.table import STATES
 from sim.amplifier.contract import Amplifier
@@ -53,35 +52,3 @@ async def test_minimalmodbus_drives_it_over_a_serial_line() -> None:
         loop.remove_reader(ours)
         os.close(ours)
         os.close(theirs)
-
-
-async def test_pymodbus_reads_its_status_over_tcp() -> None:
-    """Two units behind one port, one of them armed."""
-    loop = asyncio.get_running_loop()
-    amplifiers = {unit: Amplifier(str(unit), channels=4) for unit in (1, 2)}
-    amplifiers[2].handle("Arm", {"session": 9, "watchdog": 2000}, loop.time())
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
-        while data := await reader.read(4096):
-            end.receive(data, loop.time())
-        writer.close()
-        await writer.wait_closed()
-        ended.set()
-
-    ended = asyncio.Event()
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    client = AsyncModbusTcpClient("127.0.0.1", port=server.sockets[0].getsockname()[1])
-    try:
-        assert await client.connect()
-        for unit, state in ((1, 1), (2, 4)):
-            status = await client.read_holding_registers(STATUS, count=23, device_id=unit)
-            assert status.registers[:4] == [0, 0, state, 0]
-            assert status.registers[10] == 0x0408
-        wrong = await client.read_input_registers(0x900, count=1, device_id=1)
-        assert wrong.exception_code == 2
-    finally:
-        client.close()
-        await ended.wait()
-        server.close()
-        await server.wait_closed()

@@ -27,9 +27,9 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.states import Loss
 from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
-from controller.loop.leak import leaks_db_sl
+from controller.loop.content import leaks_db_sl
 from controller.loop.observer import Applied, Silenced
-from controller.loop.routing import Drive
+from controller.loop.plate_set import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier

@@ -14,7 +14,7 @@ from controller.diagnosis.plate_sensors import (
     start_together,
 )
 from controller.diagnosis.tone_player import TonePlayer
-from controller.loop.routing import Drive
+from controller.loop.plate_set import Drive
 from drivers import clock
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.sensors import Reading, measure_tones

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.intent import Target
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey

@@ -6,6 +6,7 @@ contacts change. A renewal disturbs a reading, which is then repeated.
 """
 
 import asyncio
+import cmath
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,6 @@ import numpy as np
 
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.loop.observer import Applied
-from controller.loop.routing import phasor_of
 from controller.sources.contacts import Contact
 from drivers import clock
 from drivers.errors import DriverError, Preempted
@@ -149,8 +149,8 @@ class SettledReadings:
             frequency,
             np.array(
                 [
-                    phasor_of(applied.drive[era.name]) * era.stroke
-                    if era.name in applied.drive
+                    cmath.rect(tone.level * era.stroke, math.radians(tone.phase))
+                    if (tone := applied.drive.get(era.name)) is not None
                     else 0j
                     for era in self._rig.eras
                 ]

@@ -1,18 +1,44 @@
-"""Capabilities of the open amplifiers of a rig together, in the terms of the table."""
+"""Capabilities of the open amplifiers of a rig together, in the terms of the table.
+
+A set takes its onset and its ending with it, so a touch waits for them. The knots that the wires
+carry in time are arithmetic, done once when the amplifiers are open.
+"""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from controller.loop.envelopes import EnvelopeSupport, envelope_support
 from drivers.host.amplifier import Amplifier
-from drivers.protocol.table import QUANTITIES
+from drivers.host.line import Line
+from drivers.protocol.table import MAX_WORDS, QUANTITIES
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.transients.base_motion import KNOT_STEP
+from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
+
+MAX_SET_TIME = 0.010
+"""How long [s] a set may take on its wire, so that its onset does not delay a touch."""
 
 _FREQUENCY, _LEVEL, _RAMP = (QUANTITIES[name] for name in ("frequency", "level", "ramp"))
 _PHASE_STEP = QUANTITIES["phase_step"]
+_STEP = QUANTITIES["envelope_step"]
+_LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
+_PART_WORDS = 3  # of a message: session, token, part
+_LEAST_ONSET = 5  # knots that an ending must leave
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeSupport:
+    """Knots of an onset and of an ending that every channel may have; 0: ramps."""
+
+    onset_knots: int
+    ending_knots: int = 0
+
+
+RAMPS_ONLY = EnvelopeSupport(0)
+"""Support of ramps only."""
 
 
 @dataclass(frozen=True)
@@ -82,3 +108,46 @@ def playback_capabilities(
         ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
         layers=min(one.capabilities["layers"] for one in amplifiers.values()),
     )
+
+
+def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
+    """Return what all open amplifiers, by name, play, and their wires carry within 10 ms."""
+    wired: dict[str, int] = defaultdict(int)
+    for channel in rig.wiring.values():
+        wired[channel.amplifier] += 1
+    by_line: dict[Line, list[str]] = defaultdict(list)
+    for name in wired:
+        by_line[amplifiers[name].line].append(name)
+    carried = [_knots_on(line, [wired[name] for name in names]) for line, names in by_line.items()]
+    carried += [
+        _knots_in(amplifiers[name].capabilities["set_words"], [count])
+        for name, count in wired.items()
+    ]
+    each = min(map(_knots_of, (amplifiers[name] for name in wired)), default=0)
+    knots, onset, ending = max(min(carried, default=0), 0), ONSET_KNOTS - 1, ENDING_KNOTS - 1
+    if each < ending or knots < ending + _LEAST_ONSET:
+        ending = 0
+    return EnvelopeSupport(min(knots - ending, each, onset), ending)
+
+
+def _knots_of(amplifier: Amplifier) -> int:
+    """Return how many knots an envelope of an amplifier may have, in the steps of the model."""
+    can = amplifier.capabilities
+    low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
+    return int(can["knots"]) if low <= KNOT_STEP <= high else 0
+
+
+def _knots_on(line: Line, channels: list[int]) -> int:
+    """Return the knots of each channel that a line carries in time, for its amplifiers' sets."""
+    takes = line.wire.transit(MAX_WORDS)
+    if takes <= 0:
+        return int(QUANTITIES["knots"].maximum)
+    return _knots_in(int(MAX_WORDS * MAX_SET_TIME / takes), channels)
+
+
+def _knots_in(words: int, channels: list[int]) -> int:
+    """Return the knots of each channel for which a number of words suffices."""
+    parts = -(-words // MAX_WORDS)
+    heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
+    each = _COMMAND_WORDS + 2 * _ENVELOPE_WORDS
+    return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))

@@ -6,8 +6,8 @@ from functools import cached_property
 
 from controller.loop.content import Prediction, not_served
 from controller.loop.decision import Decision
+from controller.loop.plate_set import Drive
 from controller.loop.playing import PlayedContent
-from controller.loop.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question

@@ -11,8 +11,7 @@ from typing import Any
 
 from controller.loop.content import Content
 from controller.loop.intent import Target
-from controller.loop.plate_set import PlateSet
-from controller.loop.routing import Drive, restarted_by, tones_by_era
+from controller.loop.plate_set import Drive, PlateSet, restarted_by, tones_by_era
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.members import Played

@@ -14,8 +14,7 @@ from chain import Chain, Position
 from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.observer import Applied
 from drivers import clock
 from model.arrays import FloatArray

@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 
-from controller.loop.capabilities import playback_capabilities
-from controller.loop.envelopes import EnvelopeSupport, envelope_support, on_wire, thinned
-from controller.loop.routing import route, tones_by_era
+from controller.loop.capabilities import (
+    EnvelopeSupport,
+    envelope_support,
+    playback_capabilities,
+)
+from controller.loop.plate_set import on_wire, route, thinned, tones_by_era
 from drivers.contents import Layer
 from drivers.contents import Tone as Played
 from drivers.host.ledger import Ledger

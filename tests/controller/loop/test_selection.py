@@ -8,8 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.selection import Selector
 from controller.loop.table_query import strongest

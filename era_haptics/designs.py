@@ -27,7 +27,7 @@ from model.structure.support import MIN_RIGID_BODY_FREQUENCY
 class RankedLayout:
     """A layout of a design: its ERAs and its contrast.
 
-    contrast [dB]: robust felt contrast, mean over the numbers of quiet fingers, None unless its
+    contrast [dB]: promised felt contrast, mean over the numbers of quiet fingers, None unless its
     answers were judged; expected_contrast [dB]: the score by which the others are ranked, None for
     ERAs that do not support the plate.
     """

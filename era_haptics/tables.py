@@ -60,7 +60,7 @@ def query(
     level_db_sl: level at the target above its detection threshold, 20 dB is strong; drive_mode:
     the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
     loads: of each finger relative to the rig's fingertip, targets first, 1 without;
-    measures: compute transient and robust contrast and concentration, too, some ten milliseconds.
+    measures: compute transient and promised contrast and concentration, too, some ten milliseconds.
     Raises InputError for positions off the plate or at the same point, and a level that cannot be
     reached. The same as `era table query`.
     """

@@ -80,7 +80,7 @@ class TouchRow:
     Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
     fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a
     finger alone, and measured ones if the pattern was too short: predicted ones are of the table's
-    plate, robust ones are the promise, what nine of ten plates within the rig's uncertainty give;
+    plate, `robust_` ones are promised, what nine of ten plates within the rig's uncertainty give;
     felt ones are in levels, the others in accelerations; transient ones are over the first 100 ms
     of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms: from
     touch frame to last byte on the wire; reason: why nothing played, if so. fingers: of several

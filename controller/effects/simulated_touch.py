@@ -17,7 +17,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.effect_level import EffectLevels
-from model.table.pulse_gains import robust_over_effect_db
+from model.table.pulse_gains import promised_over_effect_db
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
@@ -104,7 +104,7 @@ class TouchSimulator:
         if resting is not None:
             over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
             resting_level = float(over[round(since * SAMPLE_RATE) :].max())
-            promised = robust_over_effect_db(pattern, level - resting_level)
+            promised = promised_over_effect_db(pattern, level - resting_level)
         return SimulatedTouch(
             at,
             resting,

@@ -295,7 +295,10 @@ class Learning:
         if self._robust is None or self.status.are_robust:
             return
         self._correct(self._robust, are_robust=True)
-        _logger.warning("plate: not watched for %g s, answers are robust ones", ROBUST_AFTER)
+        _logger.warning(
+            "plate: not watched for %g s, answers are those of a plate that is not known",
+            ROBUST_AFTER,
+        )
         self._changed(self.status)
 
     def _say(

@@ -164,7 +164,7 @@ def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Chann
 
 
 def contrast_figure(design: Design) -> Figure:
-    """Robust felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
+    """Promised felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
     eras = design.problem.eras(design.best.found.positions)

@@ -48,9 +48,9 @@ _LEVEL_MARGIN = 0.1  # dB
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Answers at contact sets (s,): robust felt contrast [dB] of the worst finger.
+    """Answers at contact sets (s,): promised felt contrast [dB] of the worst finger.
 
-    quiet (s,): numbers of quiet fingers; level_db_sl (s,): robust level of the weakest content.
+    quiet (s,): numbers of quiet fingers; level_db_sl (s,): promised level of the weakest content.
     """
 
     quiet: IntArray

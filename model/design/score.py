@@ -1,4 +1,4 @@
-"""A fast robust score of a layout: expected contrast over sampled contact sets.
+"""A fast score of a layout: expected contrast over sampled contact sets.
 
 As answers are found (`model.ensemble.touched_plate`, `model.drive_modes.coherent`), at a few
 frequencies, from the receptances of the free plate, and with each finger loading the plate where it

@@ -70,8 +70,8 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     """Draw the distribution of contrast over contact sets of 1, 2 and 3 other fingers."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    for others, (robust, _) in enumerate(overview.contrasts, start=1):
-        contrasts = np.sort(robust)
+    for others, (promised, _) in enumerate(overview.contrasts, start=1):
+        contrasts = np.sort(promised)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
         label = f"{others} other{'s' if others > 1 else ''}"
         if len(contrasts):

@@ -30,7 +30,7 @@ CONTACT_SETS = 64
 class Overview:
     """The map of a table, and its contrast to other fingers.
 
-    contrasts: to one, two and three others, each robust and nominal felt contrast [dB] of contact
+    contrasts: to one, two and three others, each promised and nominal felt contrast [dB] of contact
     sets (2, sets).
     """
 
@@ -74,7 +74,7 @@ def set_questions(
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     """Summarize a table; felt contrast [dB]: median and tenth percentile over contact sets.
 
-    Robust contrasts are those of nine of ten plates, the others those of the nominal plate;
+    Promised contrasts are those of nine of ten plates, the others those of the nominal plate;
     beside each one standard deviation by the choice of the sets.
     """
     weak = overview.cells

@@ -40,8 +40,8 @@ class Concentration:
 class Pattern:
     """An excitation with its ramp [s] and its predicted measures at the fingertips.
 
-    Robust measures are those that nine of ten plates within the rig's uncertainty reach, or at
-    quiet fingers do not exceed: the figures to promise. The others are those of the plate as
+    Promised measures (`robust_`) are those that nine of ten plates within the rig's uncertainty
+    reach, or at quiet fingers do not exceed. The others are nominal, those of the plate as
     modelled, with the fingers on it.
 
     - level_db_sl, robust_level_db_sl: at the weakest target; quiet_level_db_sl,
@@ -83,9 +83,9 @@ class Pattern:
 
     @property
     def highest_quiet_level_db_sl(self) -> float | None:
-        """Level at the loudest quiet point [dB SL], the robust one where it is known."""
-        robust = self.robust_quiet_level_db_sl
-        return self.quiet_level_db_sl if robust is None else robust
+        """Level at the loudest quiet point [dB SL], the promised one where it is known."""
+        promised = self.robust_quiet_level_db_sl
+        return self.quiet_level_db_sl if promised is None else promised
 
     @property
     def is_imperceptible_to_quiet(self) -> bool | None:

@@ -91,8 +91,8 @@ def find_pattern(
     means, loudest = over_fingertips(together, fingers.tips.fine_weights)
     count = len(question.targets)
     ratio = means[0, :count].min(axis=0) / np.sqrt(loudest[0, count:].max(axis=0))
-    nominal, _, robust = decibels(np.array(figures(ratio))).tolist()
-    return replace(pattern, contrast_db=nominal, robust_contrast_db=robust)
+    nominal, _, least = decibels(np.array(figures(ratio))).tolist()
+    return replace(pattern, contrast_db=nominal, robust_contrast_db=least)
 
 
 def _contents(table: "LocalizationTable", question: Question) -> Contents:

@@ -29,7 +29,7 @@ class PulseGains:
         """
         if self.quiet_db_sl is None:
             return None
-        return robust_over_effect_db(
+        return promised_over_effect_db(
             pattern, pattern.level_db_sl + min(self.targets) - self.quiet_db_sl
         )
 
@@ -106,25 +106,27 @@ four of five of those of four ERAs do.
 """
 
 
-def contrast_over_effect(ringing: FloatArray, steady: FloatArray, robust: FloatArray) -> FloatArray:
+def contrast_over_effect(
+    ringing: FloatArray, steady: FloatArray, promised: FloatArray
+) -> FloatArray:
     """Contrast over a duration on nine of ten plates, as a ratio of amplitudes.
 
-    ringing: over the duration on the nominal plate; steady, robust: of the steady vibration on
+    ringing: over the duration on the nominal plate; steady, promised: of the steady vibration on
     the nominal plate, and on nine of ten. What other plates add at the quiet fingers is felt
     over the duration as at the target, in phase with the ringing by a part.
     """
-    others = np.sqrt(np.maximum(robust**-2.0 - steady**-2.0, 0.0))
+    others = np.sqrt(np.maximum(promised**-2.0 - steady**-2.0, 0.0))
     own = 1.0 / ringing
     return np.asarray((own**2 + 2 * _IN_PHASE * own * others + others**2) ** -0.5)
 
 
-def robust_over_effect_db(pattern: Pattern, ringing_db: float) -> float:
+def promised_over_effect_db(pattern: Pattern, ringing_db: float) -> float:
     """Contrast over a duration on nine of ten plates [dB], from that on the nominal plate.
 
     pattern: with the steady contrasts.
     """
-    steady, robust = pattern.felt_contrast_db, pattern.robust_felt_contrast_db
-    if steady is None or robust is None:
+    steady, promised = pattern.felt_contrast_db, pattern.robust_felt_contrast_db
+    if steady is None or promised is None:
         return ringing_db
-    ratios = 10 ** (np.array([ringing_db, steady, robust]) / 20)
+    ratios = 10 ** (np.array([ringing_db, steady, promised]) / 20)
     return float(decibels(contrast_over_effect(*ratios)))

@@ -126,7 +126,7 @@ class AnswerCheck:
 
 @dataclass(frozen=True)
 class PromiseCheck:
-    """Exact plates on which the answers keep their robust felt contrast: share, and number."""
+    """Exact plates on which the answers keep their promised felt contrast: share, and number."""
 
     kept_share: float
     plate_count: int
@@ -246,7 +246,7 @@ def verify_table(
 def _kept_share(
     table: LocalizationTable, question: Question, pattern: Pattern, rng: np.random.Generator
 ) -> float:
-    """Share of exact plates on which an answer keeps its robust felt contrast."""
+    """Share of exact plates on which an answer keeps its promised felt contrast."""
     plates = draw_plates(
         rng,
         table.uncertainty,

@@ -53,8 +53,8 @@ class WeakCells:
     """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
 
     -inf where the level is not reached, NaN on a plate too small for two fingers. errors_db: one
-    standard deviation of both by the choice of the other fingers, (2, cells). pairs_db: robust and
-    nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
+    standard deviation of both by the choice of the other fingers, (2, cells). pairs_db: promised
+    and nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
     """
 
     grid: Grid
@@ -128,7 +128,7 @@ def find_weak_cells(
 
 
 def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
-    """Robust and nominal felt contrast [dB] of answers that reach the level, (2, answers)."""
+    """Promised and nominal felt contrast [dB] of answers that reach the level, (2, answers)."""
     return np.array([*filter(None, answered)], dtype=float).reshape(-1, 2).T
 
 
@@ -157,7 +157,7 @@ def pair_questions(table: LocalizationTable) -> list[list[Question]]:
 
 
 def ask_once(table: LocalizationTable) -> Ask:
-    """Robust and nominal felt contrast [dB] of questions, None where the level is not reached.
+    """Promised and nominal felt contrast [dB] of questions, None where the level is not reached.
 
     Questions that mirror each other, where plate, ERAs and masses do, have one answer, so that the
     noise of the drawn plates does not make several samples of one.
@@ -174,13 +174,13 @@ def ask_once(table: LocalizationTable) -> Ask:
 
 
 def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
-    """Robust and nominal felt contrast [dB] of a question, None where the level is not reached."""
+    """Promised and nominal felt contrast [dB], None where the level is not reached."""
     try:
         found = table.query(question)
     except InputError:
         return None
-    robust, nominal = found.robust_felt_contrast_db, found.felt_contrast_db
-    return None if robust is None or nominal is None else (robust, nominal)
+    promised, nominal = found.robust_felt_contrast_db, found.felt_contrast_db
+    return None if promised is None or nominal is None else (promised, nominal)
 
 
 def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:

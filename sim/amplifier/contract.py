@@ -113,6 +113,7 @@ class Amplifier:
         self.token = 0
         """Of the set since arming that changed last what plays, and began t; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
+        self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
         self.is_derated = False
 
@@ -168,7 +169,7 @@ class Amplifier:
         """Return the values of the status at a time [s] up to which it has been ticked."""
         levels, is_on = self._levels(now)
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
-        decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
+        decayed = math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE))
         # A sum that lasts is limited again and again.
         self._is_limited |= any(self.playback.level(each, now) > LIMITED for each in self._channels)
         flags = {
@@ -345,6 +346,8 @@ class Amplifier:
         """Silence every channel within the ramp [s], and discard what is staged."""
         self.playback.silence(moment, ramp)
         self._silent_from = max(self.playback.silent_from, moment)
+        if self.state in ("SWITCHED_ON", _ENABLED):
+            self._discharged_from = self._silent_from
         self._intake.drop()
         self._changed(moment)
 

@@ -95,7 +95,10 @@ def test_restart_forgets_all_but_its_faults() -> None:
 
 
 def test_high_voltage_is_on_while_armed_and_discharges() -> None:
-    """1800 V; 1800/e after 20 ms without it, a current of 2 pi f/2 C U in a capacitor of 1 nF."""
+    """1800 V; 1800/e after 20 ms without it, a current of 2 pi f/2 C U in a capacitor of 1 nF.
+
+    None in one that is stopped and was never armed.
+    """
     amplifier = armed()
     play(amplifier, 1, 0.0, tone(0, 2000, 10000), ramp=0)
     measured = amplifier.handle("GetMeasured", {}, 0.01)["channels"][0]
@@ -104,3 +107,4 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
     assert amplifier.handle("GetStatus", {}, 0.12)["voltage"] == round(1800 / math.e)
+    assert Amplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["voltage"] == 0

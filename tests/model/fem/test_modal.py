@@ -8,6 +8,7 @@ import pytest
 from long_form import shortly
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
+from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_from_dict, parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
@@ -56,6 +57,19 @@ def test_modes_refuses_an_impossible_count(coarse_rig, count):
     """No modes, or more than the mesh has degrees of freedom, is bad input."""
     with pytest.raises(InputError, match=f"^modes .*got {count}"):
         natural_modes(coarse_rig, count, support="eras")
+
+
+def test_acceleration_of_a_rigid_plate_equals_mass_on_springs(coarse_rig):
+    """Driven evenly, a plate 20 mm thick follows the one-mass transmissibility by hand."""
+    plate = replace(coarse_rig.plate, thickness=0.020)
+    soft = tuple(Era(e.name, e.x, e.y, 500.0, 2.0, 0.003, 1e-4) for e in coarse_rig.eras)
+    omega = 2 * np.pi * 8.0
+    free = solve_free_plate(plate, coarse_rig.mesh, frequency_max=500.0)
+    response = free.acceleration(soft, np.array([8.0]), coarse_rig.mesh.nodes)
+    mass = plate.mass + 4 * 0.003
+    spring = 4 * (500.0 + 1j * omega * 2.0)
+    by_hand = -(omega**2) * 1e-4 * spring / (spring - omega**2 * mass)
+    np.testing.assert_allclose(response[0].sum(axis=0), by_hand, rtol=2e-3)
 
 
 MESHES = [Mesh(12, 9, LENGTH, WIDTH), Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["MITC4"], 0.002)] + [

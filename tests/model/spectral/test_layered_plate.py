@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import linalg
 
 from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.elasticity import strip_frequencies
@@ -14,6 +15,7 @@ from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
+from model.spectral.direct import AtOneFrequency
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
@@ -78,6 +80,27 @@ def test_layers_of_one_material_are_the_homogeneous_plate():
     mesh = Mesh.accurate(plate, frequency_max=500.0)
     exact = homogeneous_frequencies(plate, mesh)
     np.testing.assert_allclose(found[:9], exact[:9], rtol=2e-3)
+
+
+def test_complex_modes_equal_a_complex_eigenproblem():
+    """Of a core with a loss factor of 1, frequency within 0.1 % and loss within 1 %.
+
+    The eigenvalue of the dynamic stiffness, solved at its own frequency without a modal space.
+    """
+    plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]), loss_factor=0.0)
+    layered = AtOneFrequency(plate, (10, 8), 150.0)
+    modes = layered.modes(
+        (1, 1), shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * 500) ** 2, band=Band(30.0, 500.0)
+    )
+    for square, loss in list(zip(modes.eigenvalues, modes.losses, strict=True))[1:4]:
+        frequency = np.sqrt(square) / (2 * np.pi)
+        D = layered.dynamic_stiffness((1, 1), frequency)
+        inertia = plate.material.rho * plate.thickness
+        K = D / inertia + square * np.eye(len(D))
+        values = linalg.eigvals(K)
+        exact = values[np.argmin(np.abs(values - (square + 1j * loss)))]
+        assert square == pytest.approx(exact.real, rel=2e-3)
+        assert loss == pytest.approx(exact.imag, rel=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from controller.cli.daemon import DashboardCommand, arm, daemon, of_method, status, touch, watch
+from controller.cli.daemon import (
+    DASHBOARD,
+    DashboardCommand,
+    arm,
+    daemon,
+    of_method,
+    status,
+    touch,
+    watch,
+)
 from controller.cli.demo import demo
 from controller.cli.layout import layout_app
 from controller.cli.rig import rig_app
@@ -17,7 +26,7 @@ from model.errors import InputError
 def gateway(
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Address to listen on; port 0: any free one.")
-    ] = "127.0.0.1:8137",
+    ] = DASHBOARD,
     socket: Annotated[
         Path | None, typer.Option(help="The daemon's socket (default: the usual one).")
     ] = None,
@@ -75,7 +84,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, [HOST]:PORT or PORT alone."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdecimal()):
-        raise InputError(f"--listen must be HOST:PORT, such as 127.0.0.1:8137, got {text}")
+        raise InputError(f"--listen must be HOST:PORT, such as {DASHBOARD}, got {text}")
     return host.strip("[]") or "127.0.0.1", int(port)
 
 

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import signal
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from controller.api.schema import headline
@@ -96,7 +96,7 @@ class Daemon:
         self.learning: Learning | None = None
         """What learns the plate, if anything is to be learned."""
         timing = Timing(table)
-        self._controller = Controller(
+        self._controller = self._supervisor.controller = Controller(
             config.rig,
             table,
             lines=lines,
@@ -137,7 +137,7 @@ class Daemon:
             on_disconnect=self._api.client_left,
             holds_lease=self._api.holds_lease,
             is_busy=lambda: self._controller.is_preparing,
-            stop_all=self._stop_all,
+            stop_all=self._supervisor.stop_anyhow,
             clock=clock.now,
         )
         self._gateway: asyncio.Task[None] | None = None
@@ -157,9 +157,7 @@ class Daemon:
         try:
             await self._server.open(lock.bind())
             self._log.listener = self._publisher.logged
-            running = asyncio.create_task(
-                self._supervisor.run(self._controller), name="control loop"
-            )
+            running = asyncio.create_task(self._supervisor.run(), name="control loop")
             self._inputs.start(self._config.touch)
             if self._dashboard is not None:
                 options = gateway_options(self._dashboard, self._config.socket)
@@ -245,13 +243,6 @@ class Daemon:
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
-
-    def _stop_all(self) -> Awaitable[object]:
-        """Stop all amplifiers where a client's stop has failed on its way, and latch that."""
-        try:
-            return asyncio.ensure_future(self._controller.group.stop())
-        finally:
-            self._supervisor.latch_stop("stopped, though the request failed on its way")
 
     def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Follow amplifiers whose lines have been opened."""

@@ -61,6 +61,9 @@ class Operator:
     receives the kind of change, the lost amplifiers ("lost" only) and a message.
     """
 
+    controller: Controller
+    """With the amplifiers; to be set before all else, since it is made with the observer."""
+
     def __init__(
         self,
         *,
@@ -71,7 +74,6 @@ class Operator:
         self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed
-        self._controller_if_running: Controller | None = None
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
         self._clears: list[int] = []  # epochs of those in progress
         self._reports = DeferredCalls()
@@ -95,10 +97,6 @@ class Operator:
     def post(self, event: DaemonEvent) -> None:
         """Apply an event at once and carry out its actions in a task."""
         self._spawn(self._in_background(self._applied(event)))
-
-    def latch_stop(self, cause: str) -> None:
-        """Latch a stop that was requested of the amplifiers already; raises nothing."""
-        call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
 
     def renew(self, token: str) -> Lease:
         """Renew the lease of a token; raises RpcError if it has expired or is another's."""
@@ -189,9 +187,17 @@ class Operator:
 
         The requests to the amplifiers are queued when this returns.
         """
-        stopping = self._spawn(self._stopped(self._controller.stop()))
+        stopping = self._spawn(self._stopped(self.controller.stop()))
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
+
+    def stop_anyhow(self) -> Awaitable[object]:
+        """Stop all amplifiers where a client's stop has failed on its way, and latch that."""
+        cause = "stopped, though the request failed on its way"
+        try:
+            return asyncio.ensure_future(self.controller.group.stop())
+        finally:
+            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
 
     def assume_energised(self, now: float) -> bool:
         """Whether a lost amplifier may still be playing at a time [s].
@@ -203,22 +209,16 @@ class Operator:
         return lost is not None and now < max(lost.energised_until, self._may_play_until)
 
     @property
-    def _controller(self) -> Controller:
-        if self._controller_if_running is None:
-            raise RuntimeError("supervisor is not running")
-        return self._controller_if_running
-
-    @property
     def _may_play_until(self) -> float:
         """When [s] the watchdog must have silenced each amplifier as identified last."""
-        known = self._controller.amplifiers.values()
+        known = self.controller.amplifiers.values()
         return max((each.feeding.may_play_until for each in known), default=-math.inf)
 
     def _energised_until(self, now: float) -> float:
         """When [s] amplifiers that are lost now must be silent; one never seen may be armed."""
-        if self._controller.amplifiers:
+        if self.controller.amplifiers:
             return self._may_play_until
-        return now + self._controller.watchdog + _WATCHDOG_MARGIN
+        return now + self.controller.watchdog + _WATCHDOG_MARGIN
 
     def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         report = partial(self._link_observer, change, lost, message)
@@ -231,7 +231,7 @@ class Operator:
             case Action.ARM:
                 await self._over_link(self._arm(), epoch)
             case Action.DISARM:
-                await self._over_link(self._controller.disarm(), epoch)
+                await self._over_link(self.controller.disarm(), epoch)
             case Action.STOP:
                 await self._stop()
             case Action.REACT:
@@ -241,10 +241,10 @@ class Operator:
             case Action.CLEAR:
                 await self._over_link(self._clear(epoch), epoch)
             case Action.RECONNECT:
-                await self._controller.release()
+                await self.controller.release()
                 self._changed.set()
             case Action.CLOSE:
-                await self._controller.close()
+                await self.controller.close()
 
     async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
         """Await work that needs the link; a loss or refusal becomes an event, then is raised.
@@ -268,7 +268,7 @@ class Operator:
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
         """Await a stop of all amplifiers; one that is lost is a lost link."""
         stopped = await stopping
-        outcomes = {name: stopped.get(name, _NOT_CONNECTED) for name in self._controller.urls}
+        outcomes = {name: stopped.get(name, _NOT_CONNECTED) for name in self.controller.urls}
         try:
             await self._check_links()
         except Exception:
@@ -276,7 +276,7 @@ class Operator:
         return outcomes
 
     async def _stop(self) -> None:
-        await self._stopped(self._controller.stop())
+        await self._stopped(self.controller.stop())
 
     @property
     def _is_loss_handled(self) -> bool:
@@ -285,19 +285,19 @@ class Operator:
 
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
-        causes = self._controller.group.lost_by.values()
+        causes = self.controller.group.lost_by.values()
         if causes and not self._is_loss_handled:
             await self._handle_loss(LinkError(next(iter(causes))))
 
     async def _arm(self) -> None:
-        await self._controller.arm()
+        await self.controller.arm()
         await self.handle(DaemonEvent(Trigger.ARMED, self.operation.cause))
 
     async def _verify(self, epoch: int) -> None:
         """Disarm what still plays, then read back all amplifiers."""
-        is_armed = is_any_armed(await self._controller.group.statuses())
+        is_armed = is_any_armed(await self.controller.group.statuses())
         if is_armed and epoch == self.operation.epoch:
-            await self._controller.disarm()
+            await self.controller.disarm()
         problem = await self._read_back(epoch)
         if epoch != self.operation.epoch:
             return  # stopped, or verified and armed, in the meantime
@@ -338,8 +338,8 @@ class Operator:
         for _ in range(_MAX_READ_BACKS):
             if clears:
                 self._check_none_since(epoch)
-                await self._controller.clear()
-            group = self._controller.group
+                await self.controller.clear()
+            group = self.controller.group
             problem = find_problem(await group.statuses(), group.amplifiers)
             if problem is None or epoch != self.operation.epoch:
                 break
@@ -349,7 +349,7 @@ class Operator:
     async def _handle_loss(self, error: LinkError) -> None:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
-            group = self._controller.group
+            group = self.controller.group
             lost = *group.lost_by, *group.degraded
             text = str(error)
             if self.operation.state is not DaemonState.COMM_LOST:

@@ -20,7 +20,6 @@ from controller.daemon.states import (
     DaemonState,
     Trigger,
 )
-from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
@@ -42,7 +41,7 @@ _logger = logging.getLogger(__name__)
 class Supervisor(Operator):
     """The operation of the plate by the amplifiers of a controller.
 
-    The controller must be created with `observer` and `connected` of this supervisor.
+    Its controller must be created with its `observer` and `connected`.
     link_changed receives the kind of change, the lost amplifiers ("lost" only) and a message; alive
     is called after each cycle of the control loop, which runs in every state.
     """
@@ -83,14 +82,13 @@ class Supervisor(Operator):
         for name, amplifier in amplifiers.items():
             amplifier.listeners.append(partial(self._amplifier_event, name))
 
-    async def run(self, controller: Controller) -> None:
+    async def run(self) -> None:
         """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.
 
         Amplifiers that do not reply at the start, or refuse, are searched for as after a loss; one
         in a fault leads to the state FAULT. Raises CommandError and InputError for
         amplifiers that do not fit the configuration, RuntimeError if the control loop ends early.
         """
-        self._controller_if_running = controller
         loop = asyncio.create_task(self._run_control_loop(), name="control loop")
         try:
             await self._open()
@@ -113,7 +111,7 @@ class Supervisor(Operator):
         """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
         while True:
             try:
-                await self._controller.run()
+                await self.controller.run()
             except Exception as error:
                 _logger.exception("control loop failed, stopping all amplifiers")
                 await self._stop_after(error)
@@ -131,28 +129,27 @@ class Supervisor(Operator):
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
         self._closing.set()
-        if self._controller_if_running is not None:
-            await self.handle(DaemonEvent(Trigger.CLOSE, cause))
+        await self.handle(DaemonEvent(Trigger.CLOSE, cause))
         self._reports.flush()
 
     async def _open(self) -> None:
         """Open and verify the amplifiers; without a good reply they are searched for."""
         event = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
         try:
-            await self._controller.open()
+            await self.controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
             self._link_changed("retry", (), str(error))
             lost = error.lost if isinstance(error, LinkError) else ()
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING, amplifiers=lost)
         if self._closing.is_set():
-            await self._controller.close()
+            await self.controller.close()
         else:
             await self._in_background(self.handle(event))
 
     @property
     def _must_reopen(self) -> bool:
         """Whether amplifiers are lost, and all lines are closed."""
-        return self.operation.state is DaemonState.COMM_LOST and self._controller.is_released
+        return self.operation.state is DaemonState.COMM_LOST and self.controller.is_released
 
     async def _fail(self, error: Exception) -> None:
         await super()._fail(error)
@@ -166,7 +163,7 @@ class Supervisor(Operator):
                 await self._reconnect()
             finally:
                 if self.operation.state is DaemonState.COMM_LOST:
-                    await self._controller.release()
+                    await self.controller.release()
         except DriverError as error:
             _logger.info("failed: %s", error)
         except Exception:
@@ -182,19 +179,19 @@ class Supervisor(Operator):
             await self._pause(pause)
         while self.assume_energised(clock.now()) and not self._closing.is_set():
             await self._pause(_RECHECK)
-        if self._controller.group.is_open:  # none was lost again
+        if self.controller.group.is_open:  # none was lost again
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
         """Open all amplifiers, disarmed; none that may be armed stays open."""
         try:
-            await self._controller.open()
-            await self._controller.disarm()  # a short loss may not have expired the watchdog
+            await self.controller.open()
+            await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             self._link_changed("retry", (), str(error))
             if isinstance(error, LinkError):
                 self.note_lost(error.lost)
-            await self._controller.release()
+            await self.controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
         return True
@@ -217,12 +214,12 @@ class Supervisor(Operator):
                     await self._changed.wait()
                     self._changed.clear()
                 return
-        if self._controller.group.state not in _SILENT:
+        if self.controller.group.state not in _SILENT:
             return
         try:
             await self._check_disarmed()
         except LinkError as error:
-            if not self._controller.group.is_degraded_only(error):
+            if not self.controller.group.is_degraded_only(error):
                 await self._in_background(self._handle_loss(error))
         except DriverError:
             pass  # preempted by another request, which reports for itself
@@ -230,7 +227,7 @@ class Supervisor(Operator):
             _logger.exception("status read failed")
 
     async def _check_disarmed(self) -> None:
-        epoch, group = self.operation.epoch, self._controller.group
+        epoch, group = self.operation.epoch, self.controller.group
         statuses = await group.statuses()
         if epoch != self.operation.epoch or group.is_silencing:
             return  # they may have been read before, or during a ramp
@@ -249,12 +246,12 @@ class Supervisor(Operator):
     def _check_own_stop(self, cause: str) -> None:
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
-        if is_armed and self._controller.group.state in _SILENT:
+        if is_armed and self.controller.group.state in _SILENT:
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""
-        group, operation = self._controller.group, self.operation
+        group, operation = self.controller.group, self.operation
         degraded = group.degraded
         is_said = bool(degraded) is bool(operation.degraded)
         if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.lost_by:

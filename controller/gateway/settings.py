@@ -11,9 +11,6 @@ from pathlib import Path
 
 from model.errors import InputError
 
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8137
-
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{22,128}")  # valid in a URL and in a WebSocket subprotocol
 _HOST_NAME = re.compile(r"[A-Za-z0-9._-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
@@ -31,8 +28,8 @@ class Settings:
     """
 
     socket: Path
-    host: str = DEFAULT_HOST
-    port: int = DEFAULT_PORT
+    host: str = "127.0.0.1"
+    port: int = 0
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     certificate: Path | None = None
     key: Path | None = None

@@ -187,7 +187,8 @@ class _Run:
         )
         self.witness.follow(controller)
         controller.run = partial(self._run_on, controller.run)  # type: ignore[method-assign]
-        self.hosting = asyncio.create_task(supervisor.run(controller))
+        supervisor.controller = controller
+        self.hosting = asyncio.create_task(supervisor.run())
 
     def _seen(self, link: str, toward: str, data: bytes) -> None:
         """Note bytes on a wire."""

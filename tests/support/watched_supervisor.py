@@ -300,7 +300,8 @@ async def watched(
     daemon = Watched(supervisor, bench.controller, bench.far_ends)
     if refuses:
         daemon.refuse("GetCaps")
-    running = asyncio.create_task(supervisor.run(bench.controller))
+    supervisor.controller = bench.controller
+    running = asyncio.create_task(supervisor.run())
     await supervisor.started.wait()
     await asyncio.sleep(0.005)
     try:

@@ -79,8 +79,8 @@ class Panel(TouchSource):
     ended: list[str] = field(default_factory=list)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver a frame."""
-        deliver(TouchFrame(self.name, 0.0, ()))
+        """Deliver a frame, of a touch that is and one that is none."""
+        deliver(TouchFrame(self.name, 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
         if self.error is not None:
             raise self.error
         try:
@@ -92,50 +92,35 @@ class Panel(TouchSource):
 async def test_inputs_run_beside_each_other(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Frames carry the configured name, a failure is reported, and the others run on."""
+    """Frames carry the configured name and lie on the plate; a failure lifts, the others run on.
+
+    They keep their time and ids; not finite stays so, for contacts to refuse.
+    """
     panels = {
         "a:": Panel("x\x1b[2J"),
         "b:": Panel("y", OSError("unplugged")),
         "c:": Panel("z"),
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
-    frames: list[str] = []
+    frames: list[TouchFrame] = []
     lifted: list[str] = []
-    inputs = TouchInputs(lambda frame: frames.append(frame.source), lifted.append)
+    inputs = TouchInputs(frames.append, lifted.append)
     one, two, three = (
-        TouchInput(name, url, TouchCalibration())
+        TouchInput(name, url, turned(180))
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
     )
     inputs.start([one, two, three])
     await until(lambda: len(frames) == 3 and caplog.messages)
-    assert sorted(frames) == ["left:'x\\x1b[2J'", "right:y", "table:z"]
+    assert sorted(each.source for each in frames) == ["left:'x\\x1b[2J'", "right:y", "table:z"]
+    for frame in frames:
+        assert (frame.time, frame.timeout) == (1.5, 3.0)
+        assert frame.touches[0] == Touch(4, 0.75, 0.5)
+        assert (frame.touches[1].id, math.isnan(frame.touches[1].x)) == (5, True)
     assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
     assert lifted == ["right:"]
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
     assert sorted(lifted[1:]) == ["left:", "table:"]
-
-
-async def test_input_maps_touches_to_the_plate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames keep their time and ids; not finite stays so, for contacts to refuse."""
-
-    class Once(TouchSource):
-        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
-
-    monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Once())
-    seen: list[TouchFrame] = []
-    lifted: list[str] = []
-    inputs = TouchInputs(seen.append, lifted.append)
-    inputs.start([TouchInput("left", "a:", turned(180))])
-    await until(lambda: lifted)
-    (frame,) = seen
-    assert (frame.source, frame.time, frame.timeout) == ("left:panel", 1.5, 3.0)
-    assert frame.touches[0] == Touch(4, 0.75, 0.5)
-    assert frame.touches[1].id == 5
-    assert math.isnan(frame.touches[1].x)
-    assert lifted == ["left:"]
-    await inputs.close()
 
 
 LEFT: list[TouchInputs] = []

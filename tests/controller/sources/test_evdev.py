@@ -5,7 +5,8 @@ import contextlib
 import errno
 import os
 import struct
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,34 +77,26 @@ class PipePanel:
         os.close(self.into)
 
 
-Seen = list[tuple[float, dict[int, tuple[float, float]]]]
-
-
 async def follow(
-    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]], *, url: str = "evdev:p"
-) -> Seen:
+    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]], *, options: str = ""
+) -> list[TouchFrame]:
     """What a source delivers [s from the start] while something plays; panels are opened in turn.
 
-    An exception that the source raises is raised here.
+    An exception that the source raises is raised here. options: of its URL.
     """
-    seen: Seen = []
+    seen: list[TouchFrame] = []
     start = asyncio.get_running_loop().time()
 
     def deliver(frame: TouchFrame) -> None:
         assert frame.source == "evdev:p"
-        seen.append(
-            (
-                round(frame.time - start, 6),
-                {touch.id: (touch.x, touch.y) for touch in frame.touches},
-            )
-        )
+        seen.append(replace(frame, time=round(frame.time - start, 6)))
 
     def open_panel(path: str, *, grab: bool) -> PipePanel:
         if not panels:
             raise InputError("not there")
         return panels.pop(0)
 
-    source = EvdevSource(url, open_panel=open_panel)
+    source = EvdevSource(f"evdev:p{options}", open_panel=open_panel)
     running = asyncio.create_task(source.run(deliver))
     await asyncio.sleep(0)
     await play()
@@ -113,11 +106,9 @@ async def follow(
     return seen
 
 
-def touches_of(
-    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]]
-) -> list[dict[int, tuple[float, float]]]:
-    """The touches of each frame that a source delivers while something plays."""
-    return [touches for _, touches in run_virtual(follow(panels, play))]
+def touches_of(frames: Iterable[TouchFrame]) -> list[dict[int, tuple[float, float]]]:
+    """The touches of each frame."""
+    return [{touch.id: (touch.x, touch.y) for touch in frame.touches} for frame in frames]
 
 
 def test_evdev_source_follows_fingers() -> None:
@@ -138,7 +129,7 @@ def test_evdev_source_follows_fingers() -> None:
         os.write(panel.into, raw("slot 0 x 900", dropped=True))
         await asyncio.sleep(0.01)
 
-    assert touches_of([panel], play) == [
+    assert touches_of(run_virtual(follow([panel], play))) == [
         {5: (0.5, 0.5)},
         {5: (0.6, 0.5)},
         {5: (0.6, 0.5), 7: (0.25, 0.2)},
@@ -163,13 +154,8 @@ def test_evdev_source_repeats_resting_fingers() -> None:
         await asyncio.sleep(0.2)
 
     seen = run_virtual(follow([panel], play))
-    assert seen == [
-        (0.0, {}),
-        (0.0, {7: (0.0, 0.0)}),
-        (0.05, {7: (0.0, 0.0)}),
-        (0.1, {7: (0.0, 0.0)}),
-        (0.15, {}),
-    ]
+    assert [frame.time for frame in seen] == [0.0, 0.0, 0.05, 0.1, 0.15]
+    assert touches_of(seen) == [{}, *[{7: (0.0, 0.0)}] * 3, {}]
 
 
 def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
@@ -192,7 +178,7 @@ def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
         await asyncio.sleep(0.05)
 
     middle, corner = (0.5, 0.5), (0.25, 0.2)
-    assert touches_of([panel], play) == [
+    assert touches_of(run_virtual(follow([panel], play))) == [
         {},
         *({5: middle}, {}, {}, {6: middle}, {}),
         *({}, {}, {}, {9: corner}),
@@ -219,20 +205,12 @@ def test_evdev_source_reports_loads(
     """By force where the pressure has a unit or a value of its own, else by size."""
     panel = PipePanel()
     panel.resolutions = resolutions
-    seen: list[TouchFrame] = []
-
-    def opened(path: str, *, grab: bool) -> PipePanel:
-        return panel
 
     async def play() -> None:
-        source = EvdevSource(f"evdev:p{options}", open_panel=opened)
-        running = asyncio.create_task(source.run(seen.append))
-        await asyncio.sleep(0)
         os.write(panel.into, raw("id 7 x 0 y 0 pressure 510 major 188"))
         await asyncio.sleep(0.01)
-        running.cancel()
 
-    run_virtual(play())
+    seen = run_virtual(follow([panel], play, options=options))
     (touch,) = seen[-1].touches
     assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
 
@@ -256,8 +234,8 @@ def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
         await asyncio.sleep(0.01)
 
     seen = run_virtual(follow(panels, play))
-    assert [touches for _, touches in seen] == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
-    assert seen[1][0] <= 0.06
+    assert touches_of(seen) == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
+    assert seen[1].time <= 0.06
 
 
 def test_ioctl_request_numbers() -> None:

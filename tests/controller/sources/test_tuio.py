@@ -126,6 +126,18 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
             (0.6, PEER, frame(*HALF, fseq=2), HALF),
         ],
     ),
+    # They may use the same ids and numbers, behind one address or behind two.
+    "senders are kept apart": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=100, source="a"), QUARTER),
+            (0, PEER, frame(*HALF, fseq=100, source="b"), HALF),
+            (0, OTHER, frame(fseq=100, source="a"), []),
+            (0, PEER, frame((1, 0.75, 0.5), fseq=99, source="c"), [(1, 0.75, 0.5)]),
+            (0, PEER, of(message("alive", 1), message("fseq", 101), source="a"), QUARTER),
+            (0, PEER, of(message("alive", 1), message("fseq", 101), source="b"), HALF),
+        ],
+    ),
     # The seventeenth sender is refused and counted until one has been quiet for a while.
     "senders are bounded": (
         {"too_many_senders": 1},
@@ -189,27 +201,6 @@ def test_reader_follows_its_senders(reader: TuioReader, name: str) -> None:
     found = counts(reader)
     assert found.keys() == expected.keys()
     assert all(count in (..., found[what]) for what, count in expected.items())
-
-
-def test_sources_are_kept_apart(reader: TuioReader) -> None:
-    """Two senders may use the same ids and numbers, behind one address or behind two."""
-    for name, peer in (("a", PEER), ("b", PEER), ("a", ("192.0.2.8", 50000))):
-        reader.read(frame((1, 0.25, 0.5), fseq=100, source=name), peer, now=0)
-    other = frame((1, 0.75, 0.5), fseq=99, source="c")
-    assert touches(reader.read(other, PEER, now=0)) == [(1, 0.75, 0.5)]
-    still = bundle(message("source", "a"), message("alive", 1), message("fseq", 101))
-    result = reader.read(still, PEER, now=0)
-    assert touches(result) == [(1, 0.25, 0.5)]
-    names = {
-        result.source
-        for result in (
-            reader.read(frame(fseq=102, source=name), peer, now=0)
-            for name in ("a", "b")
-            for peer in (PEER, ("192.0.2.8", 50000))
-        )
-        if result
-    }
-    assert len(names) == 4
 
 
 def _raw(*sizes_and_parts: tuple[int, bytes]) -> bytes:

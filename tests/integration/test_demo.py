@@ -10,20 +10,17 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import controller.demo.far_end
 import controller.demo.run
 import live_demonstration
 from controller.api.client import Client
-from controller.cli.commands import app
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
 from controller.demo.run import Scene, layout_of_people
 from controller.sources.capture import read_capture
 from gateway_bench import wait_for
 from installed_program import ERA
-from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
 from tuio_messages import write_schedule
@@ -200,10 +197,3 @@ def test_page_and_daemon(tmp_path: Path) -> None:
         finally:
             process.kill()
     assert not socket.exists()
-
-
-def test_touches_come_from_the_page() -> None:
-    """A recording, or JSON of its rows, is refused beside it."""
-    for option in (["--touches", "x.tuio"], ["--json"]):
-        done = CliRunner().invoke(app, ["demo", "--dashboard", *option])
-        assert isinstance(done.exception, InputError)

@@ -1,4 +1,4 @@
-"""Sixteen ERAs on four amplifiers of four channels, on one bus and on four lines, in virtual time.
+"""Amplifiers over wires in virtual time: sixteen ERAs on four, and what full level is.
 
 The controller and its wires are the project's own; a table that always has the same pattern, in
 which every ERA plays, stands for the search.
@@ -15,11 +15,16 @@ import pytest
 
 import model
 from chain import Chain
+from controller.diagnosis.tone_player import TonePlayer
+from drivers.errors import LinkError
 from drivers.host.members import GroupState
-from long_form import in_turn
+from drivers.opening import Lines
+from long_form import in_turn, shortly
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
+from model.rig.rig import Rig
 from model.vibration.excitation import Tone
+from rig_on_wire import WIRES
 from set_table import SetTable
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
@@ -123,3 +128,28 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         four.far.devices[lost].recover()
         await holding
         assert not any(level for each in four.levels().values() for level in each)
+
+
+@pytest.mark.parametrize("of_rig", [False, True])
+@pytest.mark.parametrize("of_amplifier", [False, True])
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "can+slcan"]))
+@in_virtual_time
+async def test_motion_and_output_are_not_taken_for_each_other(
+    wire: str, of_amplifier: bool, of_rig: bool, coarse_rig: Rig
+) -> None:
+    """An amplifier opens, for touches and for measurements, where its full level is the rig's."""
+    rigs = {False: coarse_rig, True: replace(coarse_rig, outputs=frozenset(coarse_rig.amplifiers))}
+    rig = rigs[of_rig]
+    table = SetTable({}, rig.plate)
+    async with Chain.on(WIRES[wire], rig, table, plate=rigs[of_amplifier]) as chain:
+        controller, player = chain.controller, TonePlayer(rig, Lines, chain.far.urls)
+        if of_amplifier is of_rig:
+            await controller.open()
+            await controller.close()
+            await player.open()
+            await player.close()
+            return
+        for each in (controller, player):
+            with pytest.raises(LinkError, match="full level must be"):
+                await each.open()
+        await player.close()

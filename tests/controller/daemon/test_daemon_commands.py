@@ -61,18 +61,6 @@ def test_dashboard_option_has_optional_address(
     assert calls == [("d.yaml", address)] * 2
 
 
-@pytest.mark.parametrize("command", [["daemon", "d.yaml"], ["demo"]])
-def test_dashboard_is_refused_before_anything_starts_when_not_installed(
-    monkeypatch: pytest.MonkeyPatch, command: list[str]
-) -> None:
-    """Nothing is printed, and no daemon runs without the page that was asked for."""
-    monkeypatch.setattr("controller.gateway.settings.find_spec", lambda name: None)
-    result = CliRunner().invoke(app, [*command, "--dashboard"])
-    assert isinstance(result.exception, InputError)
-    assert "pip install -e '.[gateway]'" in str(result.exception)
-    assert not result.stdout
-
-
 def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -39,6 +39,8 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """A selection and what the amplifiers are to play for it.
 
+    selection: what is felt, or why not; asked: what was selected before limits of time and ledgers
+    left contents out, None to decide it again.
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
@@ -50,6 +52,7 @@ class Decision:
     selection: Selection
     from_rest: bool
     triggered_at: float
+    asked: Selection | None
     sets: Mapping[int, PlateSet] = field(default_factory=dict)
     started: frozenset[int] = frozenset()
     silence: float | None = None
@@ -90,11 +93,9 @@ class Decider:
             shape=self._builder.shape,
             arrived=self._note_answer,
         )
-        self._selected: Selection | None = None
-        self._decided: Decision | None = None  # the last one with something to send
+        self._decided: Decision | None = None  # as it was sent
         self.playing = Playing(rig, capabilities.layers, tracker.expiry_of)
         """The layers."""
-        self._over: tuple[Content, ...] = ()  # ended by themselves
         self._retry_at = math.inf  # s; when a ledger would admit what it refused
         self._is_new = True  # something has come that is not decided yet
         self._arrived = arrived
@@ -164,22 +165,21 @@ class Decider:
 
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set; fingers keep their layers."""
-        self._selected, self._decided, self._retry_at, self._is_new = None, None, math.inf, True
-        self._over = ()
+        self._decided, self._retry_at, self._is_new = None, math.inf, True
         self.playing.forget()
 
     def only_ends(self, decision: Decision) -> Decision:
         """Return the last decision without what it starts, which is decided again later."""
         self.forget()
         sets = {n: each for n, each in decision.sets.items() if n not in decision.started}
-        return replace(decision, sets=sets, started=frozenset())
+        return replace(decision, asked=None, sets=sets, started=frozenset())
 
     def confirm(self, decision: Decision, played: Played, *, now: float) -> None:
         """Note what the amplifiers play for the last decision.
 
         Pulses start when the last commit was sent.
         """
-        playing = self.playing
+        self._decided, playing = decision, self.playing
         playing.may_play = playing.may_play.difference(decision.sets).union(decision.started)
         for number in decision.started:
             for _, target in playing.contents[number].content.targets:
@@ -194,11 +194,10 @@ class Decider:
             number: self._builder.plain(each) if each.is_shaped else each
             for number, each in decision.sets.items()
         }
-        decision = self._decided = replace(decision, sets=sets)
         for number in decision.started:
             pattern = replace(self.playing.contents[number].pattern, onset=None, ending=None)
             self.playing.change(number, set=sets[number], pattern=pattern)
-        return decision
+        return replace(decision, sets=sets)
 
     def refused(self, decision: Decision, error: CommandRefused) -> Decision:
         """Return the last decision along its plain ramps, since a ledger has refused it.
@@ -215,14 +214,9 @@ class Decider:
             if len(ends) < len(self.playing.contents):
                 return self._without(ends, decision, str(error))
         self.playing.end(is_silent=True)
-        self._decided = replace(
-            decision,
-            sets={},
-            started=frozenset(),
-            silence=FADE_RAMP,
-            refusal=str(error),
+        return replace(
+            decision, sets={}, started=frozenset(), silence=FADE_RAMP, refusal=str(error)
         )
-        return self._decided
 
     def _requested_at(self, number: int) -> float:
         """Return when [s] what plays in a layer was requested, by its pulse or its contact."""
@@ -234,14 +228,13 @@ class Decider:
         contents = [self.playing.contents[number].content for number in numbers]
         self.playing.leave_out(numbers)
         ends = {number: self._builder.build_end(number, has_endings=False) for number in numbers}
-        self._decided = replace(
+        return replace(
             decision,
             selection=_held_back(decision.selection, contents, reason),
             sets={**decision.sets, **ends},
             started=decision.started - numbers,
             refusal=reason,
         )
-        return self._decided
 
     def renewal(self, now: float) -> dict[int, PlateSet]:
         """Return the sets that prolong what plays, by layer, where that is due at a time [s]."""
@@ -260,9 +253,6 @@ class Decider:
         contents = self.playing.ended(now)
         if not contents or self._decided is None:
             return None
-        self._over = (*self._over, *contents)
-        if self._selected is not None:
-            self._selected = _held_back(self._selected, contents, ENDED)
         self._decided = replace(
             self._decided,
             selection=_held_back(self._decided.selection, contents, ENDED),
@@ -281,34 +271,33 @@ class Decider:
         if not self._is_new and now < self.due:
             return None
         contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)
+        self._triggered_at = math.inf
         self._is_new, is_retry = False, now >= self._retry_at
         from_rest = now - self._played_until >= _RING_DOWN
-        decision, has_failed = None, False
+        before, decision, has_failed = self._decided, None, False
         try:
-            selection = self._select(contacts, now, triggered_at)
-            is_new = selection != self._selected or is_retry
+            asked = self._select(contacts, now, triggered_at)
+            if before is not None and asked == before.asked and not is_retry:
+                return None
             triggered_at = min(triggered_at, self._selector.triggered_at)
-            draft = Decision(contacts, selection, from_rest, triggered_at)
-            if is_new and selection.contents:
+            draft = Decision(contacts, self._playable(asked), from_rest, triggered_at, asked)
+            if draft.selection.contents:
                 decision = self._with_sets(draft, now)
-                if decision is None and _why_not(selection) != _why_not(self._selected):
+                if decision is None and _why_not(draft) != _why_not(before):
                     decision = draft  # said without sending
         except Exception as error:
             has_failed = self._is_new = True  # and tried again
             self._selector.due = math.inf
-            selection = Selection((), contacts, (), failure_text(error))
-            is_new = selection != self._selected
-            draft = Decision(contacts, selection, from_rest, triggered_at)
-            if is_new:
-                _logger.exception("loop: decision failed, silencing all channels")
-        self._triggered_at = math.inf
-        if is_new and not selection.contents:
-            is_awaited = selection.is_pending and not self.playing.may_play
+            asked = Selection((), contacts, (), failure_text(error))
+            if before is not None and asked == before.asked:
+                return None
+            draft = Decision(contacts, asked, from_rest, triggered_at, asked)
+            _logger.exception("loop: decision failed, silencing all channels")
+        self._retry_at = math.inf
+        if not draft.selection.contents:
+            is_awaited = asked.is_pending and not self.playing.may_play
             decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
-        if is_new:
-            self._selected, self._retry_at = selection, math.inf
-        if decision is not None and (decision.sets or selection.contents or decision.silence):
-            self._decided = decision
+        self._decided = decision or draft
         return decision
 
     def _note_answer(self) -> None:
@@ -320,12 +309,12 @@ class Decider:
         self._intent_due = math.inf
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
-        selection = self._selector.select(
-            contacts, intent, self.capabilities, triggered_at=triggered_at
-        )
-        if self._over:
-            self._over = tuple(each for each in self._over if each in selection.contents)
-            selection = _held_back(selection, self._over, ENDED)
+        return self._selector.select(contacts, intent, self.capabilities, triggered_at=triggered_at)
+
+    def _playable(self, selection: Selection) -> Selection:
+        """Return a selection without what has ended by itself, and what has no layer."""
+        if over := self.playing.over_of(selection.contents):
+            selection = _held_back(selection, over, ENDED)
         if len(selection.contents) > self.capabilities.layers:
             selection = self._within_layers(selection)
         return selection
@@ -398,7 +387,7 @@ def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -
     )
 
 
-def _why_not(selection: Selection | None) -> dict[ContactKey, str | None]:
+def _why_not(decision: Decision | None) -> dict[ContactKey, str | None]:
     """Return why targets feel nothing of their own, by contact."""
-    held_back = () if selection is None else selection.not_served
+    held_back = () if decision is None else decision.selection.not_served
     return {each.contact.key: each.held_back for each in held_back}

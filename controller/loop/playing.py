@@ -74,13 +74,14 @@ class Playing:
         """Layers that may play, since all were silent."""
         self.is_silent = False
         """Whether all layers are silent, for certain."""
+        self._over: tuple[Content, ...] = ()  # ended by themselves
         # By finger and voice, also where what plays is unknown.
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
 
     def forget(self) -> None:
         """Discard what plays, which is unknown; fingers keep their layers."""
         self._replace({})
-        self.is_silent = False
+        self.is_silent, self._over = False, ()
 
     def start(self, contents: Mapping[int, PlayedContent], started: frozenset[int]) -> None:
         """Note what is sent: the contents of all layers, and which of them start."""
@@ -168,7 +169,15 @@ class Playing:
         over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
         for number in over:
             self.change(number, drive={})
-        return tuple(self.contents[number].content for number in over)
+        contents = tuple(self.contents[number].content for number in over)
+        self._over = (*self._over, *contents)
+        return contents
+
+    def over_of(self, contents: Container[Content]) -> tuple[Content, ...]:
+        """Return those of the contents that are still wanted that have ended by themselves."""
+        if self._over:
+            self._over = tuple(each for each in self._over if each in contents)
+        return self._over
 
     def may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""

@@ -287,7 +287,7 @@ class Decider:
                     decision = draft  # said without sending
         except Exception as error:
             has_failed = self._is_new = True  # and tried again
-            self._selector.due = math.inf
+            self._selector.due = self._retry_at = math.inf
             asked = Selection((), contacts, (), failure_text(error))
             if before is not None and asked == before.asked:
                 return None

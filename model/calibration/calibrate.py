@@ -29,6 +29,7 @@ from model.calibration.variable_projection import row_rms
 from model.choice import best_of
 from model.errors import InputError
 from model.identification.parameters import KINDS
+from model.quantities import in_display_unit
 from model.rig.rig import Rig
 
 _WRONG_SCALE = 0.02  # common tolerance of sensors
@@ -120,12 +121,16 @@ def _check_sides(problem: Problem, fit: Fit) -> None:
     offs = space.values(fit.z, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
         if abs(off) > _MAX_SIDE * KINDS["side"].std:
-            found = side + off
-            raise InputError(
-                f"plate.{key} must be that of the measured plate, got {1e3 * side:.4g} mm in the "
-                f"rig while responses fit {1e3 * found:.4g} mm, as it looks; measure it, and "
-                "correct the rig or take its own measurement"
-            )
+            raise wrong_size(f"plate.{key}", side, side + off)
+
+
+def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
+    """What to say of a side [m] of the plate, by its key, that another one explains better."""
+    rig_has, fits = (in_display_unit(side, "m", digits=4) for side in (in_rig, measured))
+    return InputError(
+        f"{key} must be that of the measured plate, got {rig_has} in the rig while responses fit "
+        f"{fits}, as it looks; measure it, and correct the rig or take its own measurement"
+    )
 
 
 def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:

@@ -30,7 +30,7 @@ _KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value of a rig that is fitted: kind, and ERA, "" for the plate."""
+    """A value of a rig, such as is fitted: kind, and ERA, "" for the plate."""
 
     kind: str
     era: str
@@ -54,7 +54,9 @@ class Parameter:
         """The value in a rig."""
         if self.era:
             return float(getattr(rig.era(self.era), self.kind))
-        return rig.plate.material.E if self.kind == "modulus" else rig.plate.loss_factor
+        return (
+            rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
+        )
 
 
 @dataclass(frozen=True, eq=False)

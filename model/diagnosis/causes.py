@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import Parameter, SensedPlate, sensed_plate
 from model.calibration.variable_projection import modal_assurance
 from model.choice import best_by, ranked_by
 from model.diagnosis.plate_match import Match, match_plate
@@ -59,11 +59,9 @@ class Cause:
 
     def value(self, rig: Rig) -> float:
         """The value in a rig [unit], of all ERAs their mean."""
-        if self.what == "modulus":
-            return rig.plate.material.E
-        if self.key.startswith("plate."):
-            return float(getattr(rig.plate, self.what))
-        return float(np.mean([getattr(era, self.what) for era in rig.eras if self._is_of(era)]))
+        names = [era.name for era in rig.eras if self._is_of(era)]
+        names = [""] if self.key.startswith("plate.") else names
+        return float(np.mean([Parameter(self.what, name).of(rig) for name in names]))
 
     def scaled(self, rig: Rig, factor: float) -> Rig:
         """The rig with another value; raises InputError for one that it cannot have."""

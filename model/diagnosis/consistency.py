@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibrate import wrong_size
 from model.calibration.responses import Responses, Screened
 from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
@@ -22,7 +23,6 @@ from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.verdict import Verdict, best_wiring, diagnose
 from model.errors import InputError
-from model.quantities import in_display_unit
 from model.rig.rig import Rig
 
 GRAVITY = 9.80665  # m/s², standard
@@ -210,12 +210,7 @@ def _check_size(verdict: Verdict) -> None:
         return
     best = verdict.explanations[0]
     if best.cause.is_geometry and best.match.error <= MAX_FIT_ERROR:
-        raise InputError(
-            f"{best.cause.key} must be that of the measured plate, got "
-            f"{in_display_unit(best.expected, best.cause.unit)} in the rig while responses fit "
-            f"{in_display_unit(best.value, best.cause.unit)}, as it looks; measure it, and correct "
-            "the rig or take its own measurement"
-        )
+        raise wrong_size(best.cause.key, best.expected, best.value)
 
 
 def _joined(names: Sequence[str]) -> str:

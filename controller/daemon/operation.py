@@ -58,7 +58,7 @@ class Operator:
 
     An unexpected exception in a transition or action ends in a stop of all amplifiers and in FAULT.
     state_changed are called a moment after every change of the state or its epoch; link_changed
-    receives the kind of change, the lost amplifiers ("lost" only) and a message.
+    receives the kind of change, the amplifiers concerned where they are known, and a message.
     """
 
     controller: Controller

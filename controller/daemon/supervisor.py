@@ -42,8 +42,8 @@ class Supervisor(Operator):
     """The operation of the plate by the amplifiers of a controller.
 
     Its controller must be created with its `observer` and `connected`.
-    link_changed receives the kind of change, the lost amplifiers ("lost" only) and a message; alive
-    is called after each cycle of the control loop, which runs in every state.
+    link_changed receives the kind of change, the amplifiers concerned where they are known, and a
+    message; alive is called after each cycle of the control loop, which runs in every state.
     """
 
     def __init__(
@@ -138,8 +138,7 @@ class Supervisor(Operator):
         try:
             await self.controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
-            self._link_changed("retry", (), str(error))
-            lost = error.lost if isinstance(error, LinkError) else ()
+            lost = self._not_opened(error)
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING, amplifiers=lost)
         if self._closing.is_set():
             await self.controller.close()
@@ -188,13 +187,17 @@ class Supervisor(Operator):
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
-            self._link_changed("retry", (), str(error))
-            if isinstance(error, LinkError):
-                self.note_lost(error.lost)
+            self.note_lost(self._not_opened(error))
             await self.controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
         return True
+
+    def _not_opened(self, error: Exception) -> tuple[str, ...]:
+        """Say that amplifiers could not be opened; return the names of the lost, where known."""
+        lost = error.lost if isinstance(error, LinkError) else ()
+        self._link_changed("retry", lost, str(error))
+        return lost
 
     async def _pause(self, duration: float) -> None:
         """Wait for a time [s], or until `close`."""

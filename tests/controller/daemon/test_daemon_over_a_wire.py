@@ -91,12 +91,16 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
         assert await losses() == {"main": present, "side": present}
         far.devices["side"].inject_fault(FaultWindow("hang"))
         await until_losses(main=closed, side=lost)
+        await era.subscribe("link")
         begun = lost_for = (await era.status()).lost_for_s or 0.0
         while lost_for < begun + 0.6:  # an attempt to reopen them
             assert await losses() == {"main": closed, "side": lost}
             status = await era.status()
             lost_for = status.lost_for_s or 0.0
             await asyncio.sleep(0.01)
+        retry = await era.next_event()
+        assert retry is not None
+        assert (retry.data["event"], retry.data["amplifier"]) == ("retry", "side")
         main, side = (line for line in show_status(status).splitlines() if "serial://" in line)
         assert re.search(r"amplifier main .*\): closed ", main)
         assert re.search(r"amplifier side .*\): LOST, ", side)

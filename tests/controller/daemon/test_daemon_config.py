@@ -145,9 +145,9 @@ def test_config_refuses_simulated_amplifiers_beside_others(tmp_path: Path) -> No
 
 
 def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
-    """By hand: turned clockwise, and by three touched points.
+    """By hand: turned clockwise, as is said or by its three corners, and by three touched points.
 
-    Turned by 90 degrees the sensor's top left corner is the plate's top right. The other panel is
+    Turned by 90 degrees the sensor's top left corner is the plate's top right. The last panel is
     upside down and 1 cm too far east on a plate of 0.3048 m by 0.2286 m: (x, y) is shown at
     (0.3048 - x + 0.01, 0.2286 - y).
     """
@@ -155,13 +155,18 @@ def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
         folder,
         "touch:\n"
         '  - {name: a, url: "tuio:3333", calibration: {turned: 90}}\n'
+        '  - {name: b, url: "tuio:3334", calibration: {points: [\n'
+        "     {shown: [0, 0.2286], at: [0.3048, 0.2286]}, {shown: [0, 0], at: [0, 0.2286]},\n"
+        "     {shown: [0.3048, 0.2286], at: [0.3048, 0]}]}}\n"
         '  - {name: c, url: "tuio:3335", calibration: {points: [\n'
         "     {shown: [304.8 mm, 21.86 cm], at: [1 cm, 1 cm]},\n"
         "     {shown: [2.48 cm, 21.86 cm], at: [29 cm, 1 cm]},\n"
         "     {shown: [304.8 mm, 0.0286], at: [1 cm, 20 cm]}]}}\n",
     )
-    a, c = (source.calibration for source in load_daemon_config(path).touch)
-    assert a.apply(Touch(1, 0.0, 0.0)) == Touch(1, 1.0, 0.0)
+    a, b, c = (source.calibration for source in load_daemon_config(path).touch)
+    for turned in (a, b):
+        placed = turned.apply(Touch(1, 0.25, 0.0))
+        assert (placed.x, placed.y) == pytest.approx((1.0, 0.25))
     placed = c.apply(Touch(1, 0.0, 1.0))  # shown at the south-west corner
     assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
 

@@ -83,17 +83,6 @@ def test_constant_strain_has_the_energy_of_plate_theory(element, fields, expecte
     assert energy == pytest.approx(expected, rel=1e-9)
 
 
-def test_mass_is_that_of_the_section(element):
-    """rho h of motion up and down, rho h³ / 12 of rotation."""
-    fields = (lambda x, y: 1, lambda x, y: 0, lambda x, y: 0)
-    density = PLATE.material.rho * PLATE.thickness
-    rotary = density * PLATE.thickness**2 / 12
-    for shift, expected in ((0, density), (2, rotary), (1, rotary)):
-        motion = nodal(element, *fields[shift:], *fields[:shift])
-        found = motion @ of_one(element).mass @ motion / (DX * DY)
-        assert found == pytest.approx(expected, rel=1e-9)
-
-
 def frequency_error(element: Element, count: int) -> float:
     """Relative error of a thin plate's lowest natural frequency with count by count elements.
 

@@ -13,7 +13,6 @@ from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.finger.perception import detection_threshold
-from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
@@ -25,10 +24,8 @@ from model.table.raster import Raster
 from model.table.table import LocalizationTable, default_drive_frequencies
 from model.vibration.excitation import tone_amplitudes
 from paper_plate import make_paper_rig
-from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from paper_table import contact_sets, smooth_rig, smooth_table
 from registry.limits import GuardLimits
-
-TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
 
 
 def test_all_patterns_are_those_of_the_paper():
@@ -160,34 +157,6 @@ def test_read_fingertips_reads_waves_on_a_fine_raster_at_the_edges():
     tips = table.read_fingertips(places)
     np.testing.assert_allclose(tips.fine, np.cos(points @ waves.T), atol=1e-4)
     np.testing.assert_allclose(tips.few, np.cos(points[:, [0, 9, 12, 15, 18]] @ waves.T), atol=1e-4)
-
-
-def test_background_is_the_mean_over_cells_beyond_five_centimetres():
-    """The power of a drive there, cell by cell, and everywhere on a plate without such cells."""
-    table = smooth_table()
-    weights = np.exp(1j * np.arange(len(table.eras)))
-    for targets in ([TARGET], [TARGET, (0.0, 0.0)], [*map(tuple, table.cell_centres.tolist())]):
-        apart = np.hypot(*(table.cell_centres[:, None] - targets).transpose(2, 0, 1)).min(axis=1)
-        rest = table.cell_centres[(apart > 0.05) if (apart > 0.05).any() else apart < 1]
-        expected = (np.abs(weights @ table.unit_fields(rest)) ** 2).mean(axis=1)
-        found = weights.conj() @ table.background(targets) @ weights
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-def test_fingertips_interpolates_fields_of_the_plate():
-    """At 500 Hz as well the interpolation is within 1e-4 of the field, beside an ERA as inside."""
-    rig = smooth_rig()
-    raster = Raster.for_plate(rig.plate, frequency_max=500.0)
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
-    values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
-    fine = raster.fingertips(np.array(CONTACTS), values.view(np.float32)).fine
-    found = fine.reshape(-1, fine.shape[-1])
-    points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
-    solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)
-    size = np.sqrt((np.abs(kept) ** 2).mean(axis=0))
-    error = np.abs(found.view(np.complex64).reshape(solved.shape) - solved) / size
-    assert error.max() < 1e-4
 
 
 @pytest.mark.parametrize("thickness", [0.0001, 0.01])

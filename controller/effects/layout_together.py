@@ -13,17 +13,16 @@ from controller.effects.layout_check import raster
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, TouchSimulator
-from controller.loop.content import HELD_BACK
+from controller.loop.choice import Asked
+from controller.loop.content import Selection
 from controller.loop.intent import Target
 from controller.loop.joint_answer import fingers_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
-from model.errors import InputError
 from model.table.answer import answer
-from model.table.pattern import IMPERCEPTIBLE_DB_SL
-from model.table.request import MIN_CONTRAST_DB, Answer, verdict_of
+from model.table.request import MIN_CONTRAST_DB, Answer
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
@@ -232,36 +231,15 @@ def _felt(
         leaks = [each.level_db_sl for each in together.quiet]
         for (contact, _), layer in zip(lasting, together.layers, strict=True):
             found[contact.key] = layer.promised_contrast_db or 0.0, layer.verdict
-    for (contact, target), level in zip(short, leaks, strict=True):
-        others = [each for each, _ in fingers if each is not contact]
-        is_bounded = bool(protected and protected - {contact.key})
-        found[contact.key] = _of_short(simulator, contact, target, others, level, is_bounded)
-        worst = min(worst, found[contact.key][0])
+    contacts = tuple(contact for contact, _ in fingers)
+    for each, level in zip(short, leaks, strict=True):
+        key = each[0].key
+        beside = Selection((), (), quiet_levels={key: level})
+        asked = Asked((each,), contacts, protected or frozenset(), {}, (beside,), math.inf)
+        (felt,) = simulator.chooser.choose(asked, simulator.capabilities).short[key].predictions
+        found[key] = felt.promised_contrast_db or 0.0, felt.verdict
+        worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]
-
-
-def _of_short(
-    simulator: TouchSimulator,
-    contact: Contact,
-    target: Target,
-    others: Sequence[Contact],
-    foreign_db_sl: float,
-    is_bounded: bool,
-) -> tuple[float, str]:
-    """Return contrast and verdict of a short content, beside a level of what lasts there.
-
-    is_bounded: whether another finger must not notice it.
-    """
-    try:
-        quiet = [(each.x, each.y) for each in others]
-        answered = simulator.answered(target, (contact.x, contact.y), quiet)
-    except InputError:
-        return 0.0, HELD_BACK
-    felt, contrast = answered.felt_db_sl, answered.promised_contrast_db
-    alone = math.inf if contrast is None else contrast
-    is_noticed = is_bounded and felt - alone > IMPERCEPTIBLE_DB_SL
-    together = min(alone, felt - foreign_db_sl)
-    return together, HELD_BACK if is_noticed else verdict_of(together)
 
 
 def _answered(

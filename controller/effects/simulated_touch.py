@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.loop.choice import Chooser
 from controller.loop.intent import Target
+from controller.loop.selection import unshaped
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
@@ -61,13 +63,16 @@ class TouchSimulator:
     def __init__(self, table: LocalizationTable) -> None:
         self.table = table
         self._levels = EffectLevels(table)
-        self._capabilities = PlaybackCapabilities(
+        self.chooser = Chooser(table, self._levels, unshaped)
+        """Chooses what is played beside other contents."""
+        self.capabilities = PlaybackCapabilities(
             drive_mode=DRIVE_MODES[-1],
             playable=DRIVE_MODES,
             frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
             max_amplitudes=table.strokes,
             envelope_support=RAMPS_ONLY,
         )
+        """Of amplifiers that play whatever the table has."""
 
     def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> TableAnswer:
         """Answer a target at a position [m] among quiet fingers, along plain ramps.
@@ -79,7 +84,7 @@ class TouchSimulator:
             Contact(ContactKey("quiet", number), *place, since=0.0)
             for number, place in enumerate(quiet)
         ]
-        return query_table(self.table, finger, target, others, self._capabilities, self._levels)
+        return query_table(self.table, finger, target, others, self.capabilities, self._levels)
 
     def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
         """Play a target's content at a finger."""

@@ -46,7 +46,7 @@ class _Wanted:
 
     def is_met_by(self, chosen: Selection) -> bool:
         """Whether what was chosen also serves what lasts among these contacts."""
-        if not self._is_part_of(chosen, lambda target: target):
+        if not (chosen.targets and self._is_part_of(chosen, lambda target: target)):
             return False
         is_whole, then = chosen.is_whole, chosen.contacts
         now = {each.key: each for each in self.contacts}

@@ -1,12 +1,10 @@
 """What the gateway reads once for all: metrics of the daemon, and the field that is drawn."""
 
 import asyncio
-import json
 import struct
-from collections.abc import MutableMapping
 from pathlib import Path
-from typing import Any, NamedTuple
-from unittest.mock import AsyncMock
+from typing import NamedTuple
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import numpy as np
@@ -15,16 +13,16 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.responses import PlainTextResponse
 
 from controller.api.client_protocol import Unreachable
-from controller.api.jsonrpc import ErrorCode, RpcError, error_line, result_line
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import StatusResult
-from controller.api.schema import API_VERSION, Message, PlayedTone
-from controller.api.topics import PatternEvent
+from controller.api.schema import Message, PlayedTone
+from controller.api.topics import Hub, PatternEvent
 from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
-from daemon_bench import PATIENCE, ready_daemon
+from daemon_bench import PATIENCE, ready_daemon, until
 from gateway_bench import ScriptedDaemon
 from model.arrays import ComplexArray
 from model.rig.file import example_rig_path, load_rig
@@ -76,22 +74,15 @@ async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
         is_token_user_supplied=True,
         extra_hosts=("panel.local",),
     )
-    statuses: list[int] = []
-
-    async def send(message: MutableMapping[str, Any]) -> None:
-        if message["type"] == "http.response.start":
-            statuses.append(message["status"])
-
-    async def receive() -> MutableMapping[str, Any]:
-        return {"type": "http.request", "body": b""}
-
-    access = Access(PlainTextResponse("era_up 1"), settings)
-    right = settings.token.encode()
-    for path, token in (("/metrics", b"wrong"), ("/metrics\n", b"wrong"), ("/metrics", right)):
-        headers = [(b"host", b"panel.local"), (b"authorization", b"Bearer " + token)]
-        scope = {"type": "http", "path": path, "method": "GET", "headers": headers}
-        await access(scope, receive, send)
-    assert statuses == [401, 400, 200]
+    transport = httpx.ASGITransport(Access(PlainTextResponse("era_up 1"), settings))
+    async with httpx.AsyncClient(transport=transport, base_url="https://panel.local") as client:
+        for path, token, expected in (
+            ("/metrics", "wrong", 401),
+            ("/metrics%0A", "wrong", 400),
+            ("/metrics", settings.token, 200),
+        ):
+            response = await client.get(path, headers={"Authorization": f"Bearer {token}"})
+            assert response.status_code == expected
 
 
 async def test_metrics_are_read_once_for_all(
@@ -151,30 +142,17 @@ async def test_field_is_drawn_after_what_cannot_be_drawn(
 
 
 async def test_field_is_followed_again_after_a_refusal(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    daemon: ScriptedDaemon, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As by a daemon that has too many clients for a while."""
     monkeypatch.setattr("controller.gateway.field._RETRY_INTERVAL", 0.0)
-    requests: asyncio.Queue[dict[str, object]] = asyncio.Queue()
     busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        hello = json.loads(await reader.readline())
-        result = json.dumps({"api_version": API_VERSION, "rig_text": ""})
-        writer.write(result_line(hello["id"], result))
-        request = json.loads(await reader.readline())
-        requests.put_nowait(request)
-        writer.write(error_line(request.get("id"), busy) if "id" in request else b"")
-        await reader.read()
-        writer.close()
-
-    path = tmp_path / "era.sock"
-    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE / 6):
-        running = asyncio.create_task(DrawnField(path).run())
-        for _ in range(3):
-            assert (await requests.get())["method"] == "subscribe"
-        running.cancel()
-        await asyncio.wait({running})
+    subscribe = Mock(side_effect=busy)
+    monkeypatch.setattr(Hub, "subscribe", subscribe)
+    running = asyncio.create_task(DrawnField(daemon.socket).run())
+    await until(lambda: subscribe.call_count > 2, patience=PATIENCE / 6)
+    running.cancel()
+    await asyncio.wait({running})
     assert caplog.text.count("too many clients") == 1
 
 

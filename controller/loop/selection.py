@@ -65,8 +65,9 @@ class _Wanted:
         )
 
     def is_among(self, chosen: Selection) -> bool:
-        """Whether all contacts were there when it was chosen."""
-        return {each.key for each in self.contacts} <= chosen.contacts.keys()
+        """Whether all contacts were there when it was chosen, and have not lifted since."""
+        then = {(each.key, each.since) for each in chosen.contacts.values()}
+        return all((each.key, each.since) in then for each in self.contacts)
 
     def _is_part_of(self, chosen: Selection, of_target: Callable[[Target], Target]) -> bool:
         """Whether what lasts was chosen, and no more that would leave others more if it ended.
@@ -104,6 +105,7 @@ class Selector:
         self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
+        self._fingers: set[tuple[ContactKey, float]] = set()  # of what lasts, down since [s]
         self._current = _NOTHING
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer the last selection has."""
@@ -144,6 +146,12 @@ class Selector:
         for each in served:
             (short if each[1].is_short else lasting).append(each)
         wanted = _Wanted(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        fingers = {(contact.key, contact.since) for contact, _ in lasting}
+        came = {key for key, _ in fingers - self._fingers}
+        self._fingers = fingers
+        if came and not wanted.is_met_by(self._lasting):  # who has come back may be elsewhere
+            others = tuple([each for each in self._lasting.targets if each[0].key not in came])
+            self._lasting = _felt(self._lasting, others)
         self.triggered_at = math.inf
         arrived = self._thread.take()
         if arrived is not None:

@@ -310,6 +310,34 @@ async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
         assert len(fingers.applied) == 1
 
 
+@pytest.mark.parametrize("is_busy", [False, True])
+@in_virtual_time
+async def test_a_finger_that_comes_back_elsewhere_feels_nothing_chosen_for_its_old_place(
+    is_busy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the same id; also while an answer is computed that was asked for before it lifted."""
+    answering_after(0.07, monkeypatch)
+    late = "touch" if is_busy else None
+    async with fingers_on(
+        table(), LAYOUT, breaks=late, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
+    ) as fingers:
+        if is_busy:
+            fingers.at[3] = (ABOVE[0] + 0.01, ABOVE[1])
+            await fingers.hold(0.02)
+        del fingers.at[2]
+        await fingers.hold(0.02)
+        count, fingers.at[2] = len(fingers.applied), (0.27, 0.10)
+        await fingers.hold(0.3)
+        places = {
+            (contact.x, contact.y)
+            for applied in fingers.applied[count:]
+            for one in applied.contents.values()
+            for contact, _ in one.content.targets
+            if contact.key.id == 2
+        }
+        assert places == {fingers.at[2]}
+
+
 @in_virtual_time
 async def test_arming_again_forgets_no_layer_that_plays() -> None:
     """A finger that lifts just then falls silent, as the other plays on."""

@@ -108,9 +108,12 @@ class Selection:
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """What each target feels, those that are not served at the end."""
-        served = [each for content in self.contents for each in content.predictions]
-        return (*served, *self.not_served)
+        """What each target feels, those that are not served at the end.
+
+        Of several contents the last: a pulse goes on in one that others share.
+        """
+        served = {each.contact.key: each for one in self.contents for each in one.predictions}
+        return (*served.values(), *self.not_served)
 
     @property
     def pattern(self) -> Pattern | None:

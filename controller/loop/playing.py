@@ -87,7 +87,7 @@ class Playing:
         """Note what is sent: the contents of all layers, and which of them start."""
         self._replace(contents)
         self.is_silent = False
-        self._layer_of = {one.content.key: number for number, one in contents.items()}
+        self._layer_of = {one.content.key: number for number, one in [*contents.items()][::-1]}
         self.may_play |= started
 
     def end(self, *, is_silent: bool) -> None:
@@ -195,7 +195,7 @@ class Playing:
         new = []
         for content in contents:
             number = self._layer_of.get(content.key)
-            if number is None:
+            if number is None or number in numbers:  # a pulse beside what others share
                 new.append(content)
             else:
                 numbers[number] = content

@@ -1,5 +1,6 @@
 """What reaches fingers that it is not for: regions where others are not noticed, and leaks."""
 
+import asyncio
 import math
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ from controller.daemon.api_views import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Rectangle
@@ -117,6 +119,39 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
         assert (first.verdict, first.effect, first.feels) == ("shared", "left", "right")
         assert (second.effect, second.feels) == ("right", "right")
         assert first.frequency_hz == second.frequency_hz
+
+
+@in_virtual_time
+async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_that() -> None:
+    """The click has a layer of its own, and each finger is told once what it feels."""
+    regions = (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
+        Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
+    )
+    effects = {**LAYOUT.effects, "tick": Click(level=14.0)}
+    async with fingers_on(
+        table(),
+        SurfaceLayout(regions, effects, elsewhere=None),
+        at={1: (0.138, 0.06), 2: (0.165, 0.06)},
+        held=1.0,
+    ) as fingers:
+        ((shared, one),) = fingers.applied[-1].contents.items()
+        owner, other = (contact for contact, _ in one.content.targets)
+        count, sent = len(fingers.applied), len(fingers.committed)
+        player = fingers.controller._intent_source
+        assert isinstance(player, EffectPlayer)
+        player.play("tick", owner, asyncio.get_running_loop().time(), level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(0.3)
+        sets = [one for _, _, layers in fingers.committed[sent:] for one in layers]
+        assert {one.layer for one in sets if not one.renew} == {1 - shared}
+        clicked, ended = fingers.applied[count:]
+        assert clicked.contents[shared].content == ended.contents[shared].content == one.content
+        for applied in (clicked, ended):
+            assert sorted(each.contact.key for each in applied.targets) == sorted(
+                [owner.key, other.key]
+            )
+        assert {each.contact.key: each.verdict for each in clicked.targets}[owner.key] == "mixed"
 
 
 LEAKING = SurfaceLayout(

@@ -18,6 +18,7 @@ from model.calibration.responses import Responses
 from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis import causes
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
+from model.diagnosis.plate_match import match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -273,3 +274,14 @@ def test_diagnose_skips_channels_that_were_not_driven(coarse_rig, built):
     verdict = diagnose(coarse_rig, replace(built, values=part))
     assert states(verdict) == {"SE": ("not driven",), "NE": ("not driven",)}
     assert verdict.is_well
+
+
+def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
+    """Three in a hundred values that are wrong by far move parameters by a tenth of their prior."""
+    rng = np.random.default_rng(0)
+    broken = built.values.copy()
+    wrong = rng.random(broken.shape) < 0.03
+    broken[wrong] *= rng.choice([0.1, 4.0, -1.0], wrong.sum())
+    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    clean, found = (match_plate(plate, each, drives=range(4)) for each in (built.values, broken))
+    assert np.sqrt(((found.z - clean.z) ** 2).mean()) < 0.1

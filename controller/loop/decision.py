@@ -32,6 +32,9 @@ ENDED = "the vibration has ended by itself: it was not renewed, or a limit of ti
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
 
+# s; after the end of a pulse, or of a layer, none of it is left on any amplifier.
+_FADED_AFTER = 0.05
+
 _logger = logging.getLogger(__name__)
 
 
@@ -199,15 +202,16 @@ class Decider:
             self.playing.change(number, set=sets[number], pattern=pattern)
         return replace(decision, sets=sets)
 
-    def refused(self, decision: Decision, error: CommandRefused) -> Decision:
-        """Return the last decision along its plain ramps, since a ledger has refused it.
+    def refused(self, decision: Decision, error: CommandRefused, *, now: float) -> Decision:
+        """Return the last decision along its plain ramps, since a ledger has refused it by now [s].
 
-        Without its newest content where it has no other shapes, and silence where none is left.
+        Without its newest content where it has no other shapes, and silence where none is left;
+        what is left out is decided again when a pulse or a layer beside it has ended.
         """
         if any(each.is_shaped for each in decision.sets.values()):
             _logger.info("loop: plain ramps instead of envelopes: %s", error)
             return self._without_shapes(decision)
-        self._retry_at = math.inf if error.until is None else error.until
+        self._retry_at = _ended_by(decision, now) if error.until is None else error.until
         newest = max(decision.started, key=self._requested_at, default=None)
         if newest is not None:
             ends = self.playing.beside(newest)
@@ -385,6 +389,16 @@ def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -
         reason=selection.reason if left else reason,
         not_served=(*selection.not_served, *skipped),
     )
+
+
+def _ended_by(decision: Decision, now: float) -> float:
+    """Return when [s] what ends beside what a decision starts has faded; infinite for none."""
+    pulses = [target.pulse for one in decision.selection.contents for _, target in one.targets]
+    started = [each for each in pulses if each is not None and each.started_at is not None]
+    ends = [each.end for each in started if each.end > now]
+    if decision.sets.keys() - decision.started:
+        ends.append(now)
+    return max(ends, default=math.inf) + _FADED_AFTER
 
 
 def _why_not(decision: Decision | None) -> dict[ContactKey, str | None]:

@@ -384,7 +384,8 @@ class Controller:
         elif decision.sets:
             played = await self._play(decider, decision.sets)
             if isinstance(played, CommandRefused):
-                await self._execute(decider, decider.refused(decision, played))
+                instead = decider.refused(decision, played, now=clock.now())
+                await self._execute(decider, instead)
                 return
             sent_at = played.sent_at
             decider.confirm(decision, played, now=clock.now())

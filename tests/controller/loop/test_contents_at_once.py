@@ -184,6 +184,29 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
 
 
 @in_virtual_time
+async def test_what_a_loud_click_leaves_no_stroke_for_is_felt_after_it() -> None:
+    """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes."""
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    effects = {**LAYOUT.effects, "click": Click(level=44.0), "loud": Buzz(level=44.0)}
+    layout = SurfaceLayout(regions, effects, elsewhere=None)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
+        begin, (contact,) = asyncio.get_running_loop().time(), fingers.applied[-1].contacts
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.012)
+        player = fingers.controller._intent_source
+        assert isinstance(player, EffectPlayer)
+        player.play("loud", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(0.2)
+        assert max(each.time for each in fingers.silenced) > begin  # refused amid the click
+        (felt,) = fingers.applied[-1].targets
+        assert (felt.contact.key.id, felt.held_back) == (1, None)
+        assert fingers.applied[-1].time - begin <= 0.15
+        await fingers.hold(0.3)
+        assert fingers.levels_db_sl()[1] >= 43
+
+
+@in_virtual_time
 async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:

@@ -13,7 +13,7 @@ from controller.effects.layout_check import raster
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, TouchSimulator
-from controller.loop.choice import Asked
+from controller.loop.choice import Requested
 from controller.loop.content import Selection
 from controller.loop.intent import Target
 from controller.loop.joint_answer import fingers_of, requests_of
@@ -235,8 +235,8 @@ def _felt(
     for each, level in zip(short, leaks, strict=True):
         key = each[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        asked = Asked((each,), contacts, protected or frozenset(), {}, (beside,), math.inf)
-        (felt,) = simulator.chooser.choose(asked, simulator.capabilities).short[key].predictions
+        requested = Requested((each,), contacts, protected or frozenset(), {}, (beside,), math.inf)
+        (felt,) = simulator.chooser.choose(requested, simulator.capabilities).short[key].predictions
         found[key] = felt.promised_contrast_db or 0.0, felt.verdict
         worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]

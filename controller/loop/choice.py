@@ -39,7 +39,7 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Asked:
+class Requested:
     """What is to be chosen among contacts: for short pulses, and what lasts, None where it is kept.
 
     protected: contacts that must not notice the contents of others; before: what is felt now, by
@@ -65,7 +65,7 @@ class Asked:
 class Chosen:
     """What was asked, and what was chosen: for what lasts, and for each finger with a pulse."""
 
-    asked: Asked
+    requested: Requested
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
 
@@ -78,23 +78,23 @@ class Chooser:
     levels: EffectLevels | None
     shape: Shape
 
-    def choose(self, asked: Asked, capabilities: PlaybackCapabilities) -> Chosen:
+    def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
         """Choose what is asked for, what lasts first."""
-        kept, lasting = [*asked.kept], None
-        if asked.lasting is not None:
-            beside = None if asked.takes_long else ()
-            lasting = self._chosen(asked, asked.lasting, capabilities, beside)
+        kept, lasting = [*requested.kept], None
+        if requested.lasting is not None:
+            beside = None if requested.takes_long else ()
+            lasting = self._chosen(requested, requested.lasting, capabilities, beside)
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
-        for each in asked.short:
-            found = self._chosen(asked, (each,), capabilities, kept)
+        for each in requested.short:
+            found = self._chosen(requested, (each,), capabilities, kept)
             kept.append(found)
             short[each[0].key] = found
-        return Chosen(asked, lasting, short)
+        return Chosen(requested, lasting, short)
 
     def _chosen(
         self,
-        asked: Asked,
+        requested: Requested,
         targets: Targets,
         capabilities: PlaybackCapabilities,
         beside: Sequence[Selection] | None,
@@ -104,20 +104,20 @@ class Chooser:
         beside: None for several together.
         """
         keys = {contact.key for contact, _ in targets}
-        quiet = tuple([each for each in asked.contacts if each.key not in keys])
+        quiet = tuple([each for each in requested.contacts if each.key not in keys])
         try:
             if beside is not None:
-                found = self._alone(asked, targets, quiet, capabilities, beside)
+                found = self._alone(requested, targets, quiet, capabilities, beside)
             else:
                 found = query_jointly(
                     self.table,
                     targets,
                     quiet,
                     capabilities,
-                    before=asked.before,
+                    before=requested.before,
                     shape=self.shape,
-                    protected=asked.protected,
-                    is_moving=asked.is_moving,
+                    protected=requested.protected,
+                    is_moving=requested.is_moving,
                 )
         except Exception as error:
             if isinstance(error, InputError):
@@ -126,11 +126,11 @@ class Chooser:
                 _logger.error("loop: table failed, silencing its targets", exc_info=error)
                 reason = failure_text(error)
             found = _silent(targets, quiet, reason)
-        return replace(found, protected=asked.protected)
+        return replace(found, protected=requested.protected)
 
     def _alone(
         self,
-        asked: Asked,
+        requested: Requested,
         targets: Targets,
         quiet: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
@@ -146,14 +146,14 @@ class Chooser:
                 heard.append(part.quiet_levels[contact.key])
         if contents:
             left = _left_by(contents, capabilities, strokes)
-        before = asked.before.get((contact.key, 0))
+        before = requested.before.get((contact.key, 0))
         answer = self._query(contact, target, quiet, left, before)
         pattern = answer.pattern
         total = amplitudes_of([pattern.excitation])
         change = float(decibels(factor_within(total, left, strokes)))
         felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db
         leak = -math.inf if promised is None else felt - promised
-        if asked.protected - {contact.key} and leak > IMPERCEPTIBLE_DB_SL:
+        if requested.protected - {contact.key} and leak > IMPERCEPTIBLE_DB_SL:
             reason = f"a protected finger would notice it, up to {leak:.1f} dB SL; {_QUIETER}"
             return _silent(targets, quiet, reason)
         is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
@@ -238,8 +238,8 @@ def _left_by(
     return replace(
         capabilities,
         max_amplitudes={
-            name: max(most - taken[name], 1e-12)
-            for name, most in capabilities.max_amplitudes.items()
+            name: max(highest - taken[name], 1e-12)
+            for name, highest in capabilities.max_amplitudes.items()
         },
         max_power=max(math.sqrt(capabilities.max_power) - math.hypot(*levels), 1e-9) ** 2,
     )

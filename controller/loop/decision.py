@@ -42,8 +42,8 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """A selection and what the amplifiers are to play for it.
 
-    selection: what is felt, or why not; asked: what was selected before limits of time and ledgers
-    left contents out, None to decide it again.
+    selection: what is felt, or why not; requested: what was selected before limits of time and
+    ledgers left contents out, None to decide it again.
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
@@ -55,7 +55,7 @@ class Decision:
     selection: Selection
     from_rest: bool
     triggered_at: float
-    asked: Selection | None
+    requested: Selection | None
     sets: Mapping[int, PlateSet] = field(default_factory=dict)
     started: frozenset[int] = frozenset()
     silence: float | None = None
@@ -175,7 +175,7 @@ class Decider:
         """Return the last decision without what it starts, which is decided again later."""
         self.forget()
         sets = {n: each for n, each in decision.sets.items() if n not in decision.started}
-        return replace(decision, asked=None, sets=sets, started=frozenset())
+        return replace(decision, requested=None, sets=sets, started=frozenset())
 
     def confirm(self, decision: Decision, played: Played, *, now: float) -> None:
         """Note what the amplifiers play for the last decision.
@@ -280,11 +280,13 @@ class Decider:
         from_rest = now - self._played_until >= _RING_DOWN
         before, decision, has_failed = self._decided, None, False
         try:
-            asked = self._select(contacts, now, triggered_at)
-            if before is not None and asked == before.asked and not is_retry:
+            requested = self._select(contacts, now, triggered_at)
+            if before is not None and requested == before.requested and not is_retry:
                 return None
             triggered_at = min(triggered_at, self._selector.triggered_at)
-            draft = Decision(contacts, self._playable(asked), from_rest, triggered_at, asked)
+            draft = Decision(
+                contacts, self._playable(requested), from_rest, triggered_at, requested
+            )
             if draft.selection.contents:
                 decision = self._with_sets(draft, now)
                 if decision is None and _why_not(draft) != _why_not(before):
@@ -292,14 +294,14 @@ class Decider:
         except Exception as error:
             has_failed = self._is_new = True  # and tried again
             self._selector.due = self._retry_at = math.inf
-            asked = Selection((), contacts, (), failure_text(error))
-            if before is not None and asked == before.asked:
+            requested = Selection((), contacts, (), failure_text(error))
+            if before is not None and requested == before.requested:
                 return None
-            draft = Decision(contacts, asked, from_rest, triggered_at, asked)
+            draft = Decision(contacts, requested, from_rest, triggered_at, requested)
             _logger.exception("loop: decision failed, silencing all channels")
         self._retry_at = math.inf
         if not draft.selection.contents:
-            is_awaited = asked.is_pending and not self.playing.may_play
+            is_awaited = requested.is_pending and not self.playing.may_play
             decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
         self._decided = decision or draft
         return decision

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Asked, Chooser, Chosen, is_alone, sum_db
+from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db
 from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
 from controller.loop.intent import HapticIntent, Target
 from controller.loop.joint_answer import Shape
@@ -36,7 +36,7 @@ def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Patter
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Intended:
     """Who is to feel what, among contacts: what lasts, short pulses, and who must not notice."""
 
     contacts: tuple[Contact, ...]
@@ -74,12 +74,12 @@ class _Wanted:
 
         The content of a finger that feels a short pulse meanwhile has not ended.
         """
-        wanted = {of_target(target) for _, target in self.lasting}
+        intended = {of_target(target) for _, target in self.lasting}
         had = {of_target(target) for _, target in chosen.targets}
-        if not wanted <= had:
+        if not intended <= had:
             return False
         pulsing = {contact.key for contact, _ in self.short}
-        return chosen.is_whole or all(target.key in pulsing for target in had - wanted)
+        return chosen.is_whole or all(target.key in pulsing for target in had - intended)
 
 
 class Selector:
@@ -145,17 +145,17 @@ class Selector:
         short: list[tuple[Contact, Target]] = []
         for each in served:
             (short if each[1].is_short else lasting).append(each)
-        wanted = _Wanted(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         fingers = {(contact.key, contact.since) for contact, _ in lasting}
         came = {key for key, _ in fingers - self._fingers}
         self._fingers = fingers
-        if came and not wanted.is_met_by(self._lasting):  # who has come back may be elsewhere
+        if came and not intended.is_met_by(self._lasting):  # who has come back may be elsewhere
             others = tuple([each for each in self._lasting.targets if each[0].key not in came])
             self._lasting = _felt(self._lasting, others)
         self.triggered_at = math.inf
         arrived = self._thread.take()
         if arrived is not None:
-            self._take(arrived, is_late=not self._is_wanted(arrived, wanted))
+            self._take(arrived, is_late=not self._is_intended(arrived, intended))
         pulses, self._short = self._short, {}
         for contact, target in short:
             pulse = pulses.get(contact.key)
@@ -166,9 +166,11 @@ class Selector:
         if self._thread.is_busy:
             self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
         else:
-            for asked in self._to_ask(wanted, pulses, triggered_at, has_waited=arrived is not None):
-                self._ask(asked, capabilities)
-        parts = [_felt(self._lasting, wanted.lasting), *self._short.values()]
+            for requested in self._to_request(
+                intended, pulses, triggered_at, has_waited=arrived is not None
+            ):
+                self._request(requested, capabilities)
+        parts = [_felt(self._lasting, intended.lasting), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
             found = replace(found, is_pending=True)
@@ -176,43 +178,43 @@ class Selector:
             self._current = found
         return self._current
 
-    def _to_ask(
+    def _to_request(
         self,
-        wanted: _Wanted,
+        intended: _Intended,
         pulses: Mapping[ContactKey, Selection],
         triggered_at: float,
         *,
         has_waited: bool,
-    ) -> list[Asked]:
+    ) -> list[Requested]:
         """Return what is to be asked now; pulses: of all fingers, until now.
 
         A pulse that has waited for the thread goes before what lasts, for which it would be late.
         """
-        lasting = wanted.lasting
-        is_kept = not lasting or wanted.is_met_by(self._lasting)
+        lasting = intended.lasting
+        is_kept = not lasting or intended.is_met_by(self._lasting)
         is_due = self.due < math.inf and self.due <= triggered_at
         is_rested = bool(lasting) and is_due and is_kept
         if is_due:
             self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
-        new = tuple([each for each in wanted.short if each[0].key not in self._short])
+        new = tuple([each for each in intended.short if each[0].key not in self._short])
         if is_kept and not is_rested and not new:
             return []
         felt = _felt(self._lasting, lasting)
         before = {one.key: one for one in felt.contents}
-        for contact, _ in wanted.short:
+        for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         playing = [part for part in self._short.values() if _plays(part, triggered_at)]
-        asked = Asked(
-            new, wanted.contacts, wanted.protected, before, (felt, *playing), triggered_at
+        requested = Requested(
+            new, intended.contacts, intended.protected, before, (felt, *playing), triggered_at
         )
         if is_kept and not is_rested:
-            return [asked]
-        takes_long = not is_alone(lasting, wanted.protected)
-        is_moving = takes_long and not is_rested and wanted.is_moved_from(self._lasting)
+            return [requested]
+        takes_long = not is_alone(lasting, intended.protected)
+        is_moving = takes_long and not is_rested and intended.is_moved_from(self._lasting)
         self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
-        first = [asked] if has_waited and new else []
+        first = [requested] if has_waited and new else []
         last = replace(
-            asked,
+            requested,
             short=() if first else new,
             kept=tuple(playing),
             lasting=lasting,
@@ -222,15 +224,15 @@ class Selector:
         )
         return [*first, last]
 
-    def _ask(self, asked: Asked, capabilities: PlaybackCapabilities) -> None:
+    def _request(self, requested: Requested, capabilities: PlaybackCapabilities) -> None:
         """Choose at once what does not take long, else in the thread."""
         chooser = self._chooser
-        if asked.takes_long:
-            self._thread.compute(lambda: chooser.choose(asked, capabilities))
+        if requested.takes_long:
+            self._thread.compute(lambda: chooser.choose(requested, capabilities))
         else:
-            self._take(chooser.choose(asked, capabilities))
+            self._take(chooser.choose(requested, capabilities))
 
-    def _is_wanted(self, chosen: Chosen, wanted: _Wanted) -> bool:
+    def _is_intended(self, chosen: Chosen, intended: _Intended) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
 
         Levels and places may have changed since: else a finger that moves would get nothing. What
@@ -239,10 +241,11 @@ class Selector:
         found = chosen.lasting
         return (
             found is not None
-            and (chosen.asked.is_rested or not wanted.is_met_by(self._lasting))
-            and wanted.is_among(found)
-            and wanted.protected <= found.protected
-            and {each.key for each, _ in wanted.lasting} <= {each.key for each, _ in found.targets}
+            and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
+            and intended.is_among(found)
+            and intended.protected <= found.protected
+            and {each.key for each, _ in intended.lasting}
+            <= {each.key for each, _ in found.targets}
         )
 
     def _take(self, chosen: Chosen, *, is_late: bool = False) -> None:
@@ -251,7 +254,7 @@ class Selector:
         if chosen.lasting is not None and not is_late:
             self._lasting = chosen.lasting
         if chosen.short or not is_late:
-            self.triggered_at = chosen.asked.triggered_at
+            self.triggered_at = chosen.requested.triggered_at
 
 
 def _together(

@@ -31,7 +31,7 @@ class Kind:
     per_unit: how reports write it, for people and for programs, and how many of it are one in
     `Values`: by default per cent of logarithms; drift: how far it walks in an hour in service,
     drifts_to: how uncertain it becomes at most, by default as before it was measured; theory: what
-    another theory of the plate changes in values that are fitted to it. sheet, most: standard
+    another theory of the plate changes in values that are fitted to it. sheet, bound: standard
     deviation where data sheets alone describe a plate, by default std, and the largest deviation;
     own_share: of what is added to a rig's value, that std in shares of the value where it is more.
     """
@@ -44,7 +44,7 @@ class Kind:
     drifts_to: float = 0.0
     theory: float = 0.0
     sheet: float = 0.0
-    most: float = math.inf
+    bound: float = math.inf
     own_share: float = 0.0
 
     @property
@@ -59,18 +59,18 @@ _LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
 
 KINDS = {
     "thickness": Kind(_BUILT.thickness, drift=0.01),
-    "modulus": Kind(0.02, sheet=0.07, most=math.log(3.0)),
-    "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3, sheet=0.10, most=math.log(10.0)),
+    "modulus": Kind(0.02, sheet=0.07, bound=math.log(3.0)),
+    "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3, sheet=0.10, bound=math.log(10.0)),
     "damping": Kind(math.log(_BUILT.damping)),
     # Of one ERA beside that of all.
     "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping), theory=0.01),
     "loss": Kind(math.log(_BUILT.damping), drift=0.1),
     # Beside those of the rig, which may have none; data sheets give little, of ERAs by their ratio.
-    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0, sheet=0.015, most=2.0, own_share=0.7),
-    "loss_added": Kind(0.0, "", "", 1.0, sheet=0.003, most=0.5, own_share=0.7),
+    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0, sheet=0.015, bound=2.0, own_share=0.7),
+    "loss_added": Kind(0.0, "", "", 1.0, sheet=0.003, bound=0.5, own_share=0.7),
     # The power of frequency that the loss factor follows.
     "loss_exponent": Kind(0.3, "", "", 1.0),
-    "gain": Kind(_BUILT.gain, drift=0.01, sheet=1.0, most=8.0),
+    "gain": Kind(_BUILT.gain, drift=0.01, sheet=1.0, bound=8.0),
     "phase": Kind(math.radians(_BUILT.phase_deg), *_PHASE, drift=math.radians(1)),
     # A resonance at 700 Hz with a damping ratio of 0.5.
     "inertia": Kind(1 / 0.7**2, "/kHz²", "1/kHz^2", 1.0),
@@ -78,7 +78,7 @@ KINDS = {
     "sensor_gain": Kind(0.05),
     "sensor_phase": Kind(math.radians(5), *_PHASE),
     # By data sheets: of the plate's mass that an ERA carries.
-    "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, most=5.0),
+    "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
     # Of an ERA, on each axis.
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
@@ -328,8 +328,8 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
     for name in ("modulus", "stiffness", "gain", *added, *form):
         kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
         std = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
-        lower = -value if name in added else -kind.most
-        upper = np.maximum(kind.most * unit - value, value)
+        lower = -value if name in added else -kind.bound
+        upper = np.maximum(kind.bound * unit - value, value)
         columns[:, space.groups[name]] = np.array(
             np.broadcast_arrays(std, lower / std, upper / std)
         ).reshape(3, -1)

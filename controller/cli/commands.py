@@ -115,7 +115,7 @@ def report(
         print(f"  {name}: {len(text)} characters")
     for what in collected.missing:
         print(f"  skipped: {what}")
-    print(f"Wrote {output}\nNext: look before you send: names and causes are not hidden")
+    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
 
 
 EXIT_STATUS = {**by_hand.EXIT_STATUS, InputError: 2}

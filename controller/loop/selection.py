@@ -107,6 +107,7 @@ class Selector:
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: set[tuple[ContactKey, float]] = set()  # of what lasts, down since [s]
         self._current = _NOTHING
+        self._waits_since = math.inf  # s; when the first change came that waits for the thread
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer the last selection has."""
         self.due = math.inf
@@ -163,13 +164,15 @@ class Selector:
                 self._short[contact.key] = pulse
         if not contacts:
             self._lasting = _NOTHING
+        self._waits_since = min(self._waits_since, triggered_at)
         if self._thread.is_busy:
             self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
         else:
             for requested in self._to_request(
                 intended, pulses, triggered_at, has_waited=arrived is not None
             ):
-                self._request(requested, capabilities)
+                self._request(replace(requested, triggered_at=self._waits_since), capabilities)
+            self._waits_since = math.inf
         parts = [_felt(self._lasting, intended.lasting), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):

@@ -10,7 +10,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import mean_level_db_sl
+from model.finger.perception import detection_threshold, mean_level_db_sl
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
@@ -199,3 +199,13 @@ def test_playback_refuses_invalid_input(
     """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
     with pytest.raises(InputError, match=says):
         play(coarse_rig, reduced, EXCITATION, fingers, duration=duration)
+
+
+def test_playback_reads_steady_measures_at_the_end() -> None:
+    """Ten times as much until a quarter of a second before the end does not count."""
+    times = np.arange(10_000) / 10_000.0
+    tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
+    record = Record(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
+    playback = Playback((100.0,), (record,), (), settled=0.04)
+    expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
+    assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

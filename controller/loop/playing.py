@@ -185,9 +185,9 @@ class Playing:
         return one is not None and one.set.has_endings and now >= one.settled_at
 
     def beside(self, number: int) -> frozenset[int]:
-        """Return the layers that play for the same finger as one, itself included."""
-        key, _ = self.contents[number].content.key
-        return frozenset(n for n, one in self.contents.items() if one.content.key[0] == key)
+        """Return the layers of the voices of the same content as one, itself included."""
+        targets = self.contents[number].content.targets
+        return frozenset(n for n, one in self.contents.items() if one.content.targets == targets)
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Contents by layer: a finger's in the layer that it has, new ones in those that end."""

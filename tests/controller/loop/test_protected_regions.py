@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,9 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
+from drivers.contents import Layer
+from drivers.errors import CommandRefused
+from drivers.host.members import Played
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
@@ -27,6 +31,24 @@ LAYOUT = SurfaceLayout(
     {"left": Buzz(level=16.0), "right": Buzz(level=14.0), "above": Buzz(level=14.0)},
     elsewhere=None,
 )
+
+SHARED = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
+        Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
+    ),
+    {**LAYOUT.effects, "tick": Click(level=14.0)},
+    elsewhere=None,
+)
+AT_ONE_CONTENT = {1: (0.138, 0.06), 2: (0.165, 0.06)}
+
+
+def _tick(fingers: Fingers, contact: Contact) -> None:
+    """Play a click at a contact, as a client does."""
+    player = fingers.controller._intent_source
+    assert isinstance(player, EffectPlayer)
+    player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+    fingers.controller.request_update()
 
 
 @in_virtual_time
@@ -124,24 +146,11 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
 @in_virtual_time
 async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_that() -> None:
     """The click has a layer of its own, and each finger is told once what it feels."""
-    regions = (
-        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
-        Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
-    )
-    effects = {**LAYOUT.effects, "tick": Click(level=14.0)}
-    async with fingers_on(
-        table(),
-        SurfaceLayout(regions, effects, elsewhere=None),
-        at={1: (0.138, 0.06), 2: (0.165, 0.06)},
-        held=1.0,
-    ) as fingers:
+    async with fingers_on(table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
         owner, other = (contact for contact, _ in one.content.targets)
         count, sent = len(fingers.applied), len(fingers.committed)
-        player = fingers.controller._intent_source
-        assert isinstance(player, EffectPlayer)
-        player.play("tick", owner, asyncio.get_running_loop().time(), level_db_sl=None)
-        fingers.controller.request_update()
+        _tick(fingers, owner)
         await fingers.hold(0.3)
         sets = [one for _, _, layers in fingers.committed[sent:] for one in layers]
         assert {one.layer for one in sets if not one.renew} == {1 - shared}
@@ -152,6 +161,31 @@ async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_th
                 [owner.key, other.key]
             )
         assert {each.contact.key: each.verdict for each in clicked.targets}[owner.key] == "mixed"
+
+
+@in_virtual_time
+async def test_a_click_that_is_refused_leaves_what_others_share(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of the finger whose content it is: only the click is left out."""
+    async with fingers_on(table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
+        ((shared, one),) = fingers.applied[-1].contents.items()
+        sent, apply = len(fingers.committed), fingers.controller.group.apply
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            if any(tone.level for each in layers["main"] if not each.renew for tone in each.tones):
+                raise CommandRefused("too much power")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        _tick(fingers, one.content.targets[0][0])
+        await fingers.hold(0.1)
+        assert {n: each.content for n, each in fingers.applied[-1].contents.items()} == {
+            shared: one.content
+        }
+        assert not fingers.silenced
+        sets = [each for _, _, layers in fingers.committed[sent:] for each in layers]
+        assert shared not in {each.layer for each in sets if not each.renew}
 
 
 LEAKING = SurfaceLayout(

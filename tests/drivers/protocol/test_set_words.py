@@ -17,8 +17,9 @@ from drivers.protocol.table import MESSAGES, STAGED_LIFE
 STREAM = [
     *(0x0002, 20, 500),  # layer 0, two commands
     *(0x0000, 2200, 2000, 0),
-    *(0x003A, 5010, 10000, 0xDCD8),  # channel 3, keep phase, onset
+    *(0x003B, 5010, 10000, 0xDCD8),  # channel 3, keep phase, onset and ending
     *(2, 50, 1000, 9000, 10000, 0xFFFF),
+    *(1, 20, 500, 0),
     *(0x0100, 10, 0),  # layer 2, silenced
     *(0x01A0, 0, 800),  # layer 3, renewed
 ]
@@ -79,7 +80,7 @@ def test_damaged_streams_are_read_or_refused() -> None:
     for _ in range(5_000):
         stream = list(STREAM)
         for _ in range(chance.randrange(1, 4)):
-            stream[chance.randrange(len(stream))] = chance.choice((0, 1, 2, 500, 0x3A, 65535))
+            stream[chance.randrange(len(stream))] = chance.choice((0, 1, 2, 500, 0x3B, 0x3F, 65535))
         try:
             layers = unpack_layers(stream)
         except Refusal:

@@ -190,6 +190,15 @@ def test_max_sensation_is_reached_and_not_exceeded(mode):
         assert found_in(mode, replace(given, wanted=1.1 * most)) == []
 
 
+def test_max_sensation_includes_two_tones():
+    """Two ERAs that each move the target at a frequency of their own are felt sqrt(2) as much."""
+    target = np.eye(2, dtype=np.complex64)[None]
+    power = (np.eye(2)[:, :, None] * np.eye(2)[:, None])[None].astype(np.complex64)
+    quiet = np.tile(0.01 * np.eye(2, dtype=np.complex64), (2, 1, 1, 1))
+    given = Forms(target, power, quiet, np.ones(2, dtype=np.float32), 1.0, level_margin=0.0)
+    assert highest_of("switched", given) == pytest.approx(np.sqrt(2), rel=1e-4)
+
+
 def test_max_sensation_of_phased_is_the_sum_of_magnitudes():
     """No weights of up to full stroke give more than the sum of the magnitudes."""
     given = random_forms(2)

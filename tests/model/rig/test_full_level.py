@@ -11,6 +11,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.fem.plate import assemble
+from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig, parse_rig
 from model.rig.kind import gain_notes
@@ -133,6 +134,20 @@ def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(uneven: Rig) -
     low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
     found = uneven.eras[1].gain(np.array([50.0, 100.0, 125.0, 300.0]))
     np.testing.assert_allclose(found, [low, low, 0.75 * low + 0.25 * high, high])
+
+
+def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
+    """The ERA's own response is multiplied, not its neighbours'."""
+    points = np.array([[0.1, 0.05], [0.2, 0.2]])
+    frequencies = np.array([100.0, 150.0, 200.0])
+    factor = np.ones((3, 4, 1), dtype=complex)
+    factor[:, 1, 0] = uneven.eras[1].gain(frequencies)
+    free = solve_free_plate(coarse_rig.plate, coarse_rig.mesh)
+    np.testing.assert_allclose(
+        free.acceleration(uneven.eras, frequencies, points),
+        factor * free.acceleration(coarse_rig.eras, frequencies, points),
+        rtol=1e-10,
+    )
 
 
 def test_particular_solution_is_the_same_for_negative_frequency(

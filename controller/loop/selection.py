@@ -171,7 +171,7 @@ class Selector:
             for requested in self._to_request(
                 intended, pulses, triggered_at, has_waited=arrived is not None
             ):
-                self._request(replace(requested, triggered_at=self._waits_since), capabilities)
+                self._request(requested, capabilities)
             self._waits_since = math.inf
         parts = [_felt(self._lasting, intended.lasting), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
@@ -208,7 +208,7 @@ class Selector:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         playing = [part for part in self._short.values() if _plays(part, triggered_at)]
         requested = Requested(
-            new, intended.contacts, intended.protected, before, (felt, *playing), triggered_at
+            new, intended.contacts, intended.protected, before, (felt, *playing), self._waits_since
         )
         if is_kept and not is_rested:
             return [requested]

@@ -9,7 +9,6 @@ import numpy as np
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.choice import Chooser
 from controller.loop.intent import Target
-from controller.loop.selection import unshaped
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
@@ -63,7 +62,7 @@ class TouchSimulator:
     def __init__(self, table: LocalizationTable) -> None:
         self.table = table
         self._levels = EffectLevels(table)
-        self.chooser = Chooser(table, self._levels, unshaped)
+        self.chooser = Chooser(table, self._levels)
         """Chooses what is played beside other contents."""
         self.capabilities = PlaybackCapabilities(
             drive_mode=DRIVE_MODES[-1],

@@ -19,6 +19,7 @@ from controller.loop.joint_answer import (
     amplitudes_of,
     factor_within,
     query_jointly,
+    unshaped,
 )
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
@@ -72,11 +73,11 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Chooser:
-    """Chooses by a table; levels: None for steady ones only; shape: of what is chosen together."""
+    """Chooses by a table; levels: over durations; shape: adds envelopes to what is joint."""
 
     table: LocalizationTable
-    levels: EffectLevels | None
-    shape: Shape
+    levels: EffectLevels
+    shape: Shape = unshaped
 
     def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
         """Choose what is asked for, what lasts first."""

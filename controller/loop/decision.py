@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.choice import Chooser
 from controller.loop.content import Content, Selection, no_layer_free, not_served
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
@@ -77,11 +78,9 @@ class Decider:
         tracker: ContactTracker,
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
-        timing: Timing | None = None,
+        timing: Timing,
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
-        self._table = table
-        self._timing = timing
         self.capabilities = capabilities
         """Of the amplifiers together."""
         self._tracker = tracker
@@ -91,10 +90,7 @@ class Decider:
             rig, capabilities.envelope_support, capabilities.ramp_max, timing
         )
         self._selector = Selector(
-            table,
-            None if timing is None else timing.levels,
-            shape=self._builder.shape,
-            arrived=self._note_answer,
+            Chooser(table, timing.levels, self._builder.shape), arrived=self._note_answer
         )
         self._decided: Decision | None = None  # as it was sent
         self.playing = Playing(rig, capabilities.layers, tracker.expiry_of)
@@ -105,23 +101,20 @@ class Decider:
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
         self._played_until = -math.inf  # s; as far as known
 
-    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
-        self._table, self._timing = table, timing
         self._builder = replace(self._builder, timing=timing)
-        levels = None if timing is None else timing.levels
-        self._selector.replace(table, levels, self._builder.shape)
+        self._selector.chooser = Chooser(table, timing.levels, self._builder.shape)
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; tens of milliseconds.
 
         Raises InputError for a table that has no pattern for these amplifiers.
         """
-        self._table.prepare(self.capabilities.drive_mode)
-        if self._timing is None:
-            return
-        self._timing.prepare(self._table.frequencies.tolist())
-        plate, support = self._table.plate, self.capabilities.envelope_support
+        table, timing = self._selector.chooser.table, self._builder.timing
+        table.prepare(self.capabilities.drive_mode)
+        timing.prepare(table.frequencies.tolist())
+        plate, support = table.plate, self.capabilities.envelope_support
         question = Question(
             ((plate.length / 2, plate.width / 2),),
             ((0.0, 0.0),),
@@ -131,13 +124,13 @@ class Decider:
             frequencies=self.capabilities.frequencies,
             envelopes=support.onset_knots > 0,
         )
-        pattern = self._timing.with_envelopes(
+        pattern = timing.with_envelopes(
             question,
-            self._table.query(question),
+            table.query(question),
             onset=support.onset_knots > 0,
             ending=support.ending_knots > 0,
         )
-        self._timing.with_transient_measures(question, pattern)
+        timing.with_transient_measures(question, pattern)
 
     @property
     def due(self) -> float:

@@ -44,6 +44,11 @@ Shape = Callable[[Question, Pattern, bool], Pattern]
 """Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
 
 
+def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Pattern:
+    """Return a pattern as it is."""
+    return pattern
+
+
 def query_jointly(
     table: LocalizationTable,
     targets: Sequence[tuple[Contact, Target]],

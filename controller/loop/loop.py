@@ -51,8 +51,8 @@ class Controller:
     sent. The loop sends the heartbeat itself after it has run, so that the watchdogs of the
     amplifiers trip when it hangs.
 
-    intent_source: what contacts shall feel. timing: shapes the patterns of the table, ramps only
-    without it. drive_mode: None for the best that the amplifiers can play.
+    intent_source: what contacts shall feel. timing: shapes the patterns of the table. drive_mode:
+    None for the best that the amplifiers can play.
     connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
     observers: called in order.
     """
@@ -64,10 +64,10 @@ class Controller:
         *,
         lines: Callable[[], Lines],
         intent_source: IntentSource,
+        timing: Timing,
         urls: Mapping[str, str] | None = None,
         serial_numbers: Mapping[str, str] | None = None,
         observer: Observer = Observer(),  # noqa: B008  frozen
-        timing: Timing | None = None,
         drive_mode: str | None = None,
         connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
         watchdog: float = WATCHDOG,
@@ -130,7 +130,7 @@ class Controller:
         """Number of touches that could not be contacts, by reason."""
         return self._rejects.counts
 
-    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer touches by another table of this plate from now on, in one step.
 
         What plays stays until its contacts change. Prepared by the caller: nothing is computed

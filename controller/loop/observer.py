@@ -34,10 +34,10 @@ class Applied:
     contents: Mapping[int, PlayedContent]
     latency: float | None
     time: float
-    from_rest: bool = True
-    settled_after: float = 0.0
-    lasts: bool = True
-    timing: Timing | None = field(default=None, repr=False, compare=False)
+    from_rest: bool
+    settled_after: float
+    lasts: bool
+    timing: Timing = field(repr=False, compare=False)
 
     @property
     def newest(self) -> PlayedContent:
@@ -65,10 +65,10 @@ class Applied:
 
         Computed when it is first read, in about two milliseconds, so that no touch waits for it.
         None without quiet contacts, within 0.4 s of another pattern, whose ringing it does not
-        include, beside other contents, or without `timing`.
+        include, or beside other contents.
         """
         is_alone = self.from_rest and len(self.contents) == 1
-        if self.timing is None or not (is_alone and self.quiet):
+        if not (is_alone and self.quiet):
             return None
         measured = self.timing.with_transient_measures(self.question, self.pattern)
         return measured.transient_contrast_db
@@ -95,7 +95,7 @@ def applied_by(
     *,
     sent_at: float | None,
     now: float,
-    timing: Timing | None,
+    timing: Timing,
 ) -> Applied:
     """Report what plays after a decision, by layer; sent_at [s]: as of `silenced_by`."""
     selected = decision.selection.contents

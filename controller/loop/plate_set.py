@@ -54,15 +54,12 @@ class PlateSet:
 
 @dataclass(frozen=True)
 class SetBuilder:
-    """Builds the sets of one rig.
-
-    timing: shapes patterns; None for ramps only. ramp_max [s]: of all amplifiers.
-    """
+    """Builds the sets of one rig; timing: shapes patterns; ramp_max [s]: of all amplifiers."""
 
     rig: Rig
     support: EnvelopeSupport
     ramp_max: float
-    timing: Timing | None
+    timing: Timing
 
     def shape(
         self,
@@ -85,7 +82,7 @@ class SetBuilder:
         )
         adds_onset = has_onset and pattern.onset is None
         adds_ending = has_ending and pattern.ending is None
-        if self.timing is None or not (adds_onset or adds_ending):
+        if not (adds_onset or adds_ending):
             return pattern
         return self.timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
 

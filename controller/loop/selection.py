@@ -12,13 +12,8 @@ from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db
 from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
 from controller.loop.intent import HapticIntent, Target
-from controller.loop.joint_answer import Shape
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
-from model.table.effect_level import EffectLevels
-from model.table.pattern import Pattern
-from model.table.question import Question
-from model.table.table import LocalizationTable
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
@@ -28,11 +23,6 @@ MOVE_TOLERANCE = 0.008
 _RESTS_AFTER = 0.1
 
 _NOTHING = Selection((), ())
-
-
-def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Pattern:
-    """Return a pattern as it is."""
-    return pattern
 
 
 @dataclass(frozen=True)
@@ -89,19 +79,17 @@ class Selector:
     a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
     targets and their levels do, no contact has moved more than 8 mm, and none has another load,
     which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
-    others as they are: a change would be felt. levels: None for steady levels only; shape: adds
-    envelopes to what is chosen in the thread, which calls arrived when it is done.
+    others as they are: a change would be felt. chooser: answers the next question; what the thread
+    computes goes on by the former one. arrived: called when the thread is done.
     """
 
     def __init__(
         self,
-        table: LocalizationTable,
-        levels: EffectLevels | None = None,
+        chooser: Chooser,
         *,
-        shape: Shape = unshaped,
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
-        self._chooser = Chooser(table, levels, shape)
+        self.chooser = chooser
         self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
@@ -112,13 +100,6 @@ class Selector:
         """When [s] the change arrived whose answer the last selection has."""
         self.due = math.inf
         """When [s] to select anew though no contact changes, since a finger that moved rests."""
-
-    def replace(self, table: LocalizationTable, levels: EffectLevels | None, shape: Shape) -> None:
-        """Answer by another table of this plate; the selection stays until its contacts change.
-
-        What the thread computes goes on by the former one, envelopes included.
-        """
-        self._chooser = Chooser(table, levels, shape)
 
     @property
     def is_choosing(self) -> bool:
@@ -229,7 +210,7 @@ class Selector:
 
     def _request(self, requested: Requested, capabilities: PlaybackCapabilities) -> None:
         """Choose at once what does not take long, else in the thread."""
-        chooser = self._chooser
+        chooser = self.chooser
         if requested.takes_long:
             self._thread.compute(lambda: chooser.choose(requested, capabilities))
         else:

@@ -50,11 +50,11 @@ def query_table(
     target: Target,
     quiet: Sequence[Contact],
     capabilities: PlaybackCapabilities,
-    levels: EffectLevels | None,
+    levels: EffectLevels,
 ) -> TableAnswer:
     """Query a table for the only target, and scale its answer to what that shall feel.
 
-    levels: None for steady levels only. Raises InputError where nothing can be played.
+    Raises InputError where nothing can be played.
     """
     question = question_of(
         contact,
@@ -72,7 +72,7 @@ def query_table(
         rated = _over_effect(levels, question, duration)
         pattern = strongest(table.query(question, rated), capabilities.max_amplitudes)
         felt, promised = pattern.level_db_sl, pattern.robust_felt_contrast_db
-        if duration is not None and levels is not None:
+        if duration is not None:
             # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
             raised = levels.raised(
                 pattern,
@@ -84,20 +84,18 @@ def query_table(
             pattern, felt = raised.pattern, raised.level_db_sl
             promised = raised.promised_contrast_db
         return TableAnswer(question, pattern, felt, promised)
-    if duration is None and target.allow_weaker:
+    if duration is not None:
+        return _over_duration(table, question, duration, capabilities, levels)
+    if target.allow_weaker:
         return _as_neighbours_allow(table, question, capabilities)
-    is_fixed = target.band is not None
-    if duration is None or levels is None:
-        allow_weaker = is_fixed or duration is not None
-        question, pattern = _query(table, question, allow_weaker=allow_weaker)
-        if is_fixed:
-            # Alike wherever the finger is: the margin for other plates differs from place to place.
-            excess = max(pattern.level_db_sl - question.level_db_sl, 0.0)
-            pattern = pattern.scaled(-excess)
-            return _steady(question, pattern, pattern.level_db_sl)
-        robust = pattern.robust_level_db_sl
-        return _steady(question, pattern, pattern.level_db_sl if robust is None else robust)
-    return _over_duration(table, question, duration, capabilities, levels)
+    question, pattern = _query(table, question, allow_weaker=target.band is not None)
+    if target.band is not None:
+        # Alike wherever the finger is: the margin for other plates differs from place to place.
+        excess = max(pattern.level_db_sl - question.level_db_sl, 0.0)
+        pattern = pattern.scaled(-excess)
+        return _steady(question, pattern, pattern.level_db_sl)
+    robust = pattern.robust_level_db_sl
+    return _steady(question, pattern, pattern.level_db_sl if robust is None else robust)
 
 
 def question_of(contact: Contact, quiet: Sequence[Contact], **others: Any) -> Question:
@@ -167,13 +165,13 @@ def _over_duration(
 
 
 def _over_effect(
-    levels: EffectLevels | None, question: Question, duration: float | None
+    levels: EffectLevels, question: Question, duration: float | None
 ) -> OverEffect | None:
     """Return the gains over a duration [s] by which drives are chosen.
 
     None for a vibration that lasts, or whose onset is shaped.
     """
-    if levels is None or duration is None or question.envelopes:
+    if duration is None or question.envelopes:
         return None
     return OverEffect(duration, partial(levels.responses, question=question, duration=duration))
 

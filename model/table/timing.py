@@ -23,7 +23,7 @@ class Timing:
 
     def __init__(self, table: LocalizationTable, *, shaper: Shaper | None = None) -> None:
         self._table, self._eras = table, table.eras
-        self.levels: EffectLevels | None = EffectLevels(table)
+        self.levels = EffectLevels(table)
         variance = table.uncertainty.gain_variance
         self._shaper = shaper or Shaper(
             table.in_time, gain_variance=variance, fingertips=partial(_few_points, table)

@@ -19,6 +19,7 @@ from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from rig_on_wire import FarSide, far_side
+from set_table import SetTiming
 from sim.far_ends.wires import Wire
 from sim.plant.imperfections import Imperfections
 from sim.witness.witness import OperatorCommand
@@ -77,7 +78,7 @@ class Chain:
                 table,
                 lines=Lines,
                 urls=far.urls,
-                **{"intent_source": BuzzNewestContact(), **options},
+                **{"intent_source": BuzzNewestContact(), "timing": SetTiming(), **options},
             )
             witness.follow(controller)
             assert far.machine is not None

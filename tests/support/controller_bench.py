@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from model.vibration.excitation import Tone
 from newest_contact import BuzzNewestContact
 from registry.limits import GuardLimits
-from set_table import SetTable, make_rig
+from set_table import SetTable, SetTiming, make_rig
 from words_line import MemoryLine
 
 FINGER = (1, 0.5, 0.5)
@@ -299,7 +299,7 @@ def make_bench(
         table,
         lines=lambda: BenchLines(by_name),
         observer=observer or reports.observer(),
-        **{"intent_source": BuzzNewestContact(), **options},
+        **{"intent_source": BuzzNewestContact(), "timing": SetTiming(), **options},
     )
     return Bench(controller, rig, far_ends, table, reports)
 

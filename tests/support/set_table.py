@@ -1,17 +1,19 @@
-"""A table whose answers a test sets, and rigs of a few ERAs for which nothing has to be solved."""
+"""A table whose answers a test sets, its timing, and rigs for which nothing has to be solved."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, IntArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
+from model.table.effect_level import DriveLimits, RaisedPattern
 from model.table.pattern import Pattern
-from model.table.question import Question
+from model.table.pulse_gains import PulseResponses
+from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.vibration.excitation import Excitation
 from registry.limits import GuardLimits
 
@@ -58,7 +60,8 @@ class SetTable:
 
     def query(self, question: Question, over_effect: object = None) -> Pattern:
         """The same for every target."""
-        self.asked.append(question)
+        if question.level_db_sl > MIN_LEVEL_DB_SL:  # else it prepares
+            self.asked.append(question)
         answer = self.shared if self.shared and question.quiet else self.excitation
         if isinstance(answer, Exception):
             raise answer
@@ -70,3 +73,46 @@ class SetTable:
     ) -> tuple[FloatArray, FloatArray]:
         """1 m/s² everywhere."""
         return np.array([110.0]), np.ones((1, len(points)))
+
+
+class SetLevels:
+    """Levels over durations that are the steady ones."""
+
+    def raised(
+        self,
+        pattern: Pattern,
+        question: Question,
+        *,
+        level_db_sl: float,
+        duration: float,
+        limits: DriveLimits,
+    ) -> RaisedPattern:
+        """The pattern as it is."""
+        return RaisedPattern(pattern, min(level_db_sl, pattern.level_db_sl), 0.0, None)
+
+    def responses(self, rows: IntArray, *, question: Question, duration: float) -> PulseResponses:
+        """Not to be called."""
+        raise AssertionError("a table whose answers are set must ask for no responses")
+
+
+class SetTiming:
+    """A timing that leaves patterns along their ramps; prepared [Hz]: what was asked of it."""
+
+    levels = SetLevels()
+
+    def __init__(self) -> None:
+        self.prepared: list[float] = []
+
+    def prepare(self, frequencies: Iterable[float]) -> None:
+        """Remember them."""
+        self.prepared += frequencies
+
+    def with_envelopes(
+        self, question: Question, pattern: Pattern, *, onset: bool, ending: bool
+    ) -> Pattern:
+        """Return it as it is."""
+        return pattern
+
+    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
+        """Return it as it is."""
+        return pattern

@@ -23,6 +23,7 @@ from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.opening import Lines
+from model.table.timing import Timing
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
 from rig_on_wire import after_each, far_side, on_two_amplifiers
@@ -165,6 +166,7 @@ class _Run:
 
     def _host(self) -> None:
         """Start a host: a supervisor with its control loop; the witness hears what they do."""
+        table = small_table()
         supervisor = self.supervisor = Supervisor(
             state_changed=(lambda old, new: self.note("state", new.state),),
             link_changed=self._link_changed,
@@ -172,9 +174,10 @@ class _Run:
         )
         controller = self.controller = Controller(
             self.rig,
-            small_table(),
+            table,
             lines=Lines,
             intent_source=BuzzNewestContact(),
+            timing=Timing(table),
             urls=self.far.urls,
             connected=supervisor.connected,
             observer=supervisor.observer(),

@@ -17,6 +17,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_together import Together, check_together, close_pairs, matrix_of
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
+from controller.loop.choice import Chooser
 from controller.loop.content import Prediction
 from controller.loop.intent import HapticIntent
 from controller.loop.selection import Selector
@@ -53,7 +54,7 @@ def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> l
 
     async def predicted() -> tuple[Prediction, ...]:
         arrived = asyncio.Event()
-        selector = Selector(table(), EffectLevels(table()), arrived=arrived.set)
+        selector = Selector(Chooser(table(), EffectLevels(table())), arrived=arrived.set)
         selector.select(contacts, intent, playable())
         if selector.is_choosing:
             await arrived.wait()

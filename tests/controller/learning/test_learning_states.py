@@ -52,7 +52,7 @@ class Taking:
     def __init__(self) -> None:
         self.taken: list[LocalizationTable] = []
 
-    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Note a table."""
         self.taken.append(table)
 

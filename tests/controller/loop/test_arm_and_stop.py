@@ -23,6 +23,7 @@ from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
 from model.table.timing import Timing
 from newest_contact import BuzzNewestContact
+from set_table import SetTiming
 from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time
 
@@ -266,6 +267,7 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
             bench.table,
             lines=lambda: BenchLines({}),
             intent_source=BuzzNewestContact(),
+            timing=SetTiming(),
             urls={"other": "fake://"},
         )
     with pytest.raises(InputError, match=r"ERA NE .*0 to 0 on amplifier main, got 1; .*rig file"):

@@ -16,11 +16,10 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.loop.decision import ENDED, Decider
 from controller.loop.intent import Target
-from controller.loop.joint_answer import query_jointly
+from controller.loop.joint_answer import query_jointly, unshaped
 from controller.loop.observer import Applied
 from controller.loop.plate_set import PlateSet
 from controller.loop.playing import PlayedContent
-from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
@@ -29,6 +28,7 @@ from model.arrays import Complex64Array
 from model.config.shapes import Rectangle
 from model.errors import InputError
 from model.table.pattern import Pattern
+from set_table import SetTiming
 from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 
@@ -458,10 +458,10 @@ async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
 async def test_an_answer_is_shaped_by_the_timing_it_began_with(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Others are put in place meanwhile, without a timing: what was begun has its onset."""
+    """Others are put in place meanwhile, whose timing has no envelopes: what was begun has one."""
     answering_after(0.03, monkeypatch)
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.01) as fingers:
-        fingers.controller.replace_answers(table(), None)
+        fingers.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
         await fingers.hold(0.3)
         (applied,) = fingers.applied
         assert all(one.pattern.onset for one in applied.contents.values())

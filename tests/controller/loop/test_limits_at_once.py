@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 
 from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.choice import Chooser
 from controller.loop.content import Selection
 from controller.loop.intent import HapticIntent, Pulse, Target
-from controller.loop.joint_answer import query_jointly
-from controller.loop.selection import Selector, unshaped
+from controller.loop.joint_answer import query_jointly, unshaped
+from controller.loop.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.table.effect_level import EffectLevels
 from several_fingers import LEFT, RIGHT, playable, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
 FREE = playable()
+
+
+def a_selector() -> Selector:
+    """One that has chosen nothing yet."""
+    return Selector(Chooser(table(), EffectLevels(table())))
 
 
 def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:
@@ -128,12 +134,12 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
     """Both at once take no more than the limit; with hardly any left it is held back."""
     click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
     intent = HapticIntent((Target(CONTACTS[0].key, 20.0), click))
-    selector = Selector(table(), EffectLevels(table()))
+    selector = a_selector()
     free = selector.select(CONTACTS, intent, FREE)
     lasting = np.linalg.norm(sums(replace(free, contents=free.contents[:1])))
     for share, count in ((1.3, 2), (1.001, 1)):
         capabilities = replace(FREE, max_power=(share * lasting) ** 2)
-        found = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, capabilities)
+        found = a_selector().select(CONTACTS, intent, capabilities)
         assert len(found.contents) == count
         assert (
             np.linalg.norm(sums(found)) <= share * lasting * (1 + 1e-6) < np.linalg.norm(sums(free))
@@ -147,14 +153,14 @@ def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
     """It is lowered to the limit, 0.8 of its amplitude, instead of refused by the amplifiers."""
     target = Target(CONTACTS[0].key, 14.0)
     intent = HapticIntent((target,))
-    free = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, FREE)
+    free = a_selector().select(CONTACTS, intent, FREE)
     most = 0.8 * sums(free).max()
     capabilities = replace(FREE, max_power=0.8**2 * float((sums(free) ** 2).sum()))
     if what == "level":
         capabilities = replace(
             FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}
         )
-    found = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, capabilities)
+    found = a_selector().select(CONTACTS, intent, capabilities)
     assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
     (before,), (after,) = free.predictions, found.predictions
     assert before.level_db_sl is not None

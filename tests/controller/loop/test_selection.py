@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.loop.choice import Chooser
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.selection import Selector
 from controller.loop.table_query import strongest
@@ -18,7 +19,9 @@ from model.finger.perception import DEFAULT_THRESHOLD
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.table import LocalizationTable
 from model.vibration.excitation import Tone
+from set_table import SetLevels
 from small_table import small_table
 
 CAPABILITIES = PlaybackCapabilities(
@@ -68,6 +71,11 @@ def at(id: int, x: float, y: float = 0.1) -> Contact:
     return Contact(ContactKey("a", id), x, y, since=0.0)
 
 
+def selector_of(table: Table | LocalizationTable) -> Selector:
+    """A selector by a table."""
+    return Selector(Chooser(table, SetLevels()))  # type: ignore[arg-type]
+
+
 @pytest.fixture
 def table() -> Table:
     """A table that refuses nothing."""
@@ -78,9 +86,9 @@ def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
     """The question has the target's level, and drive modes and band of the amplifiers."""
     contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
     shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onset_knots=20))
-    Selector(table).select(contacts, wanting(c3=17.0), shaped)
+    selector_of(table).select(contacts, wanting(c3=17.0), shaped)
     assert table.asked.pop().envelopes
-    selection = Selector(table).select(contacts, wanting(c3=17.0), CAPABILITIES)
+    selection = selector_of(table).select(contacts, wanting(c3=17.0), CAPABILITIES)
     (question,) = table.asked
     assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
     assert (question.level_db_sl, question.drive_mode) == (17.0, "phased")
@@ -109,14 +117,14 @@ def test_selector_asks_within_the_band_of_its_target(
     """
     table.frequencies = np.array([80.0, 100.0, 120.0, 250.0, 350.0])
     intent = HapticIntent((Target(ContactKey("a", 1), 12.0, band=band),))
-    Selector(table).select((at(1, 0.1),), intent, CAPABILITIES)
+    selector_of(table).select((at(1, 0.1),), intent, CAPABILITIES)
     assert table.asked[0].frequencies == asked
 
 
 def test_selector_scales_to_what_the_neighbours_allow(table: Table) -> None:
     """Queried at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
     table.quiet_level = -2.0
-    selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
+    selection = selector_of(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
     assert table.asked[0].level_db_sl == 12.0
     assert selection.pattern is not None
     assert selection.predictions[0].level_db_sl == pytest.approx(4.0)
@@ -165,12 +173,12 @@ def test_selector_saturates_a_level_or_less(table: Table) -> None:
     capabilities = replace(CAPABILITIES, max_amplitudes={"SW": 2e-6})
     contacts = (at(1, 0.1), at(2, 0.2))
     for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
-        selection = Selector(table).select(contacts, allow_weaker(wanted), capabilities)
+        selection = selector_of(table).select(contacts, allow_weaker(wanted), capabilities)
         assert selection.pattern is not None
         assert selection.predictions[0].level_db_sl == pytest.approx(level)
         assert selection.question is table.asked[-1]
     table.most = 11.0
-    selection = Selector(table).select(contacts, allow_weaker(30.0), capabilities)
+    selection = selector_of(table).select(contacts, allow_weaker(30.0), capabilities)
     assert (selection.pattern, selection.reason) == (None, "too loud")
 
 
@@ -178,7 +186,7 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
-    selection = Selector(table).select((at(1, 0.1),), allow_weaker(60.0), capabilities)
+    selection = selector_of(table).select((at(1, 0.1),), allow_weaker(60.0), capabilities)
     assert selection.pattern is not None
     assert 12 < selection.predictions[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
@@ -282,7 +290,7 @@ COURSES: Mapping[str, Sequence[Chosen]] = {
 @pytest.mark.parametrize("name", COURSES)
 def test_selector_asks_again_when_it_must(table: Table, name: str) -> None:
     """And keeps what it has chosen otherwise; silence has its reason."""
-    selector, before = Selector(table), None
+    selector, before = selector_of(table), None
     for step in COURSES[name]:
         table.refuse_below, table.error, count = step.refuse_below, step.error, len(table.asked)
         chosen = selector.select(step.contacts, step.intent, CAPABILITIES)
@@ -300,7 +308,7 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) ->
     pulse = Target(ContactKey("a", 2), 12.0, pulse=Pulse(0.03, requested_at=0.0))
     intent = HapticIntent((Target(ContactKey("a", 1), 12.0), pulse))
     full = replace(CAPABILITIES, max_amplitudes={"SW": 1e-6}, layers=2)
-    selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), intent, full)
+    selection = selector_of(table).select((at(1, 0.1), at(2, 0.2)), intent, full)
     assert [each.targets[0][0].key.id for each in selection.contents] == [1]
     (held,) = selection.not_served
     assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
@@ -312,7 +320,7 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
 ) -> None:
     """Of 1.6 µm, of which each would take 1 µm: at once, while the first plays, and after it."""
     limits = replace(CAPABILITIES, max_amplitudes={"SW": 1.6e-6}, layers=2)
-    selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
+    selector, contacts = selector_of(table), (at(1, 0.1), at(2, 0.2))
     first, second = (
         Target(ContactKey("a", id), 12.0, pulse=Pulse(0.03, requested_at=requested_at))
         for id, requested_at in ((1, 0.0), (2, since))

@@ -3,7 +3,7 @@
 import asyncio
 import cmath
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -21,21 +21,14 @@ from drivers.protocol.sets import Envelope
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope
+from set_table import SetTiming
 from virtual_loop import in_virtual_time
 
 
-class Shapes:
+class Shapes(SetTiming):
     """A timing whose envelopes are straight lines: up in 21 knots, down in 8."""
 
-    levels = None
-
-    def __init__(self) -> None:
-        self.prepared: list[float] = []
-        self.largest = 1.0
-
-    def prepare(self, frequencies: Iterable[float]) -> None:
-        """Remember them."""
-        self.prepared += frequencies
+    largest = 1.0
 
     def with_envelopes(
         self, question: Question, pattern: Pattern, *, onset: bool, ending: bool

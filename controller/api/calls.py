@@ -10,6 +10,7 @@ from typing import Any
 from controller.api.client_protocol import make_params
 from controller.api.methods import METHODS, Method
 from controller.api.schema import Empty, Message
+from controller.api.summaries import SUMMARIES
 
 BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
 """Methods whose arguments the clients put together, from positions and names of topics."""
@@ -41,7 +42,7 @@ def _coroutine_of(name: str, method: Method) -> Callable[..., Any]:
         return None if method.result is Empty else result
 
     call.__name__, call.__qualname__ = name, f"AsyncClient.{name}"
-    call.__doc__ = f"{method.summary[0].upper()}{method.summary[1:]}."
+    call.__doc__ = SUMMARIES[name]
     call.__signature__ = signature  # type: ignore[attr-defined]
     return call
 

@@ -177,15 +177,14 @@ class Method(NamedTuple):
     """A method of the API, and how its requests are treated.
 
     is_limited: whether they count in a client's rate; silences: whether they end what plays;
-    in_reserve: whether they are served to
-    clients in reserve; needs_reply: whether they are carried out only for a client that gets the
-    reply; is_repeated: whether clients send them again if the connection is lost, after which they
-    may have been carried out; over_http: whether they need no lasting connection.
+    in_reserve: whether they are served to clients in reserve; needs_reply: whether they are carried
+    out only for a client that gets the reply; is_repeated: whether clients send them again if the
+    connection is lost, after which they may have been carried out; over_http: whether they need no
+    lasting connection.
     """
 
     params: type[Message]
     result: type[Message]
-    summary: str
     is_limited: bool = True
     silences: bool = False
     in_reserve: bool = False
@@ -195,64 +194,23 @@ class Method(NamedTuple):
 
 
 METHODS: dict[str, Method] = {
-    "hello": Method(
-        HelloParams,
-        HelloResult,
-        "introduce the client; returns what the daemon drives",
-        in_reserve=True,
-    ),
-    "status": Method(
-        Empty, StatusResult, "state of the daemon, the amplifiers and the plate", in_reserve=True
-    ),
-    "arm": Method(
-        ArmParams,
-        ArmResult,
-        "switch high voltage on; touches are felt until the lease expires",
-        needs_reply=True,
-        is_repeated=False,
-    ),
-    "renew": Method(RenewParams, RenewResult, "extend the lease"),
-    "disarm": Method(
-        DisarmParams,
-        Empty,
-        "ramp to silence and switch high voltage off; any client may",
-        silences=True,
-        in_reserve=True,
-    ),
-    "stop": Method(
-        RequestedBy,
-        StopResult,
-        "quick stop, latched until clear; any client may, at any time; error 1006 unless every "
-        "amplifier is confirmed silent",
-        is_limited=False,
-        silences=True,
-        in_reserve=True,
-    ),
-    "clear": Method(
-        ClearParams,
-        Empty,
-        "acknowledge a stop, or a fault whose cause is gone",
-        is_repeated=False,  # it would acknowledge a stop that came meanwhile
-    ),
-    "forget": Method(
-        RequestedBy, Empty, "discard what was learned of the plate; answers are those of the table"
-    ),
-    "touch": Method(
-        TouchParams,
-        Empty,
-        "report all fingers of a touch source of this client",
-        is_limited=False,  # the newest frame counts, so they never queue up
-    ),
-    "effects": Method(Empty, EffectsResult, "list the effects"),
-    "play": Method(
-        PlayParams, Empty, "play an effect at a finger; only while armed", is_repeated=False
-    ),
-    "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics", over_http=False),
-    "unsubscribe": Method(
-        UnsubscribeParams, Empty, "receive no more notifications of topics", over_http=False
-    ),
+    "hello": Method(HelloParams, HelloResult, in_reserve=True),
+    "status": Method(Empty, StatusResult, in_reserve=True),
+    "arm": Method(ArmParams, ArmResult, needs_reply=True, is_repeated=False),
+    "renew": Method(RenewParams, RenewResult),
+    "disarm": Method(DisarmParams, Empty, silences=True, in_reserve=True),
+    "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
+    # Sent again, it would acknowledge a stop that came meanwhile.
+    "clear": Method(ClearParams, Empty, is_repeated=False),
+    "forget": Method(RequestedBy, Empty),
+    # The newest frame counts, so they never queue up.
+    "touch": Method(TouchParams, Empty, is_limited=False),
+    "effects": Method(Empty, EffectsResult),
+    "play": Method(PlayParams, Empty, is_repeated=False),
+    "subscribe": Method(SubscribeParams, Empty, over_http=False),
+    "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
 }
-"""Every method of the API, by name: the one place where a method is registered."""
+"""Every method of the API, by name; SUMMARIES say what each does."""
 
 SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
 """Methods that end what plays."""

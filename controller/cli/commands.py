@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from controller.api.summaries import SUMMARIES
 from controller.cli.daemon import (
     DASHBOARD,
     DashboardCommand,
@@ -124,16 +125,9 @@ app = typer.Typer()
 app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)
-for _command in (arm, demo, gateway, report, status, touch, watch):
+for _command in (demo, gateway, report, touch, watch):
     app.command()(_command)
-
-_METHODS = {
-    "disarm": "Ramp to silence, then switch the high voltage off.",
-    "stop": "Quick-stop all amplifiers, latched until era clear. Not an emergency stop.",
-    "clear": "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.",
-    "forget": "Discard what was learned of the plate, and learn anew.",
-}
-"""Methods of the API that are commands: help is quick, and does not load what they are made of."""
-
-for _method, _help in _METHODS.items():
-    app.command(_method, help=_help)(of_method(_method))
+for _name in ("disarm", "stop", "clear", "forget"):
+    app.command(_name, help=SUMMARIES[_name])(of_method(_name))
+for _more in (arm, status):
+    app.command(help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}")(_more)

@@ -89,7 +89,7 @@ def daemon(
 
 
 def status(socket: Socket = None, as_json: JsonOption = False) -> None:
-    """Show daemon, amplifiers and contacts. Exit status 0 in a fault, too."""
+    """Exit status 0 in a fault, too."""
     from controller.cli.shown import show_status
 
     with _client(socket) as era:
@@ -108,7 +108,7 @@ def arm(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Switch the high voltage on. Stays and renews the lease; Ctrl-C disarms."""
+    """Stays and renews the lease; Ctrl-C disarms."""
     with _client(socket) as era:
         if once:
             granted = era.arm(owner, lease_s=lease)

@@ -37,6 +37,7 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, SILENCING, Method, StatusResult
 from controller.api.rate_limit import RateLimiter, Rates
 from controller.api.schema import API_VERSION, Message
+from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import KeptLink, bridge, client_name
 from controller.gateway.field import DrawnField
@@ -121,7 +122,7 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     success = {"application/json": {"schema": references[method.result, "serialization"]}}
     return {
         "operationId": name,
-        "summary": method.summary,
+        "summary": SUMMARIES[name],
         "requestBody": {
             "required": any(field.is_required() for field in method.params.model_fields.values()),
             "content": {"application/json": {"schema": references[method.params, "validation"]}},

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from controller.api.jsonrpc import ERROR_MEANINGS
 from controller.api.methods import METHODS
 from controller.api.schema import Message
+from controller.api.summaries import SUMMARIES
 from controller.api.topics import TOPICS, EventParams
 from page_part import insert
 
@@ -24,7 +25,7 @@ def reference() -> str:
     lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
-        lines += ["", f"#### {name}", "", _sentence(method.summary), "", *_HEAD, *rows]
+        lines += ["", f"#### {name}", "", SUMMARIES[name], "", *_HEAD, *rows]
     lines += ["", "### Topics", "", "The parameters of every `event` notification, and its `data`:"]
     lines += ["", *_HEAD, *_rows("", EventParams, models)]
     for topic, entry in TOPICS.items():
@@ -120,10 +121,6 @@ def _bounds(metadata: Iterable[object]) -> Iterator[str]:
 
 def _summary(model: type[Message]) -> str:
     return " ".join((model.__doc__ or "").split())
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."
 
 
 if __name__ == "__main__":

@@ -5,27 +5,37 @@ wires; only the lines are memory. The witness reads every byte and is the judge.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any, Self
+from types import MappingProxyType
+from typing import Any, Self, cast
 
+from committed_sets import CommittedSets
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.opening import Lines
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet, is_vibrating
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
+from sim.amplifier.contract import Amplifier
 from sim.far_ends.wires import Wire
+from sim.faults.fault_window import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections
 from sim.witness.witness import OperatorCommand
-from witness_config import LoopWitness
+from sim.witness_relay import parse_endpoint
+from witness_config import LoopWitness, tell_first
 
 Position = tuple[float, float]
+Finger = tuple[int, float, float]
+"""A finger by its number, at x and y [m] of the plate."""
+
 _REPORT = 0.010  # s; between two frames of the panel
 
 
@@ -35,7 +45,9 @@ class Chain:
 
     at: the fingers by id, at x, y [m] of the plate; is_felt: whether they rest on the plate too, or
     on its panel alone; must_be_felt: whether each that comes must lead to a pattern;
-    applied, silenced: what the control loop has reported.
+    timeout [s]: how long they are taken for down after a report, None for a panel's;
+    ends: the amplifiers; applied, silenced, refused, lost, contacts: what the control loop has
+    reported, of contacts their number at each change.
     """
 
     far: FarSide
@@ -45,9 +57,34 @@ class Chain:
     at: dict[int, Position] = field(default_factory=dict)
     is_felt: bool = True
     must_be_felt: bool = True
+    timeout: float | None = None
+    table: Any = field(init=False)
+    ends: "list[FarEnd]" = field(init=False)
     applied: list[Applied] = field(default_factory=list)
     silenced: list[Silenced] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    contacts: list[int] = field(default_factory=list)
     running: "asyncio.Task[None] | None" = None
+
+    def __post_init__(self) -> None:
+        """Hear of what the control loop reports, and of all that is requested of the far ends."""
+        self.table = self.controller.table
+        self.ends = [FarEnd(self.far, name) for name in self.far.devices]
+        self.controller.observers.append(
+            Observer(
+                contacts_changed=lambda contacts, change: self.contacts.append(len(contacts)),
+                pattern_applied=self.applied.append,
+                silenced=self.silenced.append,
+                refused=self.refused.append,
+                link_lost=self.lost.append,
+            )
+        )
+
+    @property
+    def end(self) -> "FarEnd":
+        """The first amplifier."""
+        return self.ends[0]
 
     @classmethod
     @asynccontextmanager
@@ -57,21 +94,24 @@ class Chain:
         rig: Rig,
         table: Any,
         *,
+        passing: tuple[float, float] | None = None,
         plate: Rig | None = None,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
         judged: Mapping[str, Any] | None = None,
-        layers: int = 8,
+        capabilities: Mapping[str, int] = MappingProxyType({}),
         **options: Any,
     ) -> AsyncIterator[Self]:
         """A chain whose wires are not open yet; wires: of all amplifiers, or of each by name.
 
+        passing [s]: shortest and longest time of bytes on serial lines, None for those of machines;
         plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
-        `witness_config`; layers: of each amplifier; options: as a `Controller` takes them.
+        `witness_config`; capabilities: what each amplifier has in place of its own; options: as a
+        `Controller` takes them.
         """
         far_end = far_side(wires, plate or rig, seed=1, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
-                amplifier.capabilities["layers"] = layers
+                amplifier.capabilities.update(capabilities)
             witness = LoopWitness(far.urls, **(judged or {}))
             controller = Controller(
                 rig,
@@ -81,11 +121,11 @@ class Chain:
                 **{"intent_source": BuzzNewestContact(), "timing": SetTiming(), **options},
             )
             witness.follow(controller)
+            for device in far.devices.values():
+                tell_first(device, "inject_fault", lambda *_: witness.disturb())
             assert far.machine is not None
+            far.machine.passing = passing or far.machine.passing
             chain = cls(far, far.machine, witness, controller)
-            controller.observers.append(
-                Observer(pattern_applied=chain.applied.append, silenced=chain.silenced.append)
-            )
             yield chain
 
     @classmethod
@@ -102,9 +142,15 @@ class Chain:
             await chain.operate("arm")
             yield chain
             await chain.close()
-            found = chain.witness.finish(clock.now())
-            assert {one.invariant for one in found} == ({breaks} if breaks else set()), found[:1]
-            assert chain.witness.frames > 10
+            chain.judge(breaks)
+
+    def judge(self, breaks: str | None = None) -> None:
+        """Ask the witness; breaks: the only rule that is broken."""
+        found = self.witness.finish(clock.now())
+        assert {one.invariant for one in found} == ({breaks} if breaks else set()), [
+            str(one)[:300] for one in found
+        ]
+        assert self.witness.frames > 10
 
     async def open(self) -> None:
         """Open all wires, and start the control loop."""
@@ -119,8 +165,8 @@ class Chain:
         """Carry out an operator's command; returns what the control loop says of it."""
         return await getattr(self.controller, command)()
 
-    def report(self) -> None:
-        """Report where the fingers are."""
+    def report(self, *, ago: float = 0.0) -> None:
+        """Report where the fingers are, or were some time ago [s]."""
         now, plate = clock.now(), self.far.bench.rig.plate
         if self.is_felt:
             self.far.bench.place_fingers({str(id): at for id, at in self.at.items()}, now=now)
@@ -128,10 +174,31 @@ class Chain:
         touches = tuple(
             Touch(id, x / plate.length, 1 - y / plate.width) for id, (x, y) in self.at.items()
         )
-        self.controller.deliver(TouchFrame("panel", now, touches))
+        self.controller.deliver(TouchFrame("panel", now - ago, touches, self.timeout))
 
-    async def hold(self, seconds: float, way: Callable[[float], None] = lambda since: None) -> None:
-        """Report them for a time [s]; way moves them, by the time since the start."""
+    def put(self, *fingers: Finger, ago: float = 0.0) -> None:
+        """Have these fingers in place of all that are down, and report them."""
+        self.at = {id: (x, y) for id, x, y in fingers}
+        self.report(ago=ago)
+
+    async def leave(self, seconds: float, *fingers: Finger, ago: float = 0.0) -> None:
+        """Put these fingers down, and report them no more for a time [s]."""
+        self.put(*fingers, ago=ago)
+        await asyncio.sleep(seconds)
+
+    async def hold(
+        self,
+        seconds: float,
+        way: Callable[[float], None] = lambda since: None,
+        *,
+        down: Sequence[Finger] = (),
+    ) -> None:
+        """Report the fingers for a time [s]; way moves them, by the time since the start.
+
+        down: fingers in place of all that are down.
+        """
+        if down:
+            self.at = {id: (x, y) for id, x, y in down}
         begin = clock.now()
         while (since := clock.now() - begin) < seconds - 1e-9:
             way(since)
@@ -143,9 +210,107 @@ class Chain:
         return {name: self.far.summary(name).levels for name in self.far.devices}
 
     async def close(self) -> None:
-        """Disarm and close all, and end the control loop."""
+        """Disarm and close all; raises what ended the control loop."""
         self.witness.commanded("disarm")
         await self.controller.close()
         if self.running is not None:
-            self.running.cancel()
-            await asyncio.gather(self.running, return_exceptions=True)
+            await self.running
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What a layer was to play from a time [s] on; token 0 for a silence."""
+
+    time: float
+    token: int
+    layer: LayerSet
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing plays after it."""
+        return not is_vibrating(self.layer)
+
+
+class FarEnd:
+    """An amplifier of a chain: what is requested of it, and what it does in place of its duty.
+
+    asked: times [s], names and values of all requests; answer may override a reply, or raise
+    Refusal; `delay` is of serial lines alone.
+    """
+
+    def __init__(self, far: FarSide, name: str) -> None:
+        self.name = name
+        self.device = far.devices[name]
+        self.amplifier = cast(Amplifier, far.bench.amplifiers[name])
+        self.asked: list[tuple[float, str, Values]] = []
+        self.answer: Callable[[str, Values], Values | None] = lambda name, values: None
+        self.obey = self.device.handle
+        self.device.handle = self._handle  # type: ignore[method-assign]
+        self.committed = CommittedSets()
+        self._far = far
+        assert far.machine is not None
+        self._machine = far.machine
+
+    def _handle(self, name: str, values: Values, now: float) -> Values:
+        self.asked.append((now, name, values))
+        answer = self.answer(name, values)
+        reply = self.obey(name, values, now) if answer is None else answer
+        self.committed.note(name, values, reply, now)
+        return reply
+
+    @property
+    def port(self) -> str:
+        """Where its line is."""
+        return parse_endpoint(self._far.urls[self.name]).location
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a host has its line open."""
+        return self._machine.opened(self.port) is not None
+
+    def delay(self, seconds: float) -> None:
+        """Let its replies leave it so much later [s] from now on."""
+        self._machine.late[self.port] = seconds
+
+    def fault(self, kind: FaultKind, **given: Any) -> None:
+        """Let a fault begin, until `recover` unless it has an end."""
+        self.device.inject_fault(FaultWindow(kind, **given))
+
+    def recover(self) -> None:
+        """End all its faults."""
+        self.device.recover()
+
+    @property
+    def state(self) -> str:
+        """Its state now."""
+        return self._far.summary(self.name).state
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """What its channels play now."""
+        return self._far.summary(self.name).levels
+
+    def status(self) -> Values:
+        """What it would report now."""
+        self.device.tick(clock.now())
+        return self.amplifier.status(clock.now())
+
+    def sent(self) -> list[Sent]:
+        """All sets that were committed, and silences, in order."""
+        return [
+            Sent(time, token, one)
+            for time, token, layers in self.committed.all
+            for one in layers or (LayerSet(0, 0, 0),)
+        ]
+
+    def requests(self, *names: str) -> list[Values]:
+        """What was requested, of some names."""
+        return [values for _, name, values in self.asked if name in names]
+
+    def names(self, since: int = 0) -> list[str]:
+        """Names of all requests from a number on."""
+        return [name for _, name, _ in self.asked[since:]]
+
+    def times(self, *names: str) -> list[float]:
+        """When something was requested [s]."""
+        return [time for time, name, _ in self.asked if name in names]

@@ -170,6 +170,7 @@ class Streamed(Chain):
 
     def __post_init__(self) -> None:
         """Place the sensors."""
+        super().__post_init__()
         self.is_felt = False
         self._sensors = Accelerometers(self.far.bench)
         self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])

@@ -5,6 +5,7 @@ Hosts and far ends write real bytes, which arrive after random delays, sometimes
 
 import asyncio
 import random
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -19,9 +20,16 @@ _NOTICED = 0.002  # s; until the host notices a hang-up
 
 
 class MemoryMachine:
-    """Ports by name; `make_terminal` is for far ends, the rest for hosts."""
+    """Ports by name; `make_terminal` is for far ends, the rest for hosts.
+
+    passing [s]: shortest and longest time of bytes on their way; late [s]: how much later what goes
+    to the host leaves the far end, by port; attempts: how often each port was to be opened.
+    """
 
     def __init__(self, loop: VirtualLoop) -> None:
+        self.passing = _PASSING
+        self.late: dict[str, float] = {}
+        self.attempts = Counter[str]()
         self._loop = loop
         self._terminals: dict[str, MemoryTerminal] = {}
         self._open: dict[str, MemoryPort] = {}
@@ -37,7 +45,8 @@ class MemoryMachine:
         self, name: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> "MemoryPort":
         """Open the host's side of a line; LinkError if it is unplugged or open already."""
-        await asyncio.sleep(self._loop.rng.uniform(*_PASSING))
+        self.attempts[name] += 1
+        await asyncio.sleep(self._loop.rng.uniform(*self.passing))
         terminal = self._terminals.get(name)
         if terminal is None or not terminal.is_plugged:
             raise LinkError(f"serial port {name} cannot be opened: no such port")
@@ -56,15 +65,23 @@ class MemoryMachine:
 
     def deliver(self, link: str, toward: str, data: bytes, to: "_Direction") -> None:
         """Deliver bytes in order, after a delay, perhaps in two pieces."""
+        late = self.late.get(link, 0.0) if toward == "host" else 0.0
+        if late or to.leaves > self._loop.time():
+            # Timers of one moment run in any order; bytes of one line must not.
+            to.leaves = max(to.leaves + 1e-9, self._loop.time() + late)
+            self._loop.call_at(to.leaves, self._pass, link, toward, data, to)
+        else:
+            self._pass(link, toward, data, to)
+
+    def _pass(self, link: str, toward: str, data: bytes, to: "_Direction") -> None:
         loop, pieces = self._loop, [data]
         loop.seen(link, toward, data)
         if len(data) > 1 and loop.rng.random() < _SPLIT:
             at = loop.rng.randrange(1, len(data))
             pieces = [data[:at], data[at:]]
         for piece in pieces:
-            # Timers of one moment run in any order; bytes of one line must not.
             soonest = to.arrives + 1e-9
-            to.arrives = max(soonest, loop.time() + loop.rng.uniform(*_PASSING))
+            to.arrives = max(soonest, loop.time() + loop.rng.uniform(*self.passing))
             loop.call_at(to.arrives, to.take, piece)
 
     def later(self, delay: float, callback: Callable[..., None], *args: Any) -> None:
@@ -89,7 +106,7 @@ class _Direction:
     """One direction of a line, until it is unplugged."""
 
     def __init__(self, take: Callable[[bytes], None]) -> None:
-        self.arrives = 0.0
+        self.arrives = self.leaves = 0.0
         self.is_cut = False
         self._take = take
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from chain import Chain, Position
-from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
@@ -60,9 +59,8 @@ class Fingers(Chain):
 
     def __post_init__(self) -> None:
         """Note what requests of the host change."""
-        sets = CommittedSets()
-        self.committed = sets.all
-        after_each(self.far.device, sets.note)
+        super().__post_init__()
+        self.committed = self.end.committed.all
 
     def reached(
         self, *, over: float = 0.25
@@ -131,7 +129,7 @@ async def fingers_on(
         table,
         intent_source=EffectPlayer(layout),
         timing=Timing(table),
-        layers=layers,
+        capabilities={"layers": layers},
         breaks=breaks,
     ) as fingers:
         fingers.at = {**at}
@@ -232,6 +230,7 @@ class _Starts(Chain):
 
     def __post_init__(self) -> None:
         """Note when a tone starts."""
+        super().__post_init__()
         amplifier = self.far.amplifier
 
         def note(*_: object) -> None:

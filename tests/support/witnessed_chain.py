@@ -37,31 +37,14 @@ WITNESSED = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
 
 @dataclass
 class Scene(Chain):
-    """A chain whose source repeats its touches; errors: what its callers were told.
+    """A chain whose source repeats its touches; errors: what its callers were told."""
 
-    delay [s]: of what goes to the host.
-    """
-
-    table: SetTable = field(init=False)
     errors: list[BaseException] = field(default_factory=list)
-    delay: float = 0.0
     _holding: "asyncio.Task[None] | None" = None
-    _due: float = 0.0
 
     def __post_init__(self) -> None:
-        """Delay what goes to the host, before the witness hears it."""
-        deliver = self.operation.deliver
-
-        def delayed(link: str, toward: str, data: bytes, to: Any) -> None:
-            if toward == "host" and self.delay:
-                # Timers of one moment fire in any order; bytes of one line stay in order.
-                self._due = max(self._due + 1e-9, clock.now() + self.delay)
-                loop = asyncio.get_running_loop()
-                loop.call_at(self._due, deliver, link, toward, data, to)
-            else:
-                deliver(link, toward, data, to)
-
-        self.operation.deliver = delayed  # type: ignore[method-assign]
+        """Have a source whose fingers do not load the plate."""
+        super().__post_init__()
         self.is_felt = False
 
     @property
@@ -89,6 +72,7 @@ class Scene(Chain):
         if self.running is not None:
             self.running.cancel()
             await asyncio.gather(self.running, return_exceptions=True)
+            self.running = None
         await self.rest(0.002)  # until bytes in flight are on the wire
         self.witness.set_stalled(clock.now())
 
@@ -155,7 +139,8 @@ class Scene(Chain):
 
     def delayed(self, seconds: float) -> None:
         """Delay what goes to the host from now on."""
-        self.delay = seconds
+        for end in self.ends:
+            end.delay(seconds)
 
     async def touch_for(self, frequency: float, level: float, phase: float = 0.0) -> None:
         """Touch where the table has this tone for one ERA, which may not be played."""
@@ -203,7 +188,6 @@ def play(
         table = SetTable(ALONE, rig.plate, SHARED)
         judged = {"channels": 3, "level": 0.5, "slew_per_s": 100}
         async with Scene.on(Wire(wire), rig, table, judged=judged) as scene:
-            scene.table = table
             scene.witness.contacts(clock.now(), ())
             sensing = asyncio.create_task(scene.keep_sensing())
             await scene.tried(scene.open())

@@ -3,29 +3,33 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from chain import Chain
 from controller.loop.loop import Controller
-from controller_bench import (
-    ENABLED,
-    FINGER,
-    OTHER,
-    STOPPED,
-    BenchLines,
-    FarEnd,
-    make_bench,
-    running,
-)
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.members import GroupState
+from drivers.opening import Lines
 from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
+from model.rig.rig import Channel
 from model.table.timing import Timing
 from newest_contact import BuzzNewestContact
+from set_chain import FINGER, OTHER, set_chain, set_running
 from set_table import SetTiming
+from sim.far_ends.wires import Wire
 from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time
+
+ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
+
+
+def states(chain: Chain) -> set[str]:
+    """The states of all amplifiers."""
+    return {end.state for end in chain.ends}
 
 
 def refusing(name: str, code: str) -> Callable[[str, Values], None]:
@@ -41,56 +45,56 @@ def refusing(name: str, code: str) -> Callable[[str, Values], None]:
 @in_virtual_time
 async def test_lost_link_stops_the_others() -> None:
     """The loss is reported, and arming needs all to be opened again."""
-    async with running("a", "b") as bench:
-        await bench.hold(FINGER, seconds=0.1)
+    async with set_running("a", "b") as chain:
+        await chain.hold(0.1, down=[FINGER])
 
-        bench.far_ends[0].line.lose("the cable was pulled")
+        chain.ends[0].fault("unplug")
         await asyncio.sleep(0.1)
-        assert bench.controller.group.state is GroupState.LOST
-        assert len(bench.far_ends[1].requests("Stop")) == 1
-        (lost,) = bench.reports.lost
-        assert "the cable was pulled" in lost
+        assert chain.controller.group.state is GroupState.LOST
+        assert len(chain.ends[1].requests("Stop")) == 1
+        (lost,) = chain.lost
+        assert "/dev/memory0 was lost" in lost
         with pytest.raises(CommandError, match=r"LOST.*open"):
-            await bench.controller.arm()
-    assert not bench.far_ends[1].is_open
+            await chain.controller.arm()
+    assert not chain.ends[1].is_open
 
 
 @in_virtual_time
 async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> None:
     """150 ms after its last frame, as with a link; not only once all are open again."""
-    async with running() as bench:
-        await bench.touches(FINGER, rest=0.05)
-        bench.far_end.line.lose("the cable was pulled")
-        await asyncio.sleep(0)
-        assert bench.reports.contacts == [1]
+    async with set_running() as chain:
+        await chain.leave(0.05, FINGER)
+        chain.end.fault("unplug")
+        await asyncio.sleep(0.0021)
+        assert chain.contacts == [1]
         await asyncio.sleep(0.151)
-        assert bench.reports.contacts == [1, 0]
+        assert chain.contacts == [1, 0]
 
 
 @in_virtual_time
 async def test_a_touch_while_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its set may be on the wire when the amplifiers are armed and what played is forgotten."""
-    async with running() as bench:
-        await bench.controller.disarm()
-        arm = bench.controller.group.arm
+    async with set_running() as chain:
+        await chain.controller.disarm()
+        arm = chain.controller.group.arm
 
         async def armed_late() -> None:
             await arm()
-            await bench.touches(FINGER, rest=0)
+            await chain.leave(0, FINGER)
 
-        monkeypatch.setattr(bench.controller.group, "arm", armed_late)
-        await bench.controller.arm()
-        await bench.hold(FINGER, seconds=0.1)
-        assert bench.states() == {ENABLED}
-        assert bench.reports.applied[-1].contents
+        monkeypatch.setattr(chain.controller.group, "arm", armed_late)
+        await chain.controller.arm()
+        await chain.hold(0.1, down=[FINGER])
+        assert states(chain) == {ENABLED}
+        assert chain.applied[-1].contents
 
 
 @pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
 @in_virtual_time
 async def test_unexpected_exception_stops_all(kind: str) -> None:
     """A bug anywhere, between stage and commit too, leaves nothing vibrating."""
-    async with running("a", "b") as bench:
-        wire = bench.far_ends[1].line.wire
+    async with set_running("a", "b") as chain:
+        wire = chain.controller.amplifiers["b"].line.wire
         request = wire.request
 
         def fail(address: int, name: str, values: Values) -> bytes:
@@ -99,89 +103,91 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
             return request(address, name, values)
 
         wire.request = fail  # type: ignore[method-assign]
-        await bench.hold(FINGER, seconds=0.1)
+        await chain.hold(0.1, down=[FINGER])
+        running, chain.running = chain.running, None
         with pytest.raises(ZeroDivisionError):
-            await bench.ended()
-        assert bench.states() == {STOPPED}
-        assert bench.controller.group.state is GroupState.STOPPED
+            await running  # type: ignore[misc]
+        assert states(chain) == {STOPPED}
+        assert chain.controller.group.state is GroupState.STOPPED
 
 
 @in_virtual_time
 async def test_stop_is_latched_until_clear() -> None:
     """Arming is refused before, even if the amplifier restarts; touches are felt after it."""
-    async with running() as bench:
-        await bench.controller.stop()
+    async with set_running() as chain:
+        await chain.controller.stop()
         with pytest.raises(CommandRefused):
-            await bench.controller.arm()
-        bench.far_end.amplifier.restart(asyncio.get_running_loop().time())
-        assert bench.far_end.state not in (STOPPED, ENABLED)
+            await chain.controller.arm()
+        chain.end.fault("reboot", lasts=0.1)
+        await asyncio.sleep(0.2)
+        assert chain.end.state not in (STOPPED, ENABLED)
         with pytest.raises(CommandRefused):
-            await bench.controller.arm()
-        assert bench.controller.group.state is GroupState.STOPPED
-        await bench.controller.clear()
-        await bench.controller.arm()
-        await bench.touches(FINGER, rest=0.01)
-        assert not bench.far_end.sets()[-1].is_silent
+            await chain.controller.arm()
+        assert chain.controller.group.state is GroupState.STOPPED
+        await chain.controller.clear()
+        await chain.controller.arm()
+        await chain.leave(0.01, FINGER)
+        assert not chain.end.sent()[-1].is_silent
 
 
 @pytest.mark.parametrize("order", ["stop", "disarm"])
 @in_virtual_time
 async def test_arm_is_refused_while_silencing(order: str) -> None:
     """Nothing is sent, because the order of arrival would decide; afterwards arming works."""
-    bench = make_bench("a", "b")
-    await bench.controller.open()
-    for far_end in bench.far_ends:
-        far_end.delay = 0.02
-    silencing = asyncio.create_task(getattr(bench.controller, order)())
-    await asyncio.sleep(0)
-    with pytest.raises(CommandRefused, match="arm again"):
-        await bench.controller.arm()
-    await silencing
-    assert not bench.controller.group.is_armed
-    assert [far_end.requests("Arm") for far_end in bench.far_ends] == [[], []]
-    await bench.controller.clear()
-    await bench.controller.arm()
-    assert bench.controller.group.state is GroupState.ARMED
-    await bench.controller.close()
+    async with set_chain("a", "b") as chain:
+        await chain.open()
+        for end in chain.ends:
+            end.delay(0.02)
+        silencing = asyncio.create_task(getattr(chain.controller, order)())
+        await asyncio.sleep(0)
+        with pytest.raises(CommandRefused, match="arm again"):
+            await chain.controller.arm()
+        await silencing
+        assert not chain.controller.group.is_armed
+        assert [end.requests("Arm") for end in chain.ends] == [[], []]
+        await chain.controller.clear()
+        await chain.controller.arm()
+        assert chain.controller.group.state is GroupState.ARMED
+        await chain.close()
 
 
 @in_virtual_time
 async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
     """One that another program has disarmed plays again, in a session that all have."""
-    async with running("a", "b") as bench:
-        held = {end.amplifier.session for end in bench.far_ends}
-        bench.far_ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
-        await bench.controller.arm()
-        assert bench.states() == {ENABLED}
-        (session,) = {end.amplifier.session for end in bench.far_ends}
+    async with set_running("a", "b", breaks="state") as chain:
+        held = {end.amplifier.session for end in chain.ends}
+        chain.ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
+        await chain.controller.arm()
+        assert states(chain) == {ENABLED}
+        (session,) = {end.amplifier.session for end in chain.ends}
         assert session not in held
 
 
 @in_virtual_time
 async def test_failed_disarm_stops_all() -> None:
     """The error is raised after that."""
-    async with running("a", "b") as bench:
-        bench.far_ends[1].answer = refusing("Disarm", "BUSY")
+    async with set_running("a", "b", breaks="stop") as chain:
+        chain.ends[1].answer = refusing("Disarm", "BUSY")
         with pytest.raises(CommandRefused, match="BUSY"):
-            await bench.controller.disarm()
-        assert bench.states() == {STOPPED}
+            await chain.controller.disarm()
+        assert states(chain) == {STOPPED}
 
 
 @in_virtual_time
 async def test_stop_completes_when_its_caller_is_cancelled_twice() -> None:
     """While the amplifiers do not hear; they hear again after the second."""
-    async with running("a", "b") as bench:
-        for far_end in bench.far_ends:
-            far_end.is_deaf = True
-        stopping = asyncio.create_task(bench.controller.stop())
+    async with set_running("a", "b") as chain:
+        for end in chain.ends:
+            end.fault("drop", toward="amplifier")
+        stopping = asyncio.create_task(chain.controller.stop())
         for _ in range(2):
             await asyncio.sleep(0.005)
             stopping.cancel()
-        for far_end in bench.far_ends:
-            far_end.is_deaf = False
+        for end in chain.ends:
+            end.recover()
         with pytest.raises(asyncio.CancelledError):
             await stopping
-        assert bench.states() == {STOPPED}
+        assert states(chain) == {STOPPED}
 
 
 @in_virtual_time
@@ -191,24 +197,24 @@ async def test_incomplete_set_is_silenced_before_the_next() -> None:
     Some amplifiers may play the aborted set and others not, which is another pattern. The heartbeat
     that is due meanwhile waits for this silence.
     """
-    async with running("a", "b") as bench:
+    async with set_running("a", "b") as chain:
         await asyncio.sleep(0.02)  # the heartbeat is due 50 ms after the first
-        for far_end in bench.far_ends:
-            far_end.delay = 0.02
-        bench.touch(FINGER)
+        for end in chain.ends:
+            end.delay(0.02)
+        chain.put(FINGER)
         await asyncio.sleep(0.025)  # staged after 20 ms, and the commits wait for their replies
-        assert [len(far_end.requests("Commit")) for far_end in bench.far_ends] == [1, 1]
-        bench.touch()
-        bench.touch(OTHER)
-        await bench.hold(OTHER, seconds=0.2)
-        for far_end in bench.far_ends:
+        assert [len(end.requests("Commit")) for end in chain.ends] == [1, 1]
+        chain.put()
+        chain.put(OTHER)
+        await chain.hold(0.2, down=[OTHER])
+        for end in chain.ends:
             after_arming, *sent = [
-                name for name in far_end.names() if name in ("Set", "Commit", "Silence")
+                name for name in end.names() if name in ("Set", "Commit", "Silence")
             ]
             assert after_arming == "Silence"
             assert sent == ["Set", "Commit", "Silence", "Set", "Commit"]
-            commit, silence = far_end.times("Commit")[0], far_end.times("Silence")[1]
-            assert not [time for time in far_end.times("Ping") if commit <= time <= silence]
+            commit, silence = end.times("Commit")[0], end.times("Silence")[1]
+            assert not [time for time in end.times("Ping") if commit <= time <= silence]
 
 
 @pytest.mark.parametrize(
@@ -224,87 +230,79 @@ async def test_close_waits_for_zero_then_stops(
     def lag(name: str, values: Values) -> Values | None:
         nonlocal left
         if name == "Disarm":
-            bench.far_end.obey(name, values, asyncio.get_running_loop().time())
-        if left <= 0 or "Disarm" not in bench.far_end.names() or name == "Stop":
+            chain.end.obey(name, values, asyncio.get_running_loop().time())
+        if left <= 0 or "Disarm" not in chain.end.names() or name == "Stop":
             return None
         left -= 1
-        return {**bench.far_end.status(), "levels": [3000, 0]}
+        return {**chain.end.status(), "levels": [3000, 0, 0]}
 
     caplog.set_level(logging.INFO)
-    async with running() as bench:
-        bench.far_end.answer = lag
-    assert bool(bench.far_end.requests("Stop")) is is_stopped
-    assert not bench.far_end.is_open
+    async with set_running(breaks="silent") as chain:
+        chain.end.answer = lag
+    assert bool(chain.end.requests("Stop")) is is_stopped
+    assert not chain.end.is_open
     assert [record.levelname for record in caplog.records] == logged
 
 
 @in_virtual_time
 async def test_error_of_opening_names_the_amplifier_that_cannot_be_reached() -> None:
     """By a line that cannot be opened, or by no reply; not those that were open before."""
-    bench = make_bench("a", "b")
-    await bench.controller.open()
-    bench.far_ends[1].is_deaf = True
-    await bench.controller.release()
-    with pytest.raises(LinkError) as mute:
-        await bench.controller.open()
-
-    def refuse() -> None:
-        raise LinkError("no such device")
-
-    bench.far_ends[1].connect = refuse  # type: ignore[method-assign, assignment]
-    with pytest.raises(LinkError) as gone:
-        await bench.controller.open()
+    async with set_chain("a", "b") as chain:
+        await chain.controller.open()
+        chain.ends[1].fault("drop", toward="amplifier")
+        await chain.controller.release()
+        with pytest.raises(LinkError) as mute:
+            await chain.controller.open()
+        chain.ends[1].fault("unplug")
+        with pytest.raises(LinkError) as gone:
+            await chain.controller.open()
     assert (mute.value.lost, gone.value.lost) == (("b",), ("b",))
 
 
 @in_virtual_time
 async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     """Other names, or fewer channels; nothing stays open."""
-    bench = make_bench(channels=1)
-    with pytest.raises(InputError, match=r"main.*other"):
-        Controller(
-            bench.rig,
-            bench.table,
-            lines=lambda: BenchLines({}),
-            intent_source=BuzzNewestContact(),
-            timing=SetTiming(),
-            urls={"other": "fake://"},
-        )
-    with pytest.raises(InputError, match=r"ERA NE .*0 to 0 on amplifier main, got 1; .*rig file"):
-        await bench.controller.open()
-    assert not bench.far_end.is_open
+    async with set_chain() as chain:
+        rig, urls = chain.far.bench.rig, chain.far.urls
+        wiring = {**rig.wiring, "NE": Channel("main", 3)}
+        for changed, given, problem in (
+            (rig, {"other": "sim://"}, r"main.*other"),
+            (replace(rig, wiring=wiring), urls, r"ERA NE .*0 to 2 on amplifier main, got 3; .*rig"),
+        ):
+            with pytest.raises(InputError, match=problem):
+                await Controller(
+                    changed,
+                    chain.table,
+                    lines=Lines,
+                    intent_source=BuzzNewestContact(),
+                    timing=SetTiming(),
+                    urls=given,
+                ).open()
+            assert not chain.end.is_open
 
 
 @in_virtual_time
 async def test_open_refuses_a_table_without_playable_frequencies() -> None:
     """With the bands of amplifier and table; nothing stays open."""
-    link = FarEnd(channels=4)
-    link.amplifier.capabilities["frequency_min"] = 8000  # 400 Hz
-    link.amplifier.capabilities["frequency_max"] = 20_000
-    table = small_table()
-    controller = Controller(
-        small_problem().rig,
-        table,
-        lines=lambda: BenchLines({"main": link}),
-        intent_source=BuzzNewestContact(),
-        timing=Timing(table),
-    )
-    with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
-        await controller.open()
-    assert controller.group.state is GroupState.CLOSED
-    assert not link.is_open
+    table, wire = small_table(), Wire("serial")
+    given: dict[str, Any] = {"capabilities": {"frequency_min": 8000}, "timing": Timing(table)}
+    async with Chain.on(wire, small_problem().rig, table, **given) as chain:
+        with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
+            await chain.controller.open()
+        assert chain.controller.group.state is GroupState.CLOSED
+        assert not chain.end.is_open
 
 
 @in_virtual_time
 async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
     """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
-    async with running("a", "b") as bench:
-        await bench.hold(FINGER, seconds=0.2)
-        bench.far_ends[1].is_deaf = True
-        await bench.touches(rest=0.6)
-        assert bench.reports.lost
-        assert bench.controller.group.state is GroupState.LOST
-        assert not any(bench.far_ends[0].levels())
+    async with set_running("a", "b") as chain:
+        await chain.hold(0.2, down=[FINGER])
+        chain.ends[1].fault("drop", toward="amplifier")
+        await chain.leave(0.6)
+        assert chain.lost
+        assert chain.controller.group.state is GroupState.LOST
+        assert not any(chain.ends[0].levels)
 
 
 @pytest.mark.parametrize("is_armed", [False, True])
@@ -312,18 +310,22 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
 @in_virtual_time
 async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> None:
     """Arming that is under way is refused; what was armed before is not armed anew."""
-    bench = make_bench("a", "b")
-    await bench.controller.open()
-    if is_armed:
-        await bench.controller.arm()
-    for far_end in bench.far_ends:
-        far_end.delay = 0.005
-    arming = asyncio.create_task(bench.controller.arm())
-    await asyncio.sleep(0.001)
-    await getattr(bench.controller, silencing)()
-    with pytest.raises(CommandRefused, match="arm again"):
-        await arming
-    left = {"disarm": GroupState.DISARMED, "stop": GroupState.STOPPED, "close": GroupState.CLOSED}
-    assert bench.controller.group.state is left[silencing]
-    if silencing != "close":
-        assert ENABLED not in bench.states()
+    async with set_chain("a", "b") as chain:
+        await chain.open()
+        if is_armed:
+            await chain.controller.arm()
+        for end in chain.ends:
+            end.delay(0.005)
+        arming = asyncio.create_task(chain.controller.arm())
+        await asyncio.sleep(0.001)
+        await getattr(chain.controller, silencing)()
+        with pytest.raises(CommandRefused, match=r"arm again|superseded"):
+            await arming
+        left = {
+            "disarm": GroupState.DISARMED,
+            "stop": GroupState.STOPPED,
+            "close": GroupState.CLOSED,
+        }
+        assert chain.controller.group.state is left[silencing]
+        if silencing != "close":
+            assert ENABLED not in states(chain)

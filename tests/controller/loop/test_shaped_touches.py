@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import pytest
 
+from chain import Chain, Sent
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
@@ -16,11 +17,12 @@ from controller.loop.decision import ENDED
 from controller.loop.intent import HapticIntent, Target
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
-from controller_bench import ENABLED, FINGER, OTHER, Bench, Sent, make_bench, running
 from drivers.protocol.sets import Envelope
+from drivers.protocol.table import QUANTITIES
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope
+from set_chain import FINGER, OTHER, set_running
 from set_table import SetTiming
 from virtual_loop import in_virtual_time
 
@@ -62,20 +64,25 @@ ONSET = 0.105  # s; 21 steps
 FULL = 0.2  # the level that the table's pattern has
 
 
+def valid_for(one: Sent) -> float:
+    """How long a set lasts without another [s], 0 for ever."""
+    return QUANTITIES["valid_for"].from_wire(one.layer.valid_for)
+
+
 @pytest.fixture
 def shapes() -> Shapes:
     """A timing whose envelopes are straight lines."""
     return Shapes()
 
 
-def sets(bench: Bench) -> list[Sent]:
+def sets(chain: Chain) -> list[Sent]:
     """Every set since the silence that follows arming."""
-    return bench.far_end.sets()[1:]
+    return chain.end.sent()[1:]
 
 
-def level(bench: Bench, channel: int = 0) -> float:
+def level(chain: Chain, channel: int = 0) -> float:
     """What a channel plays now."""
-    return bench.far_end.levels()[channel]
+    return chain.end.levels[channel]
 
 
 def levels_of(envelope: object) -> list[float]:
@@ -90,13 +97,13 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
 
     By hand: lines from 0 to level 0.2 at 90 degrees, 105 ms long, and down in 40 ms.
     """
-    async with running(knots=32, timing=shapes) as bench:
+    async with set_running(knots=32, timing=shapes) as chain:
         begin = asyncio.get_running_loop().time()
-        await bench.touches(FINGER, OTHER, rest=ONSET / 2)
-        (played,) = sets(bench)
-        driven, silent = played.commands
-        assert (silent.onset, silent.ending, silent.level) == (None, None, 0.0)
-        assert driven.level == pytest.approx(FULL)
+        await chain.leave(ONSET / 2, FINGER, OTHER)
+        (played,) = sets(chain)
+        driven, *silent = played.layer.commands
+        assert not any(each.onset or each.ending or each.level for each in silent)
+        assert driven.level == 2000
         assert levels_of(driven.onset) == pytest.approx(
             [FULL * number / 21 for number in range(1, 21)],
             abs=0.5e-4,  # the wire has steps of 1e-4
@@ -106,8 +113,8 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
         )
         assert isinstance(driven.onset, Envelope)
         assert (driven.onset.step, {phase for _, phase in driven.onset.knots}) == (50, {9000})
-        assert level(bench) == pytest.approx(FULL / 2, abs=1e-4)
-        (applied,) = bench.reports.applied
+        assert level(chain) == pytest.approx(FULL / 2, abs=1e-4)
+        (applied,) = chain.applied
         assert applied.pattern.onset is not None
         assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
         assert applied.transient_contrast_db == 30.0
@@ -116,53 +123,53 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
 @in_virtual_time
 async def test_lifted_target_fades_along_its_ending(shapes: Shapes) -> None:
     """While another finger stays; reported as silence."""
-    async with running(knots=32, timing=shapes) as bench:
-        await bench.hold(OTHER, FINGER, seconds=0.3)
-        await bench.touches(OTHER, rest=0.020)
-        assert level(bench) == pytest.approx(FULL / 2, abs=1e-3)
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(0.3, down=[OTHER, FINGER])
+        await chain.leave(0.020, OTHER)
+        assert level(chain) == pytest.approx(FULL / 2, abs=1e-3)
         await asyncio.sleep(0.0205)
-        assert bench.far_end.levels() == [0, 0]
-        assert bench.reports.silenced[-1].reason == "the target was lifted"
-        await bench.touches(rest=0.001)
-        assert bench.far_end.names()[-1] == "Silence"
+        assert not any(chain.end.levels)
+        assert chain.silenced[-1].reason == "the target was lifted"
+        await chain.leave(0.001)
+        assert chain.end.names()[-1] == "Silence"
 
 
 @pytest.mark.parametrize("held", [0.05, 0.3])
 @in_virtual_time
 async def test_last_lift_skips_the_ending(shapes: Shapes, held: float) -> None:
     """Zero at once and within 20 ms, whether the onset is over or not."""
-    async with running(knots=32, timing=shapes) as bench:
-        await bench.hold(FINGER, seconds=held)
-        await bench.touches(rest=0)
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(held, down=[FINGER])
+        await chain.leave(0)
         await asyncio.sleep(0.020)
-        assert bench.far_end.levels() == [0, 0]
+        assert not any(chain.end.levels)
 
 
 @in_virtual_time
 async def test_lift_before_the_onset_is_over_skips_the_ending(shapes: Shapes) -> None:
     """An ending leads from the full level; lifted half way up the target fades along 20 ms."""
-    async with running(knots=32, timing=shapes) as bench:
-        await bench.hold(OTHER, FINGER, seconds=0.05)
-        bench.touch(OTHER)
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(0.05, down=[OTHER, FINGER])
+        chain.put(OTHER)
         highest = 0.0
         for _ in range(21):
-            highest = max(highest, level(bench))
+            highest = max(highest, level(chain))
             await asyncio.sleep(0.001)
         assert highest <= FULL / 2 + 1e-3
-        assert bench.far_end.levels() == [0, 0]
+        assert not any(chain.end.levels)
 
 
 @in_virtual_time
 async def test_continued_tone_has_no_onset(shapes: Shapes) -> None:
     """A finger that slides feels the same frequency without a gap, with an ending again."""
-    async with running(knots=32, timing=shapes) as bench:
-        await bench.hold(FINGER, OTHER, seconds=0.2)
-        await bench.hold((1, 0.6, 0.5), OTHER, seconds=0.2)
-        first, moved = (each.commands[0] for each in sets(bench))
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(0.2, down=[FINGER, OTHER])
+        await chain.hold(0.2, down=[(1, 0.18, 0.1), OTHER])
+        first, moved = (each.layer.commands[0] for each in sets(chain))
         assert (first.keep_phase, moved.keep_phase) == (False, True)
         assert moved.onset is None
         assert len(levels_of(moved.ending)) == 7
-        _, reported = bench.reports.applied
+        _, reported = chain.applied
         assert reported.pattern.onset is None
         assert reported.transient_contrast_db is None
 
@@ -178,12 +185,12 @@ class Always:
 @in_virtual_time
 async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(shapes: Shapes) -> None:
     """None is sent; ramp and its contrast are reported."""
-    async with running(timing=shapes) as bench:
-        await bench.hold(FINGER, OTHER, seconds=0.3)
-        assert [each.onset for each in sets(bench)[0].commands] == [None, None]
-        (applied,) = bench.reports.applied
+    async with set_running(timing=shapes) as chain:
+        await chain.hold(0.3, down=[FINGER, OTHER])
+        assert [each.onset for each in sets(chain)[0].layer.commands] == [None] * 3
+        (applied,) = chain.applied
         assert applied.pattern.onset is None
-        assert applied.pattern.ramp == sets(bench)[0].ramp == 0.015
+        assert (applied.pattern.ramp, sets(chain)[0].layer.ramp) == (0.015, 15)
         assert applied.transient_contrast_db == 10.0
 
 
@@ -191,24 +198,22 @@ async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(shapes: 
 async def test_ramp_replaces_an_onset_that_the_ledger_refuses(shapes: Shapes) -> None:
     """A knot beyond full stroke is not sent; the pattern is played."""
     shapes.largest = 6.0
-    async with running(knots=32, timing=shapes) as bench:
-        await bench.hold(FINGER, OTHER, seconds=0.05)
-        (played,) = sets(bench)
-        assert (played.commands[0].onset, played.commands[0].level) == (None, FULL)
-        (applied,) = bench.reports.applied
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(0.05, down=[FINGER, OTHER])
+        (played,) = sets(chain)
+        assert (played.layer.commands[0].onset, played.layer.commands[0].level) == (None, 2000)
+        (applied,) = chain.applied
         assert applied.pattern.onset is None
         assert applied.transient_contrast_db == 10.0
-        assert bench.reports.refused == []
+        assert chain.refused == []
 
 
 @in_virtual_time
 async def test_open_prepares_table_and_envelopes(shapes: Shapes) -> None:
     """Mode and frequencies, when the controller is opened."""
-    bench = make_bench(knots=32, timing=shapes)
-    await bench.controller.open()
-    assert bench.table.prepared == ["phased"]
+    async with set_running(knots=32, timing=shapes) as chain:
+        assert chain.table.prepared == ["phased"]
     assert shapes.prepared == [90.0, 110.0, 150.0, 250.0]
-    await bench.controller.close()
 
 
 @in_virtual_time
@@ -216,26 +221,26 @@ async def test_failing_intent_source_silences_until_it_recovers(
     shapes: Shapes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Along the ramp, without endings; heartbeats continue, and touches are felt again later."""
-    async with running(knots=32, timing=shapes, intent_source=Always()) as bench:
-        await bench.hold(FINGER, seconds=0.2)
-        assert bench.far_end.levels()[0] > 0
+    async with set_running(knots=32, timing=shapes, intent_source=Always()) as chain:
+        await chain.hold(0.2, down=[FINGER])
+        assert chain.end.levels[0] > 0
         with monkeypatch.context() as patch:
             patch.setattr(Always, "intent", lambda self, contacts, now: 1 / 0)
-            await bench.hold(FINGER, OTHER, seconds=0.3)
-        assert sets(bench)[-1].token == 0  # a Silence
-        assert bench.far_end.levels() == [0, 0]
-        assert bench.reports.silenced[-1].reason.startswith("ZeroDivisionError")
-        assert bench.far_end.state == ENABLED
-        await bench.hold((3, 0.2, 0.2), seconds=0.2)
-        assert bench.far_end.levels()[0] > 0
+            await chain.hold(0.3, down=[FINGER, OTHER])
+        assert sets(chain)[-1].token == 0  # a Silence
+        assert not any(chain.end.levels)
+        assert chain.silenced[-1].reason.startswith("ZeroDivisionError")
+        assert chain.end.state == "OPERATION_ENABLED"
+        await chain.hold(0.2, down=[(3, 0.06, 0.16)])
+        assert chain.end.levels[0] > 0
 
 
 PROMISED = 0.001  # s; rounding of times
 
 
-def vibrations(bench: Bench) -> list[tuple[float, Sent]]:
+def vibrations(chain: Chain) -> list[tuple[float, Sent]]:
     """When each set that vibrates was sent [s], and the set."""
-    return [(each.time, each) for each in bench.far_end.sets() if not each.is_silent]
+    return [(each.time, each) for each in chain.end.sent() if not each.is_silent]
 
 
 def frame(*touches: Touch, timeout: float) -> TouchFrame:
@@ -246,20 +251,20 @@ def frame(*touches: Touch, timeout: float) -> TouchFrame:
 @in_virtual_time
 async def test_vibration_of_a_silent_sender_is_not_renewed() -> None:
     """It lasts as long as the contact does, and a little; any frame of the sender prolongs both."""
-    async with running() as bench:
+    async with set_running() as chain:
         begin = asyncio.get_running_loop().time()
-        bench.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
+        chain.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
         await asyncio.sleep(2.5)
-        ((sent, only),) = vibrations(bench)
-        assert 3.0 <= sent - begin + only.valid_for <= 3.3
-        bench.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
+        ((sent, only),) = vibrations(chain)
+        assert 3.0 <= sent - begin + valid_for(only) <= 3.3
+        chain.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
         await asyncio.sleep(0.1)
-        _, (again, renewed) = vibrations(bench)
-        assert 5.5 <= again - begin + renewed.valid_for <= 5.8
-        assert again < sent + only.valid_for
+        _, (again, renewed) = vibrations(chain)
+        assert 5.5 <= again - begin + valid_for(renewed) <= 5.8
+        assert again < sent + valid_for(only)
         await asyncio.sleep(5.0)
-        assert len(vibrations(bench)) == 2
-        assert bench.silences()[-1]
+        assert len(vibrations(chain)) == 2
+        assert chain.end.sent()[-1].is_silent
 
 
 @in_virtual_time
@@ -267,40 +272,40 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Were it never lifted, heartbeats alone would keep nothing playing."""
-    async with running() as bench:
+    async with set_running() as chain:
         never = property(lambda tracker: math.inf, lambda tracker, at: None)
         monkeypatch.setattr(ContactTracker, "next_expiry", never, raising=False)
         monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())
         begin = asyncio.get_running_loop().time()
-        await bench.touches(FINGER, rest=60.0)
-        assert not bench.silences()[-1]
-        ends = [time - begin + (each.valid_for or math.inf) for time, each in vibrations(bench)]
+        await chain.leave(60.0, FINGER)
+        assert not chain.end.sent()[-1].is_silent
+        ends = [time - begin + (valid_for(each) or math.inf) for time, each in vibrations(chain)]
         assert max(ends) < 2.1
 
 
 @in_virtual_time
 async def test_renewal_keeps_to_a_rate_limit_of_one_set_a_second() -> None:
     """There is no gap although each second allows one set."""
-    async with running(rate=1.0) as bench:
-        await bench.hold(FINGER, seconds=10.0)
-        sent = vibrations(bench)
+    async with set_running(rate=1.0) as chain:
+        await chain.hold(10.0, down=[FINGER])
+        sent = vibrations(chain)
         for (time, each), (following, _) in pairwise(sent):
-            assert time + 1.0 - PROMISED <= following <= time + each.valid_for
-        assert sent[-1][0] + sent[-1][1].valid_for >= asyncio.get_running_loop().time()
-        assert bench.reports.refused == []
+            assert time + 1.0 - PROMISED <= following <= time + valid_for(each)
+        assert sent[-1][0] + valid_for(sent[-1][1]) >= asyncio.get_running_loop().time()
+        assert chain.refused == []
 
 
 @pytest.mark.parametrize("on_time", [1.5, 2.5, 3.0, 5.5])
 @in_virtual_time
 async def test_renewal_keeps_to_the_on_time_limit(on_time: float) -> None:
     """The vibration ends by itself a little before, and does not begin again while fingers rest."""
-    async with running(on_time=on_time) as bench:
-        await bench.hold(FINGER, seconds=12.0)
-        sent = vibrations(bench)
-        begin, end = sent[0][0], max(time + each.valid_for for time, each in sent)
+    async with set_running(on_time=on_time) as chain:
+        await chain.hold(12.0, down=[FINGER])
+        sent = vibrations(chain)
+        begin, end = sent[0][0], max(time + valid_for(each) for time, each in sent)
         assert 0.8 * on_time < end - begin <= on_time
         # Or it would be shown as if it played on.
-        (silenced,) = [each for each in bench.reports.silenced if each.reason == ENDED]
+        (silenced,) = [each for each in chain.silenced if each.reason == ENDED]
         assert end <= silenced.time <= end + 0.06
 
 
@@ -311,12 +316,12 @@ def _clicking() -> EffectPlayer:
     return EffectPlayer(SurfaceLayout(effects={"click": Click()}, elsewhere="click"))
 
 
-async def _playing_times(bench: Bench, seconds: float) -> list[float]:
+async def _playing_times(chain: Chain, seconds: float) -> list[float]:
     """Times [s] from now on at which a channel plays, by the millisecond."""
     began = asyncio.get_running_loop().time()
     times = []
     while (now := asyncio.get_running_loop().time()) < began + seconds:
-        if max(bench.far_end.levels()) > AUDIBLE:
+        if max(chain.end.levels) > AUDIBLE:
             times.append(now - began)
         await asyncio.sleep(0.001)
     return times
@@ -325,10 +330,10 @@ async def _playing_times(bench: Bench, seconds: float) -> list[float]:
 @in_virtual_time
 async def test_tap_within_one_iteration_is_felt_as_a_click() -> None:
     """Its 40 ms and a ramp are played, and silent is the plate 80 ms after the tap."""
-    async with running(intent_source=_clicking()) as bench:
-        bench.touch((1, 0.5, 0.5))
-        bench.touch()
-        times = await _playing_times(bench, 0.3)
+    async with set_running(intent_source=_clicking()) as chain:
+        chain.put(FINGER)
+        chain.put()
+        times = await _playing_times(chain, 0.3)
         assert 0.035 <= times[-1] - times[0] <= 0.060
         assert times[-1] < 0.080
 
@@ -339,18 +344,18 @@ async def test_vibration_is_renewed_while_its_contact_is_confirmed() -> None:
 
     No other pattern is reported.
     """
-    async with running() as bench:
-        await bench.hold(FINGER, seconds=10.0)
-        sent = vibrations(bench)
+    async with set_running() as chain:
+        await chain.hold(10.0, down=[FINGER])
+        sent = vibrations(chain)
         (first, *later) = [each for _, each in sent]
         assert 9 <= len(later) <= 10
-        assert {each.valid_for for _, each in sent} == {2.0}
-        assert not first.renew
+        assert {valid_for(each) for _, each in sent} == {2.0}
+        assert not first.layer.renew
         for each in later:
-            assert each.renew
+            assert each.layer.renew
             assert each.token not in (first.token, 0)
-            assert each.commands == ()
+            assert each.layer.commands == ()
         assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 1.1
-        assert len(bench.reports.applied) == 1
+        assert len(chain.applied) == 1
         await asyncio.sleep(0.2)
-        assert bench.silences()[-1]
+        assert chain.end.sent()[-1].is_silent

@@ -18,14 +18,25 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.host.wire import Arrival, OtherHost, Reply, Several, Wire, read_event, read_reply
-from drivers.protocol.records import Values
+from drivers.host.wire import (
+    Arrival,
+    Broken,
+    OtherHost,
+    Reply,
+    Several,
+    Wire,
+    read_event,
+    read_nak,
+)
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
     BY_NUMBER,
     HELLO,
+    IDENTITY,
     MAX_WORDS,
     MESSAGES,
+    NAK,
     VERSION,
 )
 from drivers.statistics import WireCounters
@@ -119,7 +130,15 @@ class CanWire(Wire):
         if message is None:
             return []
         kind, self._pending = self._pending[2], None
-        return [read_reply(kind, message.type, message.words)]
+        try:
+            if message.type == NAK:
+                return [read_nak(message.words)]
+            if message.type != kind:
+                return [Broken(f"type of the reply must be {kind}, got {message.type}")]
+            record = IDENTITY if kind == HELLO else BY_NUMBER[kind].reply
+            return [Reply(record.read(message.words)[0])]  # what follows is ignored
+        except Refusal as refusal:
+            return [Broken(str(refusal))]
 
     def _other_version(self, node: int, data: bytes) -> list[Arrival]:
         """Take the versions for the reply to Hello, if it is of a node that will not reply."""

@@ -189,12 +189,8 @@ class Dialogue:
                 self.while_admitted(token, cuts[0])
             return cuts[0]
 
-        def follows() -> bool:
-            del cuts[0]
-            return bool(cuts)
-
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=part, follows=follows)
+        taken = await self.line.submit(self, priority, "Set", {}, make=part, parts=cuts)
         (staged,) = admitted
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")

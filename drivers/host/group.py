@@ -142,7 +142,7 @@ class Group(Members):
         if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
             await self.stop()
 
-    async def beat(self) -> None:
+    def beat(self) -> Coroutine[Any, Any, list[Values]]:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
@@ -150,10 +150,9 @@ class Group(Members):
         would silence the amplifier: so its status is read just before it is fed, five times a
         second, and less often on a slow wire.
         """
-        self._check_armed()
-        await self._exchange(self._beat())
+        return self._exchange(self._beat)
 
-    async def _beat(self) -> None:
+    def _beat(self) -> Awaitable[list[Values]]:
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
@@ -171,7 +170,7 @@ class Group(Members):
                 reading = each.read_status(Priority.READING)
                 reading.add_done_callback(_seen)
                 self._readings[name] = reading
-        await self.all(feeding)
+        return self.all(feeding)
 
     async def _read_and_feed(self, amplifier: Amplifier, before: int) -> Values:
         await amplifier.read_status(Priority.HEARTBEAT)

@@ -125,12 +125,12 @@ _SUPERSEDED = {
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    make: values of each attempt, in its turn; raises CommandRefused. follows: called after a reply;
-    whether another part of the request is to be made, by `make`. attempts: left. start: of a
-    commit that goes out together with those of other lines, until it was sent: is_held for them,
-    then is_released. longer: than on a fast wire its reply
-    may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
-    attempt.
+    make: values of each attempt, in its turn; raises CommandRefused. parts: values of
+    the messages of a request, those without a reply, where there are several: known once `make`
+    has returned the first. attempts: left. start: of a commit that goes out together with those of
+    other lines, until it was sent: is_held for them, then is_released. longer: than on a fast wire
+    its reply may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an
+    earlier attempt.
     """
 
     member: "Dialogue | None"
@@ -142,7 +142,7 @@ class Job:
     queued_at: float
     result: "asyncio.Future[Values]"
     start: JointStart | None = None
-    follows: Callable[[], bool] | None = None
+    parts: list[Values] | None = None
     attempts: int = ATTEMPTS
     is_held: bool = False
     is_released: bool = False

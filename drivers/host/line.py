@@ -67,19 +67,19 @@ class Line:
         make: Callable[[], Values] | None = None,
         timeout: float = REPLY_TIMEOUT,
         start: JointStart | None = None,
-        follows: Callable[[], bool] | None = None,
+        parts: list[Values] | None = None,
     ) -> "asyncio.Future[Values]":
         """Queue a request of an amplifier; the future has the values of its reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
         it was sent. make: values of each attempt, made when its turn has come; raises
-        CommandRefused. start: with the commits of other lines. follows: as of `Job`; the future has
+        CommandRefused. start: with the commits of other lines. parts: as of `Job`; the future has
         the values of the last reply.
         """
         future = self._loop.create_future()
         now = self.time()
-        job = Job(member, priority, name, values, make, timeout, now, future, start, follows)
+        job = Job(member, priority, name, values, make, timeout, now, future, start, parts)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -87,7 +87,6 @@ class Line:
             return future
         if self._current is None and not (self._queue.jobs or self._is_pumping or start):
             self._start(job)
-            self._schedule()
             return future
         for queued in self._queue.superseded_by(priority, member) if self._queue.jobs else ():
             self._fail(queued, Preempted(SUPERSEDED))
@@ -123,6 +122,9 @@ class Line:
                 self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
+        elif self._current is None and self._timer is not None:
+            self._timer.cancel()  # nothing is awaited: it would wake the process for nothing
+            self._timer = None
 
     def lose(self, cause: str) -> None:
         """Fail every request: the port is lost, or closed."""
@@ -157,7 +159,6 @@ class Line:
                     self._start(job)
         finally:
             self._is_pumping = False
-        self._schedule()
 
     def _release(self, job: Job) -> None:
         """Send a commit that was held, unless its result is known by now."""
@@ -196,6 +197,7 @@ class Line:
         job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
         job.delays, job.is_last_look = 0, False
         self._current = job
+        self._schedule()
 
     def _go_on(self, job: Job, data: bytes) -> None:
         """Send the rest of the request on the line, unless one that silences waits."""
@@ -246,9 +248,10 @@ class Line:
                 return
             if job.result.done():  # its caller has gone
                 return
-            if job.follows is None or not job.follows():
+            if job.parts is None or len(job.parts) == 1:
                 job.result.set_result(arrival.values)
             else:
+                del job.parts[0]
                 self._send_next_part(job)
         elif isinstance(arrival, Broken):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
@@ -271,7 +274,6 @@ class Line:
         job.attempts, job.queued_at, job.had_no_reply = ATTEMPTS, self.time(), False
         if not self._queue.jobs:
             self._start(job)
-            self._schedule()
         elif self._queue.supersedes(job):
             self._fail(job, Preempted(SUPERSEDED))
         else:
@@ -316,6 +318,7 @@ class Line:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
+        self._schedule()
 
     def _schedule(self) -> None:
         """Have the timer look at the request on the line by the next time that matters."""

@@ -7,7 +7,7 @@ sets would take the next one for an older one. It commits one that changes nothi
 
 import asyncio
 import math
-from collections.abc import Awaitable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
@@ -184,7 +184,7 @@ class Members:
             return 2
         return 0 if isinstance(error, LinkError) else 1
 
-    async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Played:
+    def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Coroutine[Any, Any, Played]:
         """Play layers on the amplifiers of these names, all from one moment on.
 
         Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
@@ -193,23 +193,16 @@ class Members:
         one does not reply: then it is unknown whether the set plays. What else fails stops all
         amplifiers before it is raised.
         """
-        self._check_armed()
-        done = await self._exchange(self._play(layers))
-        if isinstance(done, CommandRefused):
-            raise done
-        return done
+        return self._exchange(partial(self._play, layers))
 
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
 
         Returns when [s] the last request went out. Raises as `apply`.
         """
-        self._check_armed()
         # On a line that they share none waits for one that does not reply: that comes last.
-        members = [*self.amplifiers.values()]
-        members.sort(key=lambda each: each.silence_cause is not None)
-        requests = [each.silence(ramp) for each in members]
-        await self._exchange(self.all(requests))
+        members = sorted(self.amplifiers.values(), key=lambda each: each.silence_cause is not None)
+        await self._exchange(lambda: self.all([each.silence(ramp) for each in members]))
         self.is_set_incomplete = False
         return self.last_sent_at
 
@@ -221,18 +214,19 @@ class Members:
         if self._limit is not None and not self._limit.expired():
             self._limit.reschedule(clock.now())
 
-    def _check_armed(self) -> None:
-        if self.state is not GroupState.ARMED:
-            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
+    async def _exchange(self, exchange: Callable[[], Awaitable[_T | CommandRefused]]) -> _T:
+        """Run an exchange of the control loop; any unexplained failure stops all amplifiers.
 
-    async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:
-        """Run an exchange of the control loop; any unexplained failure stops all amplifiers."""
+        A refusal that it returns has changed nothing.
+        """
+        if not self.is_armed:
+            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
         before = self.epoch
         limit = asyncio.timeout(None)
         try:
             try:
                 async with limit as self._limit:
-                    return await exchange
+                    done = await exchange()
             finally:
                 self._limit = None
         except Exception as error:
@@ -250,6 +244,9 @@ class Members:
             if is_lost:  # also where it was degraded when this began
                 raise LinkTimeout(next(iter(self.lost_by.values()), str(error))) from error
             raise
+        if isinstance(done, CommandRefused):
+            raise done
+        return done
 
     async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned."""

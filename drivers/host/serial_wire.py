@@ -19,11 +19,12 @@ from drivers.host.wire import (
     Several,
     Wire,
     read_event,
-    read_reply,
+    read_nak,
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
+    BY_NUMBER,
     EVENT,
     HELLO,
     MESSAGES,
@@ -99,13 +100,17 @@ class SerialWire(Wire):
 
     def _reply(self, frame: Frame, request: Frame) -> Arrival:
         """Read the reply to a request."""
-        kind = frame.kind ^ REPLY
-        if kind != NAK and frame.version != request.version:
-            return Broken(f"version of the reply must be {request.version}, got {frame.version}")
+        kind, version = frame.kind ^ REPLY, frame.version
         try:
-            if kind == request.kind == HELLO:
+            if kind == NAK:
+                return read_nak(unpack_words(frame.payload))
+            if (kind, version) != (request.kind, request.version):
+                expected = f"{request.kind} in version {request.version}"
+                return Broken(f"type of the reply must be {expected}, got {kind} in {version}")
+            if kind == HELLO:
                 return Reply(unpack_identity(frame.payload))
-            return read_reply(request.kind, kind, unpack_words(frame.payload))
+            # What follows is ignored.
+            return Reply(BY_NUMBER[kind].reply.read(unpack_words(frame.payload))[0])
         except Refusal as refusal:
             return Broken(str(refusal))
 

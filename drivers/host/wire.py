@@ -23,13 +23,11 @@ from drivers.protocol.records import (
     WireQuantity,
 )
 from drivers.protocol.table import (
-    BY_NUMBER,
     EVENT,
     EVENT_RECORD,
     IDENTITY,
     MAX_WORDS,
     MESSAGES,
-    NAK,
     NAK_RECORD,
     NO_CHANNEL,
     QUANTITIES,
@@ -99,19 +97,6 @@ class More:
 
 
 Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More
-
-
-def read_reply(kind: int, received: int, words: Sequence[int]) -> Arrival:
-    """Read the reply to a request of a type, by its own type."""
-    if received not in (kind, NAK):
-        return Broken(f"type of the reply must be {kind}, got {received}")
-    try:
-        if received == NAK:
-            return read_nak(words)
-        record = BY_NUMBER[kind].reply if kind in BY_NUMBER else IDENTITY
-        return Reply(record.read(words)[0])  # what follows is ignored
-    except Refusal as refusal:
-        return Broken(str(refusal))
 
 
 def read_event(

@@ -1,7 +1,8 @@
 """Response of a plate on any mesh solved at each frequency, without modes: a reference.
 
 Of polynomials it is `model.spectral.direct`; of finite elements one sparse factorisation for each
-frequency.
+frequency. What ERAs and loads do to the plate is computed here: from the motion of an ERA's base
+the force (k_b + i omega c) y of the founding paper's Eq. 25, and the dynamic stiffness of each.
 """
 
 from collections.abc import Sequence
@@ -15,13 +16,7 @@ from model.fem.mesh import Mesh
 from model.fem.plate import PlateMatrices, assemble, factorise
 from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import (
-    Era,
-    Support,
-    attached_stiffness,
-    drive_forces,
-    footprints_of,
-)
+from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
 
@@ -39,7 +34,7 @@ def direct_acceleration(
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[Support] = (),
+    loads: Sequence[PointLoad | FingertipLoad] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
@@ -50,15 +45,35 @@ def direct_acceleration(
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
     omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    attached, forces = attached_stiffness(omegas, eras, loads), drive_forces(omegas, eras)
     losses = loss_factors(matrices.plate, omegas)
     for row, (omega, loss) in enumerate(zip(omegas, losses, strict=True)):
+        attached = [_dynamic_stiffness(each, omega) for each in (*eras, *loads)]
         dynamic_stiffness = (
             (1 + 1j * loss) * matrices.stiffness
             - omega**2 * matrices.mass
-            + touch.T @ sparse.diags_array(attached[row]) @ touch
+            + touch.T @ sparse.diags_array(attached) @ touch
         )
-        load = touch[: len(eras)].T @ sparse.diags_array(forces[row])
+        load = touch[: len(eras)].T @ sparse.diags_array([_force(era, omega) for era in eras])
         displacement = factorise(dynamic_stiffness).solve(load.toarray())
         result[row] = -(omega**2) * (observe @ displacement).T
     return result
+
+
+def _force(era: Era, omega: float) -> complex:
+    """Force [N] on a plate that is held, its base at full stroke, at omega [rad/s]."""
+    base = complex(era.stroke)
+    if era.gains:
+        frequencies, sizes, phases = np.transpose(era.gains)
+        base *= np.interp(omega / (2 * np.pi), frequencies, sizes * np.exp(1j * phases))
+    return (era.stiffness + 1j * omega * era.damping) * base
+
+
+def _dynamic_stiffness(each: Era | PointLoad | FingertipLoad, omega: float) -> complex:
+    """Force on what is attached by the plate's displacement there [N/m] at omega [rad/s]."""
+    if isinstance(each, FingertipLoad):
+        tip = each.fingertip
+        pulp = tip.stiffness + 1j * omega * tip.damping
+        bone = tip.joint_stiffness + 1j * omega * tip.joint_damping - omega**2 * tip.phalanx_mass
+        return pulp * bone / (pulp + bone) - omega**2 * tip.contact_mass
+    mass = each.bolt_mass if isinstance(each, Era) else each.mass
+    return each.stiffness + 1j * omega * each.damping - omega**2 * mass

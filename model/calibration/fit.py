@@ -139,7 +139,17 @@ class Fit(Start):
 
 def start_at(problem: Problem, z: FloatArray) -> Start:
     """Scales of sensors, outliers and noise by the plate at z (p,)."""
-    values, model = problem.values, problem.plate.responses(z)
+    scales, noise, used = without_outliers(problem.values, problem.plate.responses(z))
+    return Start(problem.at_scales(z, scales), noise, used)
+
+
+def without_outliers(
+    values: ComplexArray, model: ComplexArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Scales of sensors (s,), noise (f, e) and the mask (f, e, s) of values without outliers.
+
+    values, model (f, e, s): measured, and by a plate, up to a gain of each frequency and ERA.
+    """
     used, scales = np.isfinite(values), np.ones(values.shape[2])
     heard = used.any(axis=(0, 1))
     for _ in range(_ROUNDS):
@@ -155,7 +165,7 @@ def start_at(problem: Problem, z: FloatArray) -> Start:
         if (kept == used).all():
             break
         used, heard = kept, kept.any(axis=(0, 1))
-    return Start(problem.at_scales(z, scales), noise, used)
+    return scales, noise, used
 
 
 def solve(problem: Problem, start: Start) -> Fit:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from model.choice import best_of
+from model.counting import counted
 from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_difference import NOTICEABLE_DB
 from model.diagnosis.plate_match import MAX_FIT_ERROR
@@ -51,6 +52,9 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     rows += [f"SENSOR {each.name} {each.why}: left out" for each in verdict.bad_sensors]
     if not verdict.plate_matches:
         rows += _plate_rows(verdict)
+    elif verdict.match is not None and verdict.match.outliers.any():
+        count = counted(int(verdict.match.outliers.sum()), "value")
+        rows.append(f"OUTLIERS: {count} left out: check for loose contacts if they are many")
     if rows:
         return rows
     if difference_rows(verdict):

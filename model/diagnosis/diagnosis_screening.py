@@ -75,7 +75,7 @@ def off_scale(observation: Responses, values: ComplexArray, match: Match) -> lis
     """Sensors with a scale unlike that of the others, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
-    finite = np.isfinite(values) & np.isfinite(match.predicted)
+    finite = np.isfinite(values) & np.isfinite(match.predicted) & ~match.outliers
     model = np.where(finite, match.predicted, 0)
     measured = np.where(finite, values, 0)
     phase_factor = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))

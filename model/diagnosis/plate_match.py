@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.fit import without_outliers
 from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import fit_with_gains, project_gains, row_rms
 from model.choice import best_by
@@ -25,6 +26,7 @@ _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
+_MAX_OUTLIERS = 0.05  # of all values; of a plate 3 % longer than its rig's a tenth look like some
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class Match:
     prior; gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of
     robust residuals and of z; error, median_error: rms and median of residuals relative to the rms
     of their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
-    drive, with gains.
+    drive, with gains; outliers (f, e, s): mask of values that no error counts.
     """
 
     rig: Rig
@@ -47,6 +49,7 @@ class Match:
     median_error: float
     responses: ComplexArray
     predicted: ComplexArray
+    outliers: NDArray[np.bool_]
 
     @property
     def worst(self) -> float:
@@ -76,10 +79,12 @@ def match_plate(
     searched[gains_of[used]] = True
     std = model.space.std[gains_of]
 
-    def relative_to(levels: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Values by channel relative to levels (e,), logarithms of gains; and their weights."""
+    def relative_to(
+        levels: FloatArray, which: NDArray[np.bool_] = inside
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Values by channel relative to levels (e,), logarithms of gains; and weights of some."""
         scaled = values / np.exp(levels)[:, None]
-        return scaled, inside / (model_error * row_rms(scaled)[:, :, None])
+        return scaled, which / (model_error * row_rms(scaled, which)[:, :, None])
 
     tried = []
     for start in starts:
@@ -103,8 +108,10 @@ def match_plate(
     best, beside = best_by(tried, lambda each: -each[0].cost)
     z = best.x
     predicted = plate.responses(z)[:, driven]
-    _, residual = project_gains(predicted, *relative_to(beside), tolerance=_GAIN_TOLERANCE)
-    share = (model_error * np.abs(residual))[inside]
+    outliers = _outliers(values, predicted)
+    kept = inside & ~outliers
+    _, residual = project_gains(predicted, *relative_to(beside, kept), tolerance=_GAIN_TOLERANCE)
+    share = (model_error * np.abs(residual))[kept]
     gains = np.where(used, np.exp(beside + std * z[gains_of]), np.nan)
     return Match(
         plate.rig_at(z),
@@ -116,4 +123,17 @@ def match_plate(
         float(np.median(share)) if len(share) else math.inf,
         plate.responses(np.where(plate.model.space.of("gain"), 0.0, z)),
         np.where(used[:, None], predicted * np.exp(beside)[:, None], np.nan),
+        outliers,
     )
+
+
+def _outliers(values: ComplexArray, predicted: ComplexArray) -> NDArray[np.bool_]:
+    """Mask of those values (f, e, s) that a calibration would leave out.
+
+    None where these are too many, and none of a sensor that they are the most of: such values are
+    no accident, but tell that the plate, its wiring or the sensor's place is another one.
+    """
+    measured = np.isfinite(values)
+    found = measured & ~without_outliers(values, predicted)[-1]
+    found[:, :, found.sum(axis=(0, 1)) > measured.sum(axis=(0, 1)) / 2] = False
+    return found & bool(found.sum() <= _MAX_OUTLIERS * measured.sum())

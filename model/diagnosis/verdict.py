@@ -212,7 +212,7 @@ def best_wiring(
 def _phases(observation: Responses, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:
     if not observation.has_phases:
         return [ChannelPhase()] * len(dead)
-    predicted = np.where(dead[None, :, None], np.nan, match.predicted)
+    predicted = np.where(match.outliers | dead[:, None], np.nan, match.predicted)
     return phases_of_drive(observation, predicted)
 
 

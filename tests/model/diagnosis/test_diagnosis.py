@@ -14,11 +14,13 @@ import pytest
 import perturbed_plate
 from distorted_responses import DISTORTIONS
 from long_form import shortly
+from model.calibration.calibration_result import MAX_OUTLIERS
+from model.calibration.fit import without_outliers
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis import causes
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
-from model.diagnosis.plate_match import match_plate
+from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -189,16 +191,21 @@ def test_diagnose_judges_no_polarity_without_phases(coarse_rig, built):
     assert {channel.phase for channel in verdict.channels} == {None}
 
 
+def longer(rig: Rig, factor: float) -> Rig:
+    """A longer plate with its ERAs at its corners."""
+    plate = replace(rig.plate, length=factor * rig.plate.length)
+    eras = tuple(replace(era, x=factor * era.x) for era in rig.eras)
+    mesh = Mesh(14, 9, plate.length, plate.width)
+    return replace(rig, plate=plate, eras=eras, mesh=mesh)
+
+
 def changed(rig: Rig, what: str) -> Rig:
     """A plate that is not the rig's."""
     match what:
         case "plate.thickness":
             return replace(rig, plate=replace(rig.plate, thickness=0.002))
         case "plate.length":
-            plate = replace(rig.plate, length=1.2 * rig.plate.length)
-            eras = tuple(replace(era, x=1.2 * era.x) for era in rig.eras)
-            mesh = Mesh(14, 9, plate.length, plate.width)
-            return replace(rig, plate=plate, eras=eras, mesh=mesh)
+            return longer(rig, 1.2)
         case "eras.stiffness":
             return replace(
                 rig, eras=tuple(replace(era, stiffness=2.2 * era.stiffness) for era in rig.eras)
@@ -276,12 +283,39 @@ def test_diagnose_skips_channels_that_were_not_driven(coarse_rig, built):
     assert verdict.is_well
 
 
-def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
-    """Three in a hundred values that are wrong by far move parameters by a tenth of their prior."""
+def with_glitches(built: Responses) -> Responses:
+    """Three in a hundred values wrong by far, one way or another."""
     rng = np.random.default_rng(0)
     broken = built.values.copy()
     wrong = rng.random(broken.shape) < 0.03
     broken[wrong] *= rng.choice([0.1, 4.0, -1.0], wrong.sum())
+    return replace(built, values=broken)
+
+
+def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
+    """They move parameters by a tenth of their prior."""
     plate = sensed_plate(coarse_rig, built.points, built.frequencies)
-    clean, found = (match_plate(plate, each, drives=range(4)) for each in (built.values, broken))
+    clean, found = (
+        match_plate(plate, each.values, drives=range(4)) for each in (built, with_glitches(built))
+    )
     assert np.sqrt(((found.z - clean.z) ** 2).mean()) < 0.1
+
+
+def test_diagnose_passes_a_plate_of_which_some_values_are_glitches(coarse_rig, built):
+    """Neither plate nor a sensor with some of them is blamed, and it is said that they were."""
+    verdict = diagnose(coarse_rig, with_glitches(built))
+    assert verdict.is_well
+    assert verdict.bad_sensors == ()
+    (row,) = verdict_rows(verdict)
+    assert row.startswith("OUTLIERS: 1")
+
+
+def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
+    """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
+    rng = np.random.default_rng(1003)
+    built = measured(longer(within_tolerance(coarse_rig, rng), 1.03), rng)
+    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    match = match_plate(plate, built.values, drives=range(4))
+    used = without_outliers(built.values, match.predicted)[-1]
+    assert 0.05 < (~used).mean() < MAX_OUTLIERS
+    assert match.error > MAX_FIT_ERROR

@@ -1,6 +1,6 @@
 """A supervisor in virtual time, with a control loop and obedient amplifiers, and courses of it.
 
-A course is an entry of a YAML file, a list of steps. A step is a method of `Watched`, `Refused` if
+A course is an entry of a YAML file, a list of steps. A step is a method of `Watched`, `refuses` if
 the amplifiers or the supervisor must refuse it, or `is`: values of its properties, by their names.
 """
 
@@ -16,15 +16,16 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from chain import Chain
 from controller.daemon.states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.daemon.supervisor import Supervisor
-from controller.loop.loop import Controller
 from controller.loop.observer import Observer
-from controller.sources.touch import Touch, TouchFrame
-from controller_bench import FarEnd, make_bench
+from drivers import clock
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
+from set_chain import FINGER, OTHER, set_chain
+from sim.faults.fault_window import FaultKind
 from virtual_loop import run_virtual
 
 Step = str | Mapping[str, Any]
@@ -35,28 +36,20 @@ class Planted(Exception):
 
 
 @dataclass
-class Watched:
-    """A running supervisor, the far ends of its amplifiers, and what it has reported.
+class Watched(Chain):
+    """A chain under a running supervisor, and what that has reported.
 
     failing: of states, links, refusals, alive and cycles that whose observer raises.
     """
 
-    supervisor: Supervisor
-    controller: Controller
-    far_ends: Sequence[FarEnd]
+    supervisor: Supervisor = field(init=False)
     states: list[DaemonState] = field(default_factory=list)
     links: list[str] = field(default_factory=list)
-    refusals: list[str] = field(default_factory=list)
     alive: list[float] = field(default_factory=list)
     cycles: list[float] = field(default_factory=list)
     failing: str = ""
     lease: str = ""
     under_way: dict[str, "asyncio.Task[None]"] = field(default_factory=dict)
-
-    @property
-    def far_end(self) -> FarEnd:
-        """That of the first amplifier."""
-        return self.far_ends[0]
 
     @property
     def state(self) -> DaemonState:
@@ -71,12 +64,12 @@ class Watched:
     @property
     def is_loud(self) -> bool:
         """Whether any amplifier plays."""
-        return any(any(each.levels()) for each in self.far_ends)
+        return any(map(any, self.levels().values()))
 
     @property
     def opened(self) -> int:
         """How often a line to the first amplifier was opened."""
-        return len(self.far_end.attempts)
+        return self.operation.attempts[self.far_end.port]
 
     @property
     def degraded(self) -> list[str]:
@@ -91,7 +84,7 @@ class Watched:
     @property
     def is_alive(self) -> bool:
         """Whether it never was without a sign of life for more than 0.6 s."""
-        moments = [*self.alive, asyncio.get_running_loop().time()]
+        moments = [*self.alive, clock.now()]
         return max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
 
     @property
@@ -139,43 +132,48 @@ class Watched:
         """Let time pass."""
         await asyncio.sleep(seconds)
 
-    def touch(self, x: float = 0.5, y: float = 0.5) -> None:
-        """Put a finger on the plate, by default in the middle."""
-        now = asyncio.get_running_loop().time()
-        self.controller.deliver(TouchFrame("test", now, (Touch(1, x, y),)))
+    def touch(self) -> None:
+        """Put a finger on the plate."""
+        self.put(FINGER)
 
     def touch_elsewhere(self) -> None:
         """Move the finger far enough for another pattern."""
-        self.touch(0.9, 0.9)
+        self.put((FINGER[0], *OTHER[1:]))
 
-    def cut(self) -> None:
-        """Let no request reach the amplifier any more."""
-        self.far_end.cut()
+    def fault(self, kind: FaultKind, **given: Any) -> None:
+        """Let a fault of all amplifiers begin."""
+        for each in self.far_ends:
+            each.fault(kind, **given)
+
+    def recovers(self) -> None:
+        """End all faults."""
+        for each in self.far_ends:
+            each.recover()
+
+    def delays(self, seconds: float) -> None:
+        """Let replies of all amplifiers leave them so much later."""
+        for each in self.far_ends:
+            each.delay(seconds)
 
     def obey(self) -> None:
-        """Let the amplifier obey again, and forget the requests so far."""
+        """Let the amplifiers obey again, and forget the requests so far."""
         self.forget()
-        self.far_end.mend()
-        self.far_end.answer = lambda name, values: None
+        self.delays(0.0)
+        self.recovers()
+        for each in self.far_ends:
+            each.answer = lambda name, values: None
 
     def forget(self) -> None:
         """Forget the requests so far, and how often a line was opened."""
+        self.operation.attempts.clear()
         for each in self.far_ends:
             each.asked.clear()
-            each.attempts.clear()
-
-    def line(self, **changed: Any) -> None:
-        """Let lines delay, be mute or deaf."""
-        for far_end, (name, value) in (
-            (f, each) for f in self.far_ends for each in changed.items()
-        ):
-            setattr(far_end, name, value)
 
     def answer(self, *names: str, **changed: object) -> None:
         """Let the amplifier report something else in replies of some names."""
         changed = {what: _coded(what, value) for what, value in changed.items()}
-        self.far_end.answer = lambda name, values: (
-            {**self.far_end.status(), **changed} if name in names else None
+        self.far_end.lie(
+            lambda name, values: {**self.far_end.status(), **changed} if name in names else None
         )
 
     def answers(self, to: Sequence[str], **changed: object) -> None:
@@ -184,17 +182,24 @@ class Watched:
 
     def freezes(self, seconds: float) -> None:
         """Let the amplifier ignore Clear, and report what it reports now, for so long."""
-        until = asyncio.get_running_loop().time() + seconds
+        until = clock.now() + seconds
         status = self.far_end.status()
-        self.far_end.answer = lambda name, values: (
-            status
-            if asyncio.get_running_loop().time() < until and name in ("Clear", "GetStatus")
-            else None
+        self.far_end.lie(
+            lambda name, values: (
+                status if clock.now() < until and name in ("Clear", "GetStatus") else None
+            )
         )
 
-    def reports(self, **event: Any) -> None:
-        """Let the amplifier send an event."""
-        self.far_end.report(**{what: _coded(what, value) for what, value in event.items()})
+    def reports(self, when: str, **event: Any) -> None:
+        """Let the amplifier send an event as it is about to carry out a request of a name."""
+        values = {"latch": 0, **{what: _coded(what, value) for what, value in event.items()}}
+
+        def report(name: str, _: Values) -> None:
+            for listener in self.far_end.device.listeners:
+                if name == when:
+                    listener(values, clock.now())
+
+        self.far_end.lie(report)
 
     def refuse(self, *names: str) -> None:
         """Let the last amplifier refuse requests of some names."""
@@ -203,7 +208,7 @@ class Watched:
             if name in names:
                 raise Refusal("as told", "WRONG_STATE")
 
-        self.far_ends[-1].answer = answer
+        self.far_ends[-1].lie(answer)
 
     def fails_once(self, method: str) -> None:
         """Let a method of the controller fail once, while the amplifier is reached."""
@@ -236,10 +241,10 @@ class Watched:
 
     def energised_in(self, seconds: float, expected: bool) -> None:
         """Require that amplifiers are taken for energised, or not, in some seconds."""
-        now = asyncio.get_running_loop().time()
+        now = clock.now()
         assert self.supervisor.assume_energised(now + seconds) is expected
 
-    async def refused(self, step: Step) -> None:
+    async def refuses(self, step: Step) -> None:
         """Require that a step is refused."""
         with pytest.raises(CommandRefused):
             await self.take(step)
@@ -254,7 +259,7 @@ class Watched:
             await self.does(name)
         else:
             method = getattr(self, name.replace(" ", "_"))
-            if name == "refused" or not isinstance(given, list | Mapping):
+            if name == "refuses" or not isinstance(given, list | Mapping):
                 done = method(given)
             else:
                 done = method(**given) if isinstance(given, Mapping) else method(*given)
@@ -270,14 +275,13 @@ def _coded(what: str, value: Any) -> Any:
 
 @asynccontextmanager
 async def watched(
-    *amplifiers: str, refuses: bool = False, wire: str = "serial"
+    *amplifiers: str, refuses: bool = False, breaks: str | None = None, **options: Any
 ) -> AsyncIterator[Watched]:
     """A supervisor with a running control loop, which must end when it is closed.
 
-    amplifiers: one unless more are named; refuses: whether it refuses all requests at first; wire:
-    the kind of their lines.
+    amplifiers: one unless more are named; refuses: whether it refuses all requests at first;
+    breaks: the only rules of the witness that are broken; options: as for `set_chain`.
     """
-    loop = asyncio.get_running_loop()
 
     def heard(name: str, value: object) -> None:
         if daemon.failing == name:
@@ -287,30 +291,31 @@ async def watched(
     supervisor = Supervisor(
         state_changed=[lambda old, new: heard("states", new.state)],
         link_changed=lambda event, lost, message: heard("links", event),
-        alive=lambda: heard("alive", loop.time()),
+        alive=lambda: heard("alive", clock.now()),
     )
-    observer = Observer(
-        cycle_completed=lambda: heard("cycles", loop.time()),
-        refused=lambda reason: heard("refusals", reason),
-    )
-    bench = make_bench(
-        *amplifiers, wire=wire, connected=supervisor.connected, observer=supervisor.observer()
-    )
-    bench.controller.observers.append(observer)
-    daemon = Watched(supervisor, bench.controller, bench.far_ends)
-    if refuses:
-        daemon.refuse("GetCaps")
-    supervisor.controller = bench.controller
-    running = asyncio.create_task(supervisor.run())
-    await supervisor.started.wait()
-    await asyncio.sleep(0.005)
-    try:
-        yield daemon
-    finally:
-        daemon.failing = ""
-        await supervisor.close("end of the test")
-        await asyncio.wait_for(running, 20)
-        assert not any(each.is_open for each in bench.far_ends)
+    options = {"connected": supervisor.connected, "observer": supervisor.observer(), **options}
+    async with set_chain(*amplifiers, of=Watched, **options) as daemon:
+        daemon.supervisor, supervisor.controller = supervisor, daemon.controller
+        daemon.controller.observers.append(
+            Observer(
+                cycle_completed=lambda: heard("cycles", clock.now()),
+                refused=lambda reason: heard("refused", reason),
+            )
+        )
+        if refuses:
+            daemon.refuse("GetCaps")
+        running = asyncio.create_task(supervisor.run())
+        await supervisor.started.wait()
+        await asyncio.sleep(0.005)
+        try:
+            yield daemon
+        finally:
+            daemon.failing = ""
+            daemon.witness.commanded("disarm")
+            await supervisor.close("end of the test")
+            await asyncio.wait_for(running, 20)
+            assert not any(each.is_open for each in daemon.far_ends)
+        daemon.judge(breaks)
 
 
 def courses(path: Path) -> dict[str, Mapping[str, Any]]:

@@ -139,7 +139,7 @@ class Scene(Chain):
 
     def delayed(self, seconds: float) -> None:
         """Delay what goes to the host from now on."""
-        for end in self.ends:
+        for end in self.far_ends:
             end.delay(seconds)
 
     async def touch_for(self, frequency: float, level: float, phase: float = 0.0) -> None:

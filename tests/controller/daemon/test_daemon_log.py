@@ -24,15 +24,13 @@ from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.publisher import LatencyStatistics
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.states import DaemonState, Operation
-from controller_bench import BenchLines, FarEnd
 from drivers import clock
 from drivers.host.wire import Reply
 from gateway_bench import wait_for
-from registry.limits import GuardLimits
+from set_chain import set_chain
 from virtual_loop import in_virtual_time
 
 FAULT = Operation(DaemonState.FAULT, "arc")
-LIMITS = GuardLimits(40.0, 500.0, 1.0)
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
@@ -229,14 +227,14 @@ async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
         def append(self, record: MessageRecord) -> None:
             raise MemoryError
 
-    far_end, recorder = FarEnd(), FaultDumps(tmp_path)
-    host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
-    recorder.follow({"main": host})
-    await host.open()
-    assert recorder.records
-    recorder.records = Full()
-    assert (await host.stop()).is_confirmed
-    assert far_end.requests("Stop")
+    recorder = FaultDumps(tmp_path)
+    async with set_chain(connected=recorder.follow) as chain:
+        await chain.open()
+        assert recorder.records
+        recorder.records = Full()
+        assert (await chain.controller.stop())["main"].is_confirmed
+        assert chain.far_end.requests("Stop")
+        await chain.close()
 
 
 @pytest.fixture

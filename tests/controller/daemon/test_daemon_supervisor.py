@@ -8,8 +8,7 @@ import pytest
 
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
-from controller_bench import ENABLED as ARMED
-from controller_bench import STOPPED
+from drivers import clock
 from drivers.errors import CommandRefused
 from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
@@ -17,6 +16,7 @@ from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_a
 from virtual_loop import in_virtual_time
 from watched_supervisor import Watched, courses, follow, watched
 
+ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 ENABLED = DaemonState.OPERATION_ENABLED
 ARM, STOP, CLEAR = (DaemonEvent(each) for each in (Trigger.ARM, Trigger.STOP, Trigger.CLEAR))
 
@@ -45,7 +45,7 @@ def slow_down(controller: Controller, *, stop: float) -> None:
 @in_virtual_time
 async def test_control_loop_whose_failure_cannot_be_stopped_runs_again_once_it_can() -> None:
     """No heartbeat is sent before that; once cleared and armed, they are."""
-    async with watched() as daemon:
+    async with watched(breaks="heartbeat latched") as daemon:
         await daemon.handle(ARM)
         controller = daemon.controller
         step, stop = controller.step, controller.stop
@@ -120,7 +120,7 @@ async def test_loss_is_handled_before_reopening_when_found_twice() -> None:
 
         slow_down(controller, stop=0.3)
         controller.release, controller.open = early_release, noted_open
-        daemon.cut()
+        daemon.fault("unplug")
         stopping = asyncio.create_task(daemon.handle(STOP))
         await asyncio.sleep(0.01)
         controller.step = lost_step
@@ -141,7 +141,7 @@ async def test_close_ends_handling_of_loss() -> None:
     """Neither waits for the other, and closed amplifiers are no further loss."""
     async with watched() as daemon:
         slow_down(daemon.controller, stop=0.3)
-        daemon.cut()
+        daemon.fault("unplug")
         stopping = asyncio.create_task(daemon.handle(STOP))
         await asyncio.sleep(0.7)
         assert daemon.state is DaemonState.COMM_LOST
@@ -197,9 +197,9 @@ async def test_second_clear_leaves_a_plate_alone_that_the_first_has_cleared() ->
 
 async def stall(daemon: Watched, seconds: float) -> None:
     """Let the amplifier hear nothing for a time [s]."""
-    daemon.far_end.is_deaf = True
+    daemon.fault("drop", toward="amplifier")
     await asyncio.sleep(seconds)
-    daemon.far_end.is_deaf = False
+    daemon.recovers()
 
 
 @in_virtual_time
@@ -216,7 +216,7 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
             token=token_after(daemon.far_end.status()["token"]),
             now=True,
         )
-        daemon.far_end.obey("Set", part, asyncio.get_running_loop().time())
+        daemon.far_end.obey("Set", part, clock.now())
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests("Stop")
@@ -232,10 +232,10 @@ async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
         def stage_nothing(name: str, values: Values) -> Values | None:
             if name != "Set":
                 return None
-            reply = daemon.far_end.obey(name, values, asyncio.get_running_loop().time())
+            reply = daemon.far_end.obey(name, values, clock.now())
             return {**reply, "staged": 0, "played": 0}
 
-        daemon.far_end.answer = stage_nothing
+        daemon.far_end.lie(stage_nothing)
         daemon.touch()
         await asyncio.sleep(0.1)
         assert daemon.far_end.state == STOPPED
@@ -250,7 +250,7 @@ async def test_stop_in_progress_is_not_repeated(
     """A look at the amplifiers finds it at work; one after its end, without silence, does not."""
     monkeypatch.setattr("controller.daemon.supervisor.STATUS_INTERVAL", 0.02)
     async with watched("main") as daemon:
-        daemon.answer("Stop", "GetStatus", levels=[1000, 0], state="QUICK_STOP_ACTIVE")
+        daemon.answer("Stop", "GetStatus", levels=[1000, 0, 0], state="QUICK_STOP_ACTIVE")
         stopping = asyncio.ensure_future(daemon.supervisor.stop("a test"))
         await asyncio.sleep(0.1)
         assert not stopping.done()
@@ -277,9 +277,9 @@ async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
             await asyncio.sleep(0.1)
         assert daemon.state is DaemonState.FAULT
         assert "a bug" in daemon.supervisor.operation.cause
-        assert (daemon.far_end.state, {*daemon.far_end.levels()}) == (STOPPED, {0})
+        assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
         await daemon.handle(CLEAR)
         await daemon.handle(ARM)
         daemon.touch_elsewhere()
         await asyncio.sleep(0.1)
-        assert (daemon.state, any(daemon.far_end.levels())) == (ENABLED, True)
+        assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)

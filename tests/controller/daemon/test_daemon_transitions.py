@@ -23,7 +23,7 @@ from watched_supervisor import Planted, Watched, watched
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
 SILENCING = (Trigger.STOP, Trigger.DISARM, Trigger.FAULT, Trigger.LINK_LOST)
-OBSERVERS = ("states", "links", "alive", "cycles", "refusals")
+OBSERVERS = ("states", "links", "alive", "cycles", "refused")
 METHODS = (
     (Action.VERIFY, "disarm"),
     (Action.ARM, "arm"),
@@ -48,7 +48,6 @@ async def until(made: Watched, *states: DaemonState) -> None:
 async def arm_again(made: Watched) -> None:
     """Clear what is latched, and arm, on a wire that is whole."""
     made.obey()
-    made.far_end.delay = 0.0
     for _ in range(10):
         await until(made, READY, ENABLED, DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
         if made.state is ENABLED:
@@ -68,10 +67,10 @@ async def enter(made: Watched, state: DaemonState) -> None:
         case DaemonState.OPERATION_ENABLED:
             pass
         case DaemonState.FAULT_REACTION_ACTIVE:
-            made.far_end.delay = 0.02
+            made.delays(0.01)
             made.supervisor.post(DaemonEvent(Trigger.FAULT, "test"))
         case DaemonState.COMM_LOST:
-            made.far_end.cut()
+            made.fault("unplug")
             await made.handle(DaemonEvent(Trigger.LINK_LOST, "test"))
         case _:
             latched = state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)

@@ -29,7 +29,7 @@ ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 
 def states(chain: Chain) -> set[str]:
     """The states of all amplifiers."""
-    return {end.state for end in chain.ends}
+    return {end.state for end in chain.far_ends}
 
 
 def refusing(name: str, code: str) -> Callable[[str, Values], None]:
@@ -48,15 +48,15 @@ async def test_lost_link_stops_the_others() -> None:
     async with set_running("a", "b") as chain:
         await chain.hold(0.1, down=[FINGER])
 
-        chain.ends[0].fault("unplug")
+        chain.far_ends[0].fault("unplug")
         await asyncio.sleep(0.1)
         assert chain.controller.group.state is GroupState.LOST
-        assert len(chain.ends[1].requests("Stop")) == 1
+        assert len(chain.far_ends[1].requests("Stop")) == 1
         (lost,) = chain.lost
         assert "/dev/memory0 was lost" in lost
         with pytest.raises(CommandError, match=r"LOST.*open"):
             await chain.controller.arm()
-    assert not chain.ends[1].is_open
+    assert not chain.far_ends[1].is_open
 
 
 @in_virtual_time
@@ -64,7 +64,7 @@ async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> N
     """150 ms after its last frame, as with a link; not only once all are open again."""
     async with set_running() as chain:
         await chain.leave(0.05, FINGER)
-        chain.end.fault("unplug")
+        chain.far_end.fault("unplug")
         await asyncio.sleep(0.0021)
         assert chain.contacts == [1]
         await asyncio.sleep(0.151)
@@ -118,16 +118,16 @@ async def test_stop_is_latched_until_clear() -> None:
         await chain.controller.stop()
         with pytest.raises(CommandRefused):
             await chain.controller.arm()
-        chain.end.fault("reboot", lasts=0.1)
+        chain.far_end.fault("reboot", lasts=0.1)
         await asyncio.sleep(0.2)
-        assert chain.end.state not in (STOPPED, ENABLED)
+        assert chain.far_end.state not in (STOPPED, ENABLED)
         with pytest.raises(CommandRefused):
             await chain.controller.arm()
         assert chain.controller.group.state is GroupState.STOPPED
         await chain.controller.clear()
         await chain.controller.arm()
         await chain.leave(0.01, FINGER)
-        assert not chain.end.sent()[-1].is_silent
+        assert not chain.far_end.sent()[-1].is_silent
 
 
 @pytest.mark.parametrize("order", ["stop", "disarm"])
@@ -136,7 +136,7 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
     """Nothing is sent, because the order of arrival would decide; afterwards arming works."""
     async with set_chain("a", "b") as chain:
         await chain.open()
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.delay(0.02)
         silencing = asyncio.create_task(getattr(chain.controller, order)())
         await asyncio.sleep(0)
@@ -144,7 +144,7 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
             await chain.controller.arm()
         await silencing
         assert not chain.controller.group.is_armed
-        assert [end.requests("Arm") for end in chain.ends] == [[], []]
+        assert [end.requests("Arm") for end in chain.far_ends] == [[], []]
         await chain.controller.clear()
         await chain.controller.arm()
         assert chain.controller.group.state is GroupState.ARMED
@@ -155,11 +155,11 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
 async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
     """One that another program has disarmed plays again, in a session that all have."""
     async with set_running("a", "b", breaks="state") as chain:
-        held = {end.amplifier.session for end in chain.ends}
-        chain.ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
+        held = {end.amplifier.session for end in chain.far_ends}
+        chain.far_ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
         await chain.controller.arm()
         assert states(chain) == {ENABLED}
-        (session,) = {end.amplifier.session for end in chain.ends}
+        (session,) = {end.amplifier.session for end in chain.far_ends}
         assert session not in held
 
 
@@ -167,7 +167,7 @@ async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
 async def test_failed_disarm_stops_all() -> None:
     """The error is raised after that."""
     async with set_running("a", "b", breaks="stop") as chain:
-        chain.ends[1].answer = refusing("Disarm", "BUSY")
+        chain.far_ends[1].answer = refusing("Disarm", "BUSY")
         with pytest.raises(CommandRefused, match="BUSY"):
             await chain.controller.disarm()
         assert states(chain) == {STOPPED}
@@ -177,13 +177,13 @@ async def test_failed_disarm_stops_all() -> None:
 async def test_stop_completes_when_its_caller_is_cancelled_twice() -> None:
     """While the amplifiers do not hear; they hear again after the second."""
     async with set_running("a", "b") as chain:
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.fault("drop", toward="amplifier")
         stopping = asyncio.create_task(chain.controller.stop())
         for _ in range(2):
             await asyncio.sleep(0.005)
             stopping.cancel()
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.recover()
         with pytest.raises(asyncio.CancelledError):
             await stopping
@@ -199,15 +199,15 @@ async def test_incomplete_set_is_silenced_before_the_next() -> None:
     """
     async with set_running("a", "b") as chain:
         await asyncio.sleep(0.02)  # the heartbeat is due 50 ms after the first
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.delay(0.02)
         chain.put(FINGER)
         await asyncio.sleep(0.025)  # staged after 20 ms, and the commits wait for their replies
-        assert [len(end.requests("Commit")) for end in chain.ends] == [1, 1]
+        assert [len(end.requests("Commit")) for end in chain.far_ends] == [1, 1]
         chain.put()
         chain.put(OTHER)
         await chain.hold(0.2, down=[OTHER])
-        for end in chain.ends:
+        for end in chain.far_ends:
             after_arming, *sent = [
                 name for name in end.names() if name in ("Set", "Commit", "Silence")
             ]
@@ -230,17 +230,17 @@ async def test_close_waits_for_zero_then_stops(
     def lag(name: str, values: Values) -> Values | None:
         nonlocal left
         if name == "Disarm":
-            chain.end.obey(name, values, asyncio.get_running_loop().time())
-        if left <= 0 or "Disarm" not in chain.end.names() or name == "Stop":
+            chain.far_end.obey(name, values, asyncio.get_running_loop().time())
+        if left <= 0 or "Disarm" not in chain.far_end.names() or name == "Stop":
             return None
         left -= 1
-        return {**chain.end.status(), "levels": [3000, 0, 0]}
+        return {**chain.far_end.status(), "levels": [3000, 0, 0]}
 
     caplog.set_level(logging.INFO)
     async with set_running(breaks="silent") as chain:
-        chain.end.answer = lag
-    assert bool(chain.end.requests("Stop")) is is_stopped
-    assert not chain.end.is_open
+        chain.far_end.answer = lag
+    assert bool(chain.far_end.requests("Stop")) is is_stopped
+    assert not chain.far_end.is_open
     assert [record.levelname for record in caplog.records] == logged
 
 
@@ -249,11 +249,11 @@ async def test_error_of_opening_names_the_amplifier_that_cannot_be_reached() -> 
     """By a line that cannot be opened, or by no reply; not those that were open before."""
     async with set_chain("a", "b") as chain:
         await chain.controller.open()
-        chain.ends[1].fault("drop", toward="amplifier")
+        chain.far_ends[1].fault("drop", toward="amplifier")
         await chain.controller.release()
         with pytest.raises(LinkError) as mute:
             await chain.controller.open()
-        chain.ends[1].fault("unplug")
+        chain.far_ends[1].fault("unplug")
         with pytest.raises(LinkError) as gone:
             await chain.controller.open()
     assert (mute.value.lost, gone.value.lost) == (("b",), ("b",))
@@ -278,7 +278,7 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
                     timing=SetTiming(),
                     urls=given,
                 ).open()
-            assert not chain.end.is_open
+            assert not chain.far_end.is_open
 
 
 @in_virtual_time
@@ -290,7 +290,7 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
         with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
             await chain.controller.open()
         assert chain.controller.group.state is GroupState.CLOSED
-        assert not chain.end.is_open
+        assert not chain.far_end.is_open
 
 
 @in_virtual_time
@@ -298,11 +298,11 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
     """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
     async with set_running("a", "b") as chain:
         await chain.hold(0.2, down=[FINGER])
-        chain.ends[1].fault("drop", toward="amplifier")
+        chain.far_ends[1].fault("drop", toward="amplifier")
         await chain.leave(0.6)
         assert chain.lost
         assert chain.controller.group.state is GroupState.LOST
-        assert not any(chain.ends[0].levels)
+        assert not any(chain.far_ends[0].levels)
 
 
 @pytest.mark.parametrize("is_armed", [False, True])
@@ -314,7 +314,7 @@ async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> Non
         await chain.open()
         if is_armed:
             await chain.controller.arm()
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.delay(0.005)
         arming = asyncio.create_task(chain.controller.arm())
         await asyncio.sleep(0.001)

@@ -26,7 +26,7 @@ def now() -> float:
 
 def first_silence(chain: Chain, since: float) -> float:
     """When the first silent set from a time on was sent [s]."""
-    return next(each.time for each in chain.end.sent() if each.is_silent and each.time >= since)
+    return next(each.time for each in chain.far_end.sent() if each.is_silent and each.time >= since)
 
 
 @in_virtual_time
@@ -63,7 +63,7 @@ async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
     """Not while its reply is awaited; nor for a frame without a change or without a new set."""
     async with set_running() as chain:
         await asyncio.sleep(0.02)
-        chain.end.delay(0.010)
+        chain.far_end.delay(0.010)
         is_preparing = [chain.controller.is_preparing]
         chain.put(FINGER)
         is_preparing.append(chain.controller.is_preparing)
@@ -72,11 +72,11 @@ async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
         await asyncio.sleep(0.015)
         chain.put(FINGER)
         is_preparing.append(chain.controller.is_preparing)
-        before = len(chain.end.sent())
+        before = len(chain.far_end.sent())
         chain.put(NEAR)
         is_preparing.append(chain.controller.is_preparing)
         await asyncio.sleep(0.025)
-        assert len(chain.end.sent()) == before
+        assert len(chain.far_end.sent()) == before
         is_preparing.append(chain.controller.is_preparing)
     assert is_preparing == [False, True, False, False, True, False]
 
@@ -85,7 +85,7 @@ async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
 async def test_latency_counts_to_the_commit_with_several_amplifiers() -> None:
     """To its last byte, 10 ms after the stage, whose reply takes as long; not to the read-back."""
     async with set_running("west", "east") as chain:
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.delay(0.010)
         await chain.leave(0.040, FINGER, ago=0.003)
         (applied,) = chain.applied
@@ -103,7 +103,7 @@ async def test_controller_keeps_phase_when_a_finger_moves() -> None:
         await chain.hold(0.1, down=[(1, 0.21, 0.1)])
         await chain.leave(0.01)
         await chain.hold(0.1, down=[(2, 0.21, 0.1)])
-        played = [each for each in chain.end.sent() if not each.is_silent]
+        played = [each for each in chain.far_end.sent() if not each.is_silent]
         assert [[c.keep_phase for c in each.layer.commands] for each in played] == [
             [False] * 3,
             [True, False, False],
@@ -119,7 +119,7 @@ async def test_controller_keeps_phase_at_a_frequency_that_the_wire_rounds() -> N
         chain.table.excitation = {"SW": Tone(101.33, 30e-6)}
         await chain.hold(0.1, down=[FINGER])
         await chain.hold(0.1, down=[(1, 0.18, 0.1)])
-        tones = [each.layer.commands[0] for each in chain.end.sent() if not each.is_silent]
+        tones = [each.layer.commands[0] for each in chain.far_end.sent() if not each.is_silent]
         assert [tone.frequency for tone in tones] == [2027, 2027]
         assert [tone.keep_phase for tone in tones] == [False, True]
 
@@ -135,21 +135,21 @@ async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) ->
 
         def note(name: str, values: Values) -> None:
             if name == kind:
-                chain.end.delay(0.045)
+                chain.far_end.delay(0.045)
                 awaited.set()
 
-        chain.end.answer = note
+        chain.far_end.answer = note
         chain.put(FINGER)
         await awaited.wait()
-        chain.end.answer = lambda name, values: None
+        chain.far_end.answer = lambda name, values: None
         await asyncio.sleep(0.001)
         await chain.leave(0.02)
-        assert not any(chain.end.levels)
-        chain.end.delay(0.0)
-        beats = len(chain.end.times("Ping"))
+        assert not any(chain.far_end.levels)
+        chain.far_end.delay(0.0)
+        beats = len(chain.far_end.times("Ping"))
         await asyncio.sleep(0.06)
         assert chain.silenced[-1].reason == NO_CONTACTS
-        assert len(chain.end.times("Ping")) > beats
+        assert len(chain.far_end.times("Ping")) > beats
         assert chain.controller.group.state is GroupState.ARMED
 
 
@@ -164,7 +164,7 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
             if after:
                 asyncio.get_running_loop().call_soon(lift, after - 1)
             else:
-                before.extend(len(end.asked) for end in chain.ends)
+                before.extend(len(end.asked) for end in chain.far_ends)
                 chain.put()
 
         def answer(name: str, values: Values) -> None:
@@ -172,11 +172,11 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
                 asyncio.get_running_loop().call_later(0.002, lift, later)
 
         await asyncio.sleep(0.046)
-        for end in chain.ends:
+        for end in chain.far_ends:
             end.delay(0.002)
-        chain.ends[-1].answer = answer
+        chain.far_ends[-1].answer = answer
         await chain.leave(0.05, FINGER)
-        for end, count in zip(chain.ends, before, strict=True):
+        for end, count in zip(chain.far_ends, before, strict=True):
             sent = end.names(count)
             assert sent.index("Silence") < sent.index("Ping")
 
@@ -189,7 +189,7 @@ async def test_controller_silences_a_timeout_while_a_reply_is_awaited(ago: float
     The frame is too old when it arrives, or becomes so while the amplifier takes 40 ms to reply.
     """
     async with set_running(breaks="answer") as chain:
-        chain.end.delay(0.04)
+        chain.far_end.delay(0.04)
         await chain.leave(0.002, FINGER)
         chain.put(FINGER, ago=ago)
         over = max(now(), now() - ago + 0.15)
@@ -206,7 +206,7 @@ async def test_controller_times_out_a_finger_from_before_arming() -> None:
         over = now() + 0.15
         await asyncio.sleep(0.13)
         await chain.controller.arm()
-        chain.end.delay(0.04)
+        chain.far_end.delay(0.04)
         await asyncio.sleep(0.2)
         assert first_silence(chain, over) == pytest.approx(over, abs=1e-4)
 
@@ -215,7 +215,7 @@ async def test_controller_times_out_a_finger_from_before_arming() -> None:
 async def test_heartbeat_stops_when_the_loop_hangs() -> None:
     """While the loop waits for one amplifier, the other gets no heartbeat."""
     async with set_running("a", "b") as chain:
-        slow, other = chain.ends
+        slow, other = chain.far_ends
         slow.fault("hang", lasts=0.1)
         hung = now()
         await chain.leave(0.08, FINGER)
@@ -228,10 +228,10 @@ async def test_heartbeat_stops_when_the_loop_hangs() -> None:
 async def test_arm_changes_nothing_while_armed() -> None:
     """No second Arm is sent, for it would begin another session; heartbeats go on."""
     async with set_running() as chain:
-        begin = len(chain.end.asked)
+        begin = len(chain.far_end.asked)
         await asyncio.gather(*(chain.controller.arm() for _ in range(2)))
         await asyncio.sleep(2.5 * HEARTBEAT)
-        kinds = chain.end.names(begin)
+        kinds = chain.far_end.names(begin)
         assert "Arm" not in kinds
         assert "Ping" in kinds
         assert chain.controller.group.state is GroupState.ARMED
@@ -259,9 +259,9 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         (refusal,) = chain.refused
         assert "2 command sets" in refusal
         assert chain.silenced[-1].reason == refusal
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
         await chain.hold(0.2, down=[FINGER])
-        assert any(chain.end.levels)
+        assert any(chain.far_end.levels)
         assert len(chain.refused) == 1
         assert len(chain.table.asked) == asked + 1
         assert chain.applied[-1].time == pytest.approx(begin + 1.1, abs=1e-3)
@@ -270,7 +270,7 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
             await chain.leave(0.010, FINGER)
             assert len(chain.refused) == refused
         await chain.leave(2)
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
         assert len(chain.applied) == 4
 
 
@@ -300,6 +300,6 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
     async with set_running(observer=observer) as chain:
         await chain.leave(0.01, FINGER)
         await chain.leave(0.2)
-        assert [each.is_silent for each in chain.end.sent()] == [True, False, True]
-        assert len(chain.end.requests("Ping")) > 3
+        assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]
+        assert len(chain.far_end.requests("Ping")) > 3
     assert "no disk space for this row" in caplog.text

@@ -77,12 +77,12 @@ def shapes() -> Shapes:
 
 def sets(chain: Chain) -> list[Sent]:
     """Every set since the silence that follows arming."""
-    return chain.end.sent()[1:]
+    return chain.far_end.sent()[1:]
 
 
 def level(chain: Chain, channel: int = 0) -> float:
     """What a channel plays now."""
-    return chain.end.levels[channel]
+    return chain.far_end.levels[channel]
 
 
 def levels_of(envelope: object) -> list[float]:
@@ -128,10 +128,10 @@ async def test_lifted_target_fades_along_its_ending(shapes: Shapes) -> None:
         await chain.leave(0.020, OTHER)
         assert level(chain) == pytest.approx(FULL / 2, abs=1e-3)
         await asyncio.sleep(0.0205)
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
         assert chain.silenced[-1].reason == "the target was lifted"
         await chain.leave(0.001)
-        assert chain.end.names()[-1] == "Silence"
+        assert chain.far_end.names()[-1] == "Silence"
 
 
 @pytest.mark.parametrize("held", [0.05, 0.3])
@@ -142,7 +142,7 @@ async def test_last_lift_skips_the_ending(shapes: Shapes, held: float) -> None:
         await chain.hold(held, down=[FINGER])
         await chain.leave(0)
         await asyncio.sleep(0.020)
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
 
 
 @in_virtual_time
@@ -156,7 +156,7 @@ async def test_lift_before_the_onset_is_over_skips_the_ending(shapes: Shapes) ->
             highest = max(highest, level(chain))
             await asyncio.sleep(0.001)
         assert highest <= FULL / 2 + 1e-3
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
 
 
 @in_virtual_time
@@ -223,16 +223,16 @@ async def test_failing_intent_source_silences_until_it_recovers(
     """Along the ramp, without endings; heartbeats continue, and touches are felt again later."""
     async with set_running(knots=32, timing=shapes, intent_source=Always()) as chain:
         await chain.hold(0.2, down=[FINGER])
-        assert chain.end.levels[0] > 0
+        assert chain.far_end.levels[0] > 0
         with monkeypatch.context() as patch:
             patch.setattr(Always, "intent", lambda self, contacts, now: 1 / 0)
             await chain.hold(0.3, down=[FINGER, OTHER])
         assert sets(chain)[-1].token == 0  # a Silence
-        assert not any(chain.end.levels)
+        assert not any(chain.far_end.levels)
         assert chain.silenced[-1].reason.startswith("ZeroDivisionError")
-        assert chain.end.state == "OPERATION_ENABLED"
+        assert chain.far_end.state == "OPERATION_ENABLED"
         await chain.hold(0.2, down=[(3, 0.06, 0.16)])
-        assert chain.end.levels[0] > 0
+        assert chain.far_end.levels[0] > 0
 
 
 PROMISED = 0.001  # s; rounding of times
@@ -240,7 +240,7 @@ PROMISED = 0.001  # s; rounding of times
 
 def vibrations(chain: Chain) -> list[tuple[float, Sent]]:
     """When each set that vibrates was sent [s], and the set."""
-    return [(each.time, each) for each in chain.end.sent() if not each.is_silent]
+    return [(each.time, each) for each in chain.far_end.sent() if not each.is_silent]
 
 
 def frame(*touches: Touch, timeout: float) -> TouchFrame:
@@ -264,7 +264,7 @@ async def test_vibration_of_a_silent_sender_is_not_renewed() -> None:
         assert again < sent + valid_for(only)
         await asyncio.sleep(5.0)
         assert len(vibrations(chain)) == 2
-        assert chain.end.sent()[-1].is_silent
+        assert chain.far_end.sent()[-1].is_silent
 
 
 @in_virtual_time
@@ -278,7 +278,7 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
         monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())
         begin = asyncio.get_running_loop().time()
         await chain.leave(60.0, FINGER)
-        assert not chain.end.sent()[-1].is_silent
+        assert not chain.far_end.sent()[-1].is_silent
         ends = [time - begin + (valid_for(each) or math.inf) for time, each in vibrations(chain)]
         assert max(ends) < 2.1
 
@@ -321,7 +321,7 @@ async def _playing_times(chain: Chain, seconds: float) -> list[float]:
     began = asyncio.get_running_loop().time()
     times = []
     while (now := asyncio.get_running_loop().time()) < began + seconds:
-        if max(chain.end.levels) > AUDIBLE:
+        if max(chain.far_end.levels) > AUDIBLE:
             times.append(now - began)
         await asyncio.sleep(0.001)
     return times
@@ -358,4 +358,4 @@ async def test_vibration_is_renewed_while_its_contact_is_confirmed() -> None:
         assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 1.1
         assert len(chain.applied) == 1
         await asyncio.sleep(0.2)
-        assert chain.end.sent()[-1].is_silent
+        assert chain.far_end.sent()[-1].is_silent

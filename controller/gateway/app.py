@@ -29,6 +29,7 @@ from controller.api.jsonrpc import (
     ErrorData,
     RpcError,
     error_line,
+    parse_json,
     read_params,
     read_request,
     request_line,
@@ -276,7 +277,10 @@ class Gateway:
 
 
 async def _body(request: Request) -> bytes:
-    """A request's body on one line, by default an empty object; raises HTTPException."""
+    """A request's body on one line, by default an empty object; raises HTTPException and RpcError.
+
+    It is parsed here, so that lines and columns of an error are those of the body.
+    """
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in ("application/json", ""):
         raise HTTPException(415, "the content type must be application/json")
@@ -290,7 +294,7 @@ async def _body(request: Request) -> bytes:
             raise too_large
     if body and not media:  # an empty body needs no type
         raise HTTPException(415, "the content type must be application/json")
-    return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
+    return json.dumps(parse_json(body or b"{}")).encode()
 
 
 async def _http_error(_: Request, error: Exception) -> Response:

@@ -144,6 +144,13 @@ def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: Scripted
     assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "forget")]
 
 
+def test_http_error_has_line_and_column_of_the_body(gateway: GatewayProcess) -> None:
+    """Not those of the line that the daemon would receive."""
+    response = http(gateway, body=b'{"owner": "me",\n  lease_s: 5}')
+    assert response.status == 400
+    assert "line 2 column 3" in json.loads(response.body)["error"]
+
+
 def test_http_method_without_parameters_needs_no_body(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:

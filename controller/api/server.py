@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 from controller.api.admission import Acceptor, Admission
@@ -39,7 +40,8 @@ _RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
 
-_BUSY = RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
+# Made anew each time: an exception that is raised again and again keeps all its tracebacks.
+_busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
 
 _logger = logging.getLogger(__name__)
 
@@ -208,9 +210,9 @@ class ApiServer:
         if not is_limited or connection.rate.take():
             return call
         if call.error is not None:
-            connection.refuse(_BUSY)
+            connection.refuse(_busy())
             return None
-        return replace(call, params=None, error=_BUSY)
+        return replace(call, params=None, error=_busy())
 
     def _finished(self, connection: Connection, task: "asyncio.Task[None]") -> None:
         connection.pending.discard(task)

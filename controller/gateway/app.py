@@ -40,7 +40,7 @@ from controller.api.rate_limit import RateLimiter, Rates
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
-from controller.gateway.bridge import KeptLink, bridge, client_name
+from controller.gateway.bridge import KeptLink, bridge, client_name, too_many
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -241,7 +241,7 @@ class Gateway:
                 return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
             if not (kept.is_open or self._may_connect(request)):
-                raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
+                raise too_many()
             return result_of(read_line(await kept.request(self._daemon, name, method, params)))
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error

@@ -6,13 +6,14 @@ On a WebSocket frames are lines of the API to the daemon, and the other way.
 import asyncio
 import contextlib
 import itertools
+from functools import partial
 from pathlib import Path
 
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable
-from controller.api.jsonrpc import RpcError, read_request
+from controller.api.client_protocol import Unreachable
+from controller.api.jsonrpc import ErrorCode, RpcError, read_request
 from controller.api.link import DaemonLink
 from controller.api.methods import SILENCING
 from controller.gateway.field import DrawnField
@@ -23,6 +24,9 @@ _MAX_NAME = 80  # characters; as in the API
 
 UNSUPPORTED_DATA = 1003  # close code of RFC 6455
 NO_DAEMON = 4001  # one of those for private use; the page connects again
+
+too_many = partial(RpcError, ErrorCode.BUSY, "too many connections", remedy="keep one open")
+"""The error of a further connection over HTTP that calls methods."""
 
 _numbers = itertools.count(1)
 
@@ -110,23 +114,14 @@ def client_name(name: str, connection: HTTPConnection) -> str:
 MAX_KEPT = 8  # connections; the daemon has 32
 
 
-class HttpLinks:
-    """Bounds the connections to the daemon of all HTTP connections, which has some for others."""
-
-    def __init__(self) -> None:
-        self.places = asyncio.Semaphore(MAX_KEPT)
-        self.busy = 0
-        self.idle: dict[KeptLink, None] = {}  # longest idle first
-
-
 class KeptLink:
     """The connection to the daemon that an HTTP connection keeps, from its first request on.
 
-    Unless another one needs its place: who is idle longest loses its own.
+    kept: those of all HTTP connections, which leave places of the daemon to others.
     """
 
-    def __init__(self, links: HttpLinks) -> None:
-        self._links = links
+    def __init__(self, kept: "set[KeptLink]") -> None:
+        self._kept = kept
         self._link: DaemonLink | None = None
         self._is_over = False
 
@@ -140,34 +135,22 @@ class KeptLink:
 
         Raises RpcError and Unreachable.
         """
-        links = self._links
         try:
-            async with asyncio.timeout(RESPONSE_TIMEOUT), links.places:
-                links.idle.pop(self, None)
-                links.busy += 1
-                try:
-                    if links.busy + len(links.idle) > MAX_KEPT:
-                        next(iter(links.idle)).drop()
-                    if self._link is None or not self._link.is_open:
-                        self._link = await DaemonLink.open(path, name)
-                    if self._is_over:  # sent all the same
-                        asyncio.get_running_loop().call_soon(self.drop)
-                    return await self._link.request(method, params, id=name)
-                finally:
-                    links.busy -= 1
-                    if self.is_open:
-                        links.idle[self] = None
-        except TimeoutError as error:
-            self.drop()
-            raise Unreachable.at(path, error) from error
-
-    def drop(self) -> None:
-        """Close it; a further request opens another."""
-        self._links.idle.pop(self, None)
-        if self._link is not None and self._link.is_open:
-            self._link.close()
+            if self._link is None or not self._link.is_open:
+                if len(self._kept - {self}) >= MAX_KEPT:
+                    raise too_many()
+                self._kept.add(self)
+                self._link = await DaemonLink.open(path, name)
+            if self._is_over:  # sent all the same
+                asyncio.get_running_loop().call_soon(self.close)
+            return await self._link.request(method, params, id=name)
+        finally:
+            if not self.is_open:
+                self._kept.discard(self)
 
     def close(self) -> None:
         """Close it: the HTTP connection is over."""
         self._is_over = True
-        self.drop()
+        self._kept.discard(self)
+        if self._link is not None and self._link.is_open:
+            self._link.close()

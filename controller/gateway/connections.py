@@ -14,7 +14,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode, Frame
 
 from controller.api.rate_limit import RateLimiter
-from controller.gateway.bridge import HttpLinks, KeptLink
+from controller.gateway.bridge import KeptLink
 
 MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request
@@ -60,7 +60,7 @@ class HttpConnection(H11Protocol):
         self._idle: dict[HttpConnection, asyncio.TimerHandle] = self.app_state.setdefault(
             "idle", {}
         )
-        self._daemon = KeptLink(self.app_state.setdefault("links", HttpLinks()))
+        self._daemon = KeptLink(self.app_state.setdefault("links", set()))
         self.app_state = {**self.app_state, "daemon": self._daemon}  # for requests
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

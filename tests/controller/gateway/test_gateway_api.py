@@ -123,18 +123,19 @@ def test_http_touches_belong_to_their_connection(
 def test_http_connections_leave_places_of_the_daemon_to_others(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """The one longest idle loses its own, and gets another when it calls again."""
+    """A ninth is refused until one of them closes."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with contextlib.ExitStack() as stack:
-        kept = [
+        first, *kept, ninth = [
             stack.enter_context(httpx.Client(base_url=gateway.url, headers=headers))
-            for _ in range(10)
+            for _ in range(9)
         ]
-        for each in (*kept, kept[0]):
+        for each in (first, *kept, first):
             assert each.post("api/v1/status").status_code == 200
-        first, second, third, *others, again = daemon.callers
-        wait_for(lambda: not any(each.is_open for each in (first, second, third)))
-        assert [each.is_open for each in (*others, again)] == [True] * 8
+        assert len({id(each) for each in daemon.callers}) == 8
+        assert ninth.post("api/v1/status").status_code == 429
+        first.close()
+        wait_for(lambda: ninth.post("api/v1/status").status_code == 200)
 
 
 def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:

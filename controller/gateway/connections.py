@@ -11,7 +11,7 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.frames import CloseCode, Frame
+from websockets.frames import Frame
 
 from controller.api.rate_limit import RateLimiter
 from controller.gateway.bridge import KeptLink
@@ -159,14 +159,6 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
             return
         super().handle_cont(event)
 
-    def send_receive_event_to_app(self) -> None:
-        """Pass a complete message on; invalid UTF-8 closes without a log record."""
-        if self.curr_msg_data_type == "text" and not _is_utf8(b"".join(self.frames)):
-            self.conn.send_close(CloseCode.INVALID_DATA)
-            self.handle_parser_exception()
-            return
-        super().send_receive_event_to_app()
-
     def keepalive_timeout(self) -> None:
         """Close without waiting for a client that does not answer pings."""
         super().keepalive_timeout()
@@ -194,11 +186,3 @@ def _is_ambiguous(head: bytes) -> bool:
     """
     lengths = [name for name in (b"\ncontent-length:", b"\ntransfer-encoding:") if name in head]
     return len(lengths) > 1 or _BARE_OR_FOLDED.search(head) is not None
-
-
-def _is_utf8(data: bytes) -> bool:
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from itertools import accumulate
 from typing import get_args
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -48,9 +48,7 @@ class _Metrics(Collector):
 def exposition(status: StatusResult | None) -> bytes:
     """Format a status in Prometheus' text format; only `era_up 0` without one."""
     up = _gauge("era_up", "Whether the daemon responds.", float(status is not None))
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Metrics([up, *(() if status is None else metrics_of(status))]))
-    return generate_latest(registry)
+    return generate_latest(_Metrics([up, *(() if status is None else metrics_of(status))]))
 
 
 def metrics_of(status: StatusResult) -> Iterator[Metric]:

@@ -2,12 +2,13 @@
 
 import asyncio
 import contextlib
+import logging
 import os
 import re
 import signal
 import socket
 import ssl
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import uvicorn
 
@@ -25,32 +26,12 @@ _SHUTDOWN_TIMEOUT = 0.3  # s; for connections to close by themselves
 
 
 class _Server(uvicorn.Server):
-    """Announces its port; ends at a signal, with an exit status of its own."""
-
-    def __init__(self, config: uvicorn.Config, *, announce: Callable[[int], None]) -> None:
-        super().__init__(config)
-        self._announce = announce
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and announce the port."""
-        await super().startup(sockets)
-        if sockets and self.started:
-            self._announce(sockets[0].getsockname()[1])
+    """Ends within a short time, whatever its clients do."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close connections, aborting those that do not close in time."""
         asyncio.get_running_loop().call_later(_SHUTDOWN_TIMEOUT, self._abort)
         await super().shutdown(sockets)
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Shut down at SIGINT and SIGTERM, with exit status 0."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, self._end)
-        yield
-
-    def _end(self) -> None:
-        self.should_exit = True
 
     def _abort(self) -> None:
         for connection in list(self.server_state.connections):
@@ -84,8 +65,16 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
     )
+    # Of texts of clients that are not UTF-8, each of which it logs.
+    logging.getLogger("uvicorn.error").addFilter(
+        lambda record: not (record.exc_info and record.exc_info[0] is UnicodeDecodeError)
+    )
+    server, loop = _Server(config), asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):  # else the exit status would be the signal's
+        loop.add_signal_handler(number, server.handle_exit, number, None)
     own = asyncio.create_task(gateway.run())
-    await _Server(config, announce=announce).serve(sockets=[listening])
+    announce(listening.getsockname()[1])
+    await server._serve(sockets=[listening])
     own.cancel()
     await asyncio.wait({own})
 
@@ -109,7 +98,7 @@ def check_certificate(settings: Settings) -> None:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Bind the socket to listen on; raises InputError."""
+    """Listen on a socket of its own; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     # With IPPROTO_TCP given asyncio sets TCP_NODELAY; without it a response's body waits 40 ms for
     # the acknowledgement of its head.
@@ -119,6 +108,7 @@ def listen(settings: Settings) -> socket.socket:
         # Inherited by accepted connections; the system's default limit is some megabytes.
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         listening.bind((settings.host, settings.port))
+        listening.listen()
     except OSError as error:
         listening.close()
         raise InputError(

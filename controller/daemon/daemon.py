@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import signal
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -69,7 +70,7 @@ class Daemon:
         self._supervisor = Supervisor(
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
-                lambda old, new: manager.status(headline(new.state.value, new.cause)),
+                lambda old, new: manager.notify(f"STATUS={headline(new.state.value, new.cause)}"),
                 self._dumps.state_changed,
                 self._follow_state,
             ),
@@ -184,7 +185,7 @@ class Daemon:
 
     async def reload(self) -> None:
         """Read the configuration again and apply its layout, if nothing else has changed."""
-        self._manager.reloading()
+        self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
             new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
             self._apply(new, changed, differs=differs)
@@ -221,7 +222,7 @@ class Daemon:
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
-        self._manager.stopping()
+        self._manager.notify("STOPPING=1")
         self._reloading.cancel()
         try:
             await self._supervisor.close(self._shutdown_cause)

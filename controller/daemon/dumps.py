@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from controller.daemon.states import DaemonState, Operation
 from drivers import clock
@@ -28,16 +28,6 @@ _DUMPED = (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT, DaemonState.COM
 _logger = logging.getLogger(__name__)
 
 
-class MessageRecord(NamedTuple):
-    """One message: time [s], amplifier or line, way, name of the message, and its content."""
-
-    time_s: float
-    link: str
-    way: str
-    message: str
-    content: object = ""
-
-
 class FaultDumps:
     """Keeps the last messages unformatted, and writes them in a thread: a disk may be slow or gone.
 
@@ -46,7 +36,7 @@ class FaultDumps:
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
-        self.records: deque[MessageRecord] = deque(maxlen=MAX_RECORDS)
+        self.records: deque[Mapping[str, object]] = deque(maxlen=MAX_RECORDS)
         self._written_at = float("-inf")
         self._writer: threading.Thread | None = None
 
@@ -69,10 +59,10 @@ class FaultDumps:
         message: str,
         content: object = "",
     ) -> None:
-        """Record a message; a stop depends on no record."""
+        """Record a message of an amplifier or line; a stop depends on no record."""
         try:
-            link = names.get(address, line)
-            self.records.append(MessageRecord(clock.now(), link, way, message, content))
+            where = {"time_s": clock.now(), "link": names.get(address, line)}
+            self.records.append({**where, "way": way, "message": message, "content": content})
         except Exception:
             _logger.exception("recorder failed")
 
@@ -98,7 +88,7 @@ class FaultDumps:
         self._writer.start()
 
 
-def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str) -> Path:
+def write_dump(folder: Path, records: Iterable[Mapping[str, object]], *, cause: str) -> Path:
     """Write records to a new file; keep the newest `MAX_DUMPS`; raises OSError.
 
     A file that cannot be written completely is deleted.
@@ -109,8 +99,9 @@ def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str) ->
     opened = open(path, "x", encoding="utf-8", opener=_owner_only)  # noqa: SIM115
     try:
         with opened as stream:
-            for line in ({"cause": cause, "unix_time_s": time.time()}, *map(_as_json, records)):
-                stream.write(json.dumps(line, default=_content) + "\n")
+            for line in ({"cause": cause, "unix_time_s": time.time()}, *records):
+                known = {key: value for key, value in line.items() if value != ""}
+                stream.write(json.dumps(known, default=_content) + "\n")
     except OSError:
         path.unlink(missing_ok=True)
         raise
@@ -124,10 +115,6 @@ def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str) ->
 def _owner_only(path: str, flags: int) -> int:
     """Open a file with mode 0600 from its creation on."""
     return os.open(path, flags, 0o600)
-
-
-def _as_json(record: MessageRecord) -> dict[str, object]:
-    return {key: value for key, value in record._asdict().items() if value != ""}
 
 
 def _content(arrival: Any) -> object:

@@ -131,7 +131,7 @@ def _check_log_file(config: DaemonConfig) -> None:
 
 def _run(config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: str | None) -> None:
     manager = ServiceManager()
-    manager.status("preparing the localization table")
+    manager.notify("STATUS=preparing the localization table")
     table = _table(config)
     sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -147,8 +147,6 @@ def _run(config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: s
     except Exception:
         _logger.exception("daemon: terminated")
         raise
-    finally:
-        manager.close()
 
 
 def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:

@@ -7,7 +7,6 @@ nothing is sent.
 import contextlib
 import os
 import socket
-import time
 from collections.abc import Mapping
 
 _MAX_TEXT = 400  # characters
@@ -18,38 +17,23 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
-        self._socket: socket.socket | None = None
-        if self._address:
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            self._socket.setblocking(False)
         self._watchdog_interval = _watchdog_interval(environment)
         self._last_alive = float("-inf")
 
     def notify(self, *assignments: str) -> None:
         """Send assignments such as STATUS=..., one a line; control characters are removed."""
-        if self._socket is None:
+        if not self._address:
             return
         lines = ("".join(c for c in text if c.isprintable())[:_MAX_TEXT] for text in assignments)
         # @ marks an address in the abstract namespace
         address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
-        with contextlib.suppress(OSError):
-            self._socket.sendto("\n".join(lines).encode(), address)
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+            own.setblocking(False)
+            own.sendto("\n".join(lines).encode(), address)
 
     def ready(self, status: str) -> None:
         """Report that the daemon serves requests."""
         self.notify("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
-
-    def status(self, text: str) -> None:
-        """Set the status line of `systemctl status`."""
-        self.notify(f"STATUS={text}")
-
-    def reloading(self) -> None:
-        """Report the start of a reload; `ready` ends it."""
-        self.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-
-    def stopping(self) -> None:
-        """Report that the daemon shuts down."""
-        self.notify("STOPPING=1")
 
     def alive(self, now: float) -> None:
         """Feed systemd's watchdog; called by the control loop after each cycle, at a time [s]."""
@@ -57,12 +41,6 @@ class ServiceManager:
         if interval is not None and now - self._last_alive >= interval:
             self._last_alive = now
             self.notify("WATCHDOG=1")
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
 
 def _watchdog_interval(environment: Mapping[str, str]) -> float | None:

@@ -122,7 +122,7 @@ async def test_daemon_notifies_systemd(tmp_path: Path) -> None:
             for text in ("READY=1", "WATCHDOG=1", "STATUS=ready: "):
                 await until(lambda text=text: has_heard(text))
             os.kill(os.getpid(), signal.SIGHUP)
-            await until(lambda: has_heard("RELOADING=1"))
+            await until(lambda: has_heard("RELOADING=1\nMONOTONIC_USEC="))
             os.kill(os.getpid(), signal.SIGTERM)
             await until(bench.running.done)
             assert has_heard("STOPPING=1")

@@ -1,6 +1,5 @@
 """The daemon's log, notices to systemd, dumps and latencies; none may block the daemon."""
 
-import contextlib
 import io
 import json
 import logging
@@ -8,7 +7,7 @@ import socket
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from controller.daemon.dumps import (
     DUMP_PATTERN,
     MAX_DUMPS,
     FaultDumps,
-    MessageRecord,
     write_dump,
 )
 from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
@@ -139,14 +137,6 @@ def manager_socket(tmp_path: Path) -> Iterator[socket.socket]:
         yield bound
 
 
-@contextlib.contextmanager
-def service_manager(at: socket.socket, **more: str) -> Iterator[ServiceManager]:
-    """A notifier in the environment of a service."""
-    manager = ServiceManager({"NOTIFY_SOCKET": at.getsockname(), **more})
-    yield manager
-    manager.close()
-
-
 @pytest.mark.parametrize(
     ("more", "count"),
     [
@@ -160,22 +150,18 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
     manager_socket: socket.socket,
     more: dict[str, str],
     count: int,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Not one of another process, nor without a valid interval; no assignment can be forged."""
-    with service_manager(manager_socket, **more) as manager:
-        manager.ready("all is well\nERRNO=5")
-        assert manager_socket.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
-        monkeypatch.setattr("time.monotonic_ns", lambda: 5_000_999)
-        manager.reloading()
-        assert manager_socket.recv(4096) == b"RELOADING=1\nMONOTONIC_USEC=5000"
-        for milliseconds in range(0, 3500, 50):
-            manager.alive(milliseconds / 1000)
-        manager.stopping()
-        messages = []
-        while (message := manager_socket.recv(100)) != b"STOPPING=1":
-            messages.append(message)
-        assert messages == [b"WATCHDOG=1"] * count
+    manager = ServiceManager({"NOTIFY_SOCKET": manager_socket.getsockname(), **more})
+    manager.ready("all is well\nERRNO=5")
+    assert manager_socket.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
+    for milliseconds in range(0, 3500, 50):
+        manager.alive(milliseconds / 1000)
+    manager.notify("STOPPING=1")
+    messages = []
+    while (message := manager_socket.recv(100)) != b"STOPPING=1":
+        messages.append(message)
+    assert messages == [b"WATCHDOG=1"] * count
 
 
 def test_service_manager_may_be_missing() -> None:
@@ -183,16 +169,20 @@ def test_service_manager_may_be_missing() -> None:
     for manager in (ServiceManager({}), ServiceManager({"NOTIFY_SOCKET": "/nowhere/at/all"})):
         manager.ready("well")
         manager.alive(0.0)
-        manager.close()
+
+
+def message(time_s: float, way: str, name: str) -> dict[str, object]:
+    """A message of amplifier main without its content."""
+    return {"time_s": time_s, "link": "main", "way": way, "message": name}
 
 
 def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     """The cause first, then each message with its content by name; only the newest files stay."""
     folder = tmp_path / "new" / "folder"
     records = [
-        MessageRecord(1.5, "main", "out", "Arm", {"watchdog": 250, "session": 9}),
-        MessageRecord(1.6, "main", "in", "Reply", Reply({"state": 6, "levels": [5000, 0]})),
-        MessageRecord(1.7, "main", "none", "no reply"),
+        {**message(1.5, "out", "Arm"), "content": {"watchdog": 250, "session": 9}},
+        {**message(1.6, "in", "Reply"), "content": Reply({"state": 6, "levels": [5000, 0]})},
+        {**message(1.7, "none", "no reply"), "content": ""},
     ]
     for _ in range(MAX_DUMPS + 2):
         path = write_dump(folder, records, cause="arc\nx")
@@ -223,8 +213,8 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
 async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
     """The wire gets the Stop, and the caller its outcome."""
 
-    class Full(deque[MessageRecord]):
-        def append(self, record: MessageRecord) -> None:
+    class Full(deque[Mapping[str, object]]):
+        def append(self, record: Mapping[str, object]) -> None:
             raise MemoryError
 
     recorder = FaultDumps(tmp_path)

@@ -111,19 +111,15 @@ class Transition:
         return steepest(pairwise(points[passed:]), self.step, is_cosine=not self.knots)[1]
 
 
-def along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
-    """Return a transition along an envelope, from a time [s] on."""
+def along(
+    envelope: Envelope | None, time: float, ramp: float, first: complex, last: complex
+) -> Transition:
+    """Return a transition from a time [s] on: along an envelope, or a ramp [s] without one."""
+    if envelope is None:
+        return Transition(time, ramp, first, last, time + ramp)
     step = envelope.step / _PER_STEP
     end = time + step * (len(envelope.knots) + 1)
     return Transition(time, step, first, last, end, amplitudes_of(envelope))
-
-
-def towards(command: Command, time: float, ramp: float, first: complex) -> Transition:
-    """Return the transition to what a command plays: along its onset, or a ramp [s] without one."""
-    last = amplitude_of(command.level, command.phase)
-    if command.onset is None:
-        return Transition(time, ramp, first, last, time + ramp)
-    return along(command.onset, time, first, last)
 
 
 def steepest(
@@ -191,7 +187,7 @@ class Voice:
         if self.ending is None or self.has_ended:
             return self.faded(time, ramp, uncertainty)
         first = self.transition.reached(time, uncertainty)
-        return replace(self, transition=along(self.ending, time, first, 0j), has_ended=True)
+        return replace(self, transition=along(self.ending, time, ramp, first, 0j), has_ended=True)
 
     def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
         """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
@@ -228,6 +224,7 @@ def voices_after(
     is_driven = command is not None and (command.level > 0 or command.onset is not None)
     is_fading = is_driven or (command is not None and command.skip_ending)
     is_new = is_driven
+    last = 0j if command is None else amplitude_of(command.level, command.phase)
     after: list[Voice] = []
     for voice in voices:
         if voice.layer != layer or voice.has_ended:
@@ -235,18 +232,14 @@ def voices_after(
         elif command is not None and command.keep_phase and voice.is_continued_by(command):
             is_new = False
             first = voice.transition.reached(time, uncertainty)
-            transition = towards(command, time, ramp, first)
+            transition = along(command.onset, time, ramp, first, last)
             after.append(replace(voice, transition=transition, ending=command.ending))
         elif is_fading:
             after.append(voice.faded(time, ramp, uncertainty))
         else:
             after.append(voice.ended(time, ramp, uncertainty))
     if is_new and command is not None:
-        if command.onset is None:  # nearly always
-            last = amplitude_of(command.level, command.phase)
-            transition = Transition(time, ramp, 0j, last, time + ramp)
-        else:
-            transition = towards(command, time, ramp, 0j)
+        transition = along(command.onset, time, ramp, 0j, last)
         frequency = command.frequency / _PER_HERTZ
         after.append(Voice(layer, frequency, time, transition, False, command.ending))
     return after

@@ -115,7 +115,9 @@ class Bounds:
             of_voice.append(self._steepest(course))
             for one in course.sets:
                 if one.after or not course.is_new:  # it may fade along that ramp, at another time
-                    of_voice.append(_steepest_of(course.starts, _ramp(one.ramp / _PER_RAMP)))
+                    of_voice.append(
+                        _steepest_of(course.starts, along(None, 0.0, one.ramp / _PER_RAMP, 0j, 0j))
+                    )
         steepest_rise = 0.0
         for several in rises.values():
             is_alone = len(several) == 1
@@ -134,9 +136,10 @@ class Bounds:
             ways = [(change if way.last or way.knots else 0.0, change)]
         if not voice.has_ended:
             if voice.ending is not None:
-                ways.append(_steepest_of(starts, along(voice.ending, 0.0, 0j, 0j)))
+                ways.append(_steepest_of(starts, along(voice.ending, 0.0, 0.0, 0j, 0j)))
             elif not course.is_new and self._playback.end_of(voice.layer) < math.inf:
-                ways.append(_steepest_of(starts, _ramp(self._playback.ramp_of(voice.layer))))
+                ramp = self._playback.ramp_of(voice.layer)
+                ways.append(_steepest_of(starts, along(None, 0.0, ramp, 0j, 0j)))
         rises, changes = zip(*ways, strict=True)
         return max(rises), max(changes)
 
@@ -160,11 +163,6 @@ def _of_several_ways(ways: Sequence[Transition], times: Sequence[float]) -> list
         return []
     since = enumerate(times[:-1])
     return [at for at, time in since if len({kind for end, kind in kinds if time < end}) > 1]
-
-
-def _ramp(ramp: float) -> Transition:
-    """Return a fade along a ramp [s]."""
-    return Transition(0.0, ramp, 0j, 0j, ramp)
 
 
 def _steepest_of(starts: Sequence[complex], way: Transition) -> tuple[float, float]:

@@ -111,12 +111,18 @@ class Ledger:
             before = self._budget.sent(now, lasts=lasts)
         self.doubt = Doubt(token, layers, now, before)
 
-    def confirmed(self, now: float) -> None:
-        """Note at a time [s] that the set in doubt plays, since it was sent at the earliest."""
+    def resolve(self, token: int, now: float) -> None:
+        """Resolve the doubt at a time [s] by the token that the amplifier says it committed last.
+
+        That set plays, since it was sent at the earliest; another one was not played.
+        """
         if self.doubt is None:
             return
-        token, layers, sent_at, _ = self.doubt
+        sent, layers, sent_at, before = self.doubt
         self.doubt = None
+        if token != sent:
+            self._budget.restore(before)
+            return
         playback = self.playback
         if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
@@ -129,12 +135,6 @@ class Ledger:
         playback.commit(layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
-
-    def refused(self) -> None:
-        """Note that the set in doubt was not played."""
-        if self.doubt is not None:
-            self._budget.restore(self.doubt.before)
-            self.doubt = None
 
     def correct(self, sent: LayerSet, achieved: LayerSet, token: int) -> None:
         """Go on with a layer of the set with this token as the amplifier says it plays it.
@@ -154,13 +154,6 @@ class Ledger:
         self.playback.silence(sent_at, ramp)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
-
-    def resolve(self, token: int, now: float) -> None:
-        """Resolve the doubt by the token that the amplifier says it committed last."""
-        if self.doubt is not None and token == self.doubt.token:
-            self.confirmed(now)
-        else:
-            self.refused()
 
     def problem_of(self, status: Values, sent_at: float, now: float) -> str | None:
         """Describe what the status of an armed one contradicts; None if it agrees.

@@ -29,7 +29,7 @@ def tone(channel: int = 0, level: float = 0.5, frequency: float = 100.0, **other
 def play(ledger: Ledger, token: int, at: float, *layers: Layer) -> None:
     """Admit, send and confirm a set without delay."""
     ledger.sent(token, ledger.admit(layers, at), at)
-    ledger.confirmed(at)
+    ledger.resolve(token, at)
 
 
 def refusal(ledger: Ledger, *layers: Layer, at: float = 1.0) -> CommandRefused:
@@ -314,7 +314,7 @@ def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> N
             ledger.silenced(0.06, at, at + 0.01)
         else:
             ledger.sent(token, ledger.admit([layer], at), at)
-            ledger.confirmed(at + 0.01)
+            ledger.resolve(token, at + 0.01)
     loud = Layer(2, (HIGH(level=0.9),))
     refusal(ledger, loud, at=at + 0.025)
     assert ledger.admit([loud], at + 1.0)
@@ -437,5 +437,5 @@ def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: in
             rises = [(new - old) / step for new, old in zip(levels, before, strict=True)]
             assert max(rises) <= limits.slew * (1 + 1e-6)
             before = levels
-        ledger.confirmed(min(commit + 0.001, until))
+        ledger.resolve(token, min(commit + 0.001, until))
     assert admitted > 20

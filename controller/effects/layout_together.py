@@ -16,7 +16,7 @@ from controller.effects.simulated_touch import Position, TouchSimulator
 from controller.loop.choice import Requested
 from controller.loop.content import Selection
 from controller.loop.intent import Target
-from controller.loop.joint_answer import fingers_of, requests_of
+from controller.loop.table_query import fingers_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of

@@ -1,7 +1,8 @@
 """What is chosen for fingers: one answer for all contents that last, and one for each short pulse.
 
 A pulse is chosen beside what lasts: with the stroke and the power that this leaves, all other
-fingers quiet. It is over before an answer for all would help, and never changed.
+fingers quiet. It is over before an answer for all would help, and never changed. What lasts and
+does not fit beside a pulse that plays has what that leaves, until it has ended.
 """
 
 import contextlib
@@ -10,19 +11,18 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.capabilities import PlaybackCapabilities, amplitudes_of
 from controller.loop.content import Content, Prediction, Selection, Targets, not_served
 from controller.loop.intent import Target
 from controller.loop.joint_answer import (
     LIMITS_LEAVE_NOTHING,
     Shape,
-    amplitudes_of,
-    factor_within,
     query_jointly,
     unshaped,
 )
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
+from model.choice import NEARLY
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.table.effect_level import EffectLevels
@@ -64,11 +64,15 @@ class Requested:
 
 @dataclass(frozen=True)
 class Chosen:
-    """What was asked, and what was chosen: for what lasts, and for each finger with a pulse."""
+    """What was asked, and what was chosen: for what lasts, and for each finger with a pulse.
+
+    is_limited: whether what lasts has only what pulses leave that play beside it.
+    """
 
     requested: Requested
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
+    is_limited: bool
 
 
 @dataclass(frozen=True)
@@ -81,35 +85,59 @@ class Chooser:
 
     def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
         """Choose what is asked for, what lasts first."""
-        kept, lasting = [*requested.kept], None
+        kept, lasting, is_limited = [*requested.kept], None, False
         if requested.lasting is not None:
-            beside = None if requested.takes_long else ()
-            lasting = self._chosen(requested, requested.lasting, capabilities, beside)
+            lasting, is_limited = self._lasting(requested, requested.lasting, capabilities)
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
         for each in requested.short:
-            found = self._chosen(requested, (each,), capabilities, kept)
+            left = self._left_by(_contents(kept), capabilities)
+            found = self._chosen(requested, (each,), left, kept)
             kept.append(found)
             short[each[0].key] = found
-        return Chosen(requested, lasting, short)
+        return Chosen(requested, lasting, short, is_limited)
+
+    def _lasting(
+        self, requested: Requested, targets: Targets, capabilities: PlaybackCapabilities
+    ) -> tuple[Selection, bool]:
+        """Choose what lasts, and whether it is limited by pulses that play.
+
+        Beside these what it replaces fades, too.
+        """
+        free, pulses = self._chosen(requested, targets, capabilities), _contents(requested.kept)
+        if not pulses:
+            return free, False
+        fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
+        left = self._left_by([*pulses, *fading], capabilities)
+        total = amplitudes_of([each.pattern.excitation for each in free.contents])
+        if left.factor_within(total, self.table.strokes) >= 1 - NEARLY:
+            return free, False
+        return self._chosen(requested, targets, left), True
+
+    def _left_by(
+        self, contents: Sequence[Content], capabilities: PlaybackCapabilities
+    ) -> PlaybackCapabilities:
+        """Return what contents leave of the amplifiers' limits."""
+        if not contents:
+            return capabilities
+        taken = amplitudes_of([each.pattern.excitation for each in contents])
+        return capabilities.left_by(taken, self.table.strokes)
 
     def _chosen(
         self,
         requested: Requested,
         targets: Targets,
         capabilities: PlaybackCapabilities,
-        beside: Sequence[Selection] | None,
+        beside: Sequence[Selection] | None = None,
     ) -> Selection:
-        """Choose for a target beside others, or several; any failure is their reason for silence.
+        """Choose for targets within what is left; any failure is their reason for silence.
 
-        beside: None for several together.
+        beside: what a pulse is felt beside; None for what lasts.
         """
         keys = {contact.key for contact, _ in targets}
         quiet = tuple([each for each in requested.contacts if each.key not in keys])
         try:
-            if beside is not None:
-                found = self._alone(requested, targets, quiet, capabilities, beside)
-            else:
+            if requested.takes_long and beside is None:
                 found = query_jointly(
                     self.table,
                     targets,
@@ -120,6 +148,8 @@ class Chooser:
                     protected=requested.protected,
                     is_moving=requested.is_moving,
                 )
+            else:
+                found = self._alone(requested, targets, quiet, capabilities, beside or ())
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -139,28 +169,24 @@ class Chooser:
     ) -> Selection:
         """Choose for the only target beside others; raises InputError."""
         ((contact, target),) = targets
-        strokes, left, heard = self.table.strokes, capabilities, list[float]()
-        contents = list[Content]()
-        for part in beside:
-            contents += part.contents
-            if contact.key in part.quiet_levels:
-                heard.append(part.quiet_levels[contact.key])
-        if contents:
-            left = _left_by(contents, capabilities, strokes)
-        before = requested.before.get((contact.key, 0))
-        answer = self._query(contact, target, quiet, left, before)
+        key = contact.key
+        heard = [each.quiet_levels[key] for each in beside if key in each.quiet_levels]
+        before = requested.before.get((key, 0))
+        answer = self._query(contact, target, quiet, capabilities, before)
         pattern = answer.pattern
         total = amplitudes_of([pattern.excitation])
-        change = float(decibels(factor_within(total, left, strokes)))
+        change = float(decibels(capabilities.factor_within(total, self.table.strokes)))
         felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db
         leak = -math.inf if promised is None else felt - promised
-        if requested.protected - {contact.key} and leak > IMPERCEPTIBLE_DB_SL:
+        if requested.protected - {key} and leak > IMPERCEPTIBLE_DB_SL:
             reason = f"a protected finger would notice it, up to {leak:.1f} dB SL; {_QUIETER}"
             return _silent(targets, quiet, reason)
-        is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
-        if felt < 0 and (change < 0 or (contents and not is_heard)):
-            used_up = "the contents of other fingers use the whole stroke; lift a finger"
-            return _silent(targets, quiet, used_up if contents else LIMITS_LEAVE_NOTHING)
+        if felt < 0:
+            is_beside = bool(_contents(beside))
+            is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
+            if change < 0 or (is_beside and not is_heard):
+                used_up = "the contents of other fingers use the whole stroke; lift a finger"
+                return _silent(targets, quiet, used_up if is_beside else LIMITS_LEAVE_NOTHING)
         others = sum_db(heard) if heard else None
         if others is not None:
             promised = min(math.inf if promised is None else promised, felt - others)
@@ -222,25 +248,11 @@ def _is_step(new: Target, old: Target) -> bool:
     return is_step and new.level_db_sl is not None and not (new.pulse and new.pulse.is_raised)
 
 
+def _contents(parts: Iterable[Selection]) -> list[Content]:
+    return [content for part in parts for content in part.contents]
+
+
 def _silent(targets: Targets, quiet: tuple[Contact, ...], reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
     skipped = tuple(not_served(contact, reason) for contact, _ in targets)
     return Selection(targets, quiet, (), reason, skipped)
-
-
-def _left_by(
-    contents: Sequence[Content],
-    capabilities: PlaybackCapabilities,
-    strokes: Mapping[str, float],
-) -> PlaybackCapabilities:
-    """Return what contents leave of the amplitudes and the power, their peaks together."""
-    taken = amplitudes_of([each.pattern.excitation for each in contents])
-    levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
-    return replace(
-        capabilities,
-        max_amplitudes={
-            name: max(highest - taken[name], 1e-12)
-            for name, highest in capabilities.max_amplitudes.items()
-        },
-        max_power=max(math.sqrt(capabilities.max_power) - math.hypot(*levels), 1e-9) ** 2,
-    )

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from controller.loop.intent import Target
+from controller.loop.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
@@ -99,6 +99,16 @@ class Selection:
         for contact, _ in self.targets:
             found[contact.key] = contact
         return found
+
+    @cached_property
+    def target_keys(self) -> frozenset[ContactKey]:
+        """Contacts of the targets."""
+        return frozenset([contact.key for contact, _ in self.targets])
+
+    @property
+    def pulses(self) -> list[Pulse]:
+        """Those of the targets that have an end of their own."""
+        return [target.pulse for _, target in self.targets if target.pulse is not None]
 
     @cached_property
     def is_whole(self) -> bool:

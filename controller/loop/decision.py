@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.choice import Chooser
 from controller.loop.content import Content, Selection, no_layer_free, not_served
-from controller.loop.intent import IntentSource
+from controller.loop.intent import FADED_AFTER, IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.playing import PlayedContent, Playing, all_left
 from controller.loop.selection import Selector
@@ -32,9 +32,6 @@ ENDED = "the vibration has ended by itself: it was not renewed, or a limit of ti
 
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
-
-# s; after the end of a pulse, or of a layer, none of it is left on any amplifier.
-_FADED_AFTER = 0.05
 
 _logger = logging.getLogger(__name__)
 
@@ -329,22 +326,21 @@ class Decider:
         """Return a draft with the sets of all layers that change; None if none does."""
         playing, before = self.playing, self.playing.contents
         numbers = playing.numbered(draft.selection.contents)
-        contents = {n: one for n, one in before.items() if one.content == numbers.get(n)}
-        restarting = playing.restarting(numbers, contents)
-        contents = {n: one for n, one in contents.items() if one.content.key[0] not in restarting}
-        changed = {n: content for n, content in numbers.items() if n not in contents}
+        starting, restarting = playing.starting(numbers)
+        contents = {n: one for n, one in before.items() if n in numbers and n not in starting}
         sets: dict[int, PlateSet] = {}
-        for number, content in changed.items():
+        for number in starting:
+            content = numbers[number]
             sets[number], pattern = self._builder.build_pattern(
                 number,
                 content.pattern,
                 content.question,
-                playing=before[number].continued if number in before else {},
+                playing=playing.drive_of(number),
                 valid_for=playing.lasts(content, now),
-                restarts=content.key[0] in restarting,
+                restarts=number in restarting,
                 is_shaped=not content.targets[0][1].is_short,
                 lasts=min(all_left(content.targets, now), default=math.inf),
-                among=len(changed),
+                among=len(starting),
             )
             contents[number] = PlayedContent(content, sets[number], pattern)
         started = frozenset(sets)
@@ -393,7 +389,7 @@ def _ended_by(decision: Decision, now: float) -> float:
     ends = [each.end for each in started if each.end > now]
     if decision.sets.keys() - decision.started:
         ends.append(now)
-    return max(ends, default=math.inf) + _FADED_AFTER
+    return max(ends, default=math.inf) + FADED_AFTER
 
 
 def _why_not(decision: Decision | None) -> dict[ContactKey, str | None]:

@@ -21,6 +21,9 @@ _MIN_WAIT = 0.001  # s
 # A pulse that has not started this long [s] after it was due has lost its touch.
 _MAX_DELAY = 0.1
 
+FADED_AFTER = 0.05
+"""After the end of a pulse, or of a layer, by so long [s] none of it is left on any amplifier."""
+
 NO_CONTACTS = "no contact on the plate"
 
 

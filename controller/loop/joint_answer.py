@@ -7,25 +7,24 @@ latter counts: another frequency begins with an onset, for which the next place 
 
 import cmath
 import math
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
-from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.capabilities import PlaybackCapabilities, amplitudes_of
 from controller.loop.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
 from controller.loop.intent import Target
-from controller.loop.table_query import playable_band, question_of
+from controller.loop.table_query import fingers_of, question_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import Complex64Array
 from model.choice import NEARLY
-from model.finger.perception import FELT_DB_SL, decibels
+from model.finger.perception import decibels
 from model.table import request
 from model.table.answer import answer
 from model.table.modulation import with_gains
-from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
+from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.promised import share_stroke
 from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
@@ -35,10 +34,10 @@ from model.vibration.excitation import Excitation, base_amplitudes
 KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
 
-LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
-
 _SIDE_BANDS = 2
 _SILENT_DB = -60.0  # a gain by which a content is not felt
+
+LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
 
 Shape = Callable[[Question, Pattern, bool], Pattern]
 """Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
@@ -78,16 +77,14 @@ def query_jointly(
 
     def within(found: Answer) -> float:
         tones = [each for layer in found.layers for each in _tones_of(layer)]
-        return factor_within(amplitudes_of(tones), capabilities, strokes)
+        return capabilities.factor_within(amplitudes_of(tones), strokes)
 
     free, factor = found, within(found)
     if factor < 1 - NEARLY:
-        gains_db = _gains_db(requests, found, capabilities, strokes)
-        lowered = with_gains(table, found, gains_db)
+        gains = _gains_db(requests, found, capabilities, strokes)
+        lowered = with_gains(table, found, gains)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
-            softer = [
-                _at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)
-            ]
+            softer = [_at_gain(*each) for each in zip(requests, found.layers, gains, strict=True)]
             lowered = answer(table, softer, fingers, playable=playable)
         found = lowered
         factor = within(found)
@@ -166,40 +163,6 @@ def _as_layers_allow(requests: Sequence[Request], layers: int) -> list[Request]:
     return found
 
 
-def requests_of(
-    table: LocalizationTable,
-    targets: Sequence[tuple[Contact, Target]],
-    playable: tuple[float, float],
-    protected: frozenset[ContactKey],
-) -> list[Request]:
-    """Return one request per finger; playable: the lowest and highest frequency [Hz]."""
-    return [
-        Request(
-            (contact.x, contact.y),
-            playable_band(target.band, table.frequencies, playable),
-            FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
-            target.priority,
-            may_share=target.may_share,
-            load=contact.load,
-            content=None if target.is_own else target.content,
-            min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
-            max_foreign_db_sl=_bound(contact, protected),
-            modulation_hz=target.modulation_hz,
-        )
-        for contact, target in targets
-    ]
-
-
-def fingers_of(quiet: Sequence[Contact], protected: frozenset[ContactKey]) -> list[Finger]:
-    """Return the fingers that are to feel nothing, with what they may feel of others' contents."""
-    return [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
-
-
-def _bound(contact: Contact, protected: frozenset[ContactKey]) -> float:
-    """The level [dB SL] of others' contents that a finger may feel."""
-    return IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
-
-
 def _kept(
     requests: Sequence[Request],
     targets: Sequence[tuple[Contact, Target]],
@@ -245,26 +208,6 @@ def _served(found: Answer) -> int:
 
 def _worst(found: Answer) -> float:
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
-
-
-def amplitudes_of(excitations: Iterable[Excitation]) -> dict[str, float]:
-    """The amplitudes [m] of excitations together, by ERA."""
-    total = defaultdict[str, float](float)
-    for tones in excitations:
-        for name, tone in tones.items():
-            total[name] += tone.amplitude
-    return total
-
-
-def factor_within(
-    total: Mapping[str, float], capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
-) -> float:
-    """The factor, 1 at most, by which amplitudes [m] are within the amplifiers' limits."""
-    share, power = 1.0, 0.0
-    for name, amplitude in total.items():
-        share = max(share, amplitude / capabilities.max_amplitudes[name])
-        power += (amplitude / strokes[name]) ** 2
-    return 1.0 / max(share, math.sqrt(power / capabilities.max_power))
 
 
 def _tones_of(layer: Layer) -> tuple[Excitation, ...]:

@@ -203,22 +203,28 @@ class Playing:
         free = [number for number in dict.fromkeys(every) if number not in numbers]
         return {**numbers, **dict(zip(free, new, strict=False))}
 
-    def restarting(
-        self, numbers: Mapping[int, Content], unchanged: Container[int]
-    ) -> set[ContactKey]:
-        """Return the fingers of several voices of which one starts, by the contents of layers.
+    def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:
+        """Return the layers that start by the contents of all, and which of these restart.
 
-        A carrier and its side bands must count their phases from one moment.
+        A carrier and its side bands must count their phases from one moment: where one starts, all
+        of the content restart.
         """
-        voiced = {content.key[0] for content in numbers.values() if content.voice}
-        found = set()
-        for number, content in numbers.items() if voiced else ():
-            before = self.contents.get(number)
-            drive = {} if before is None else before.continued
-            is_continued = not restarted_by(content.pattern.excitation, drive)
-            if content.key[0] in voiced and number not in unchanged and not is_continued:
-                found.add(content.key[0])
-        return found
+        restarting = set[int]()
+        changed = [
+            number
+            for number, content in numbers.items()
+            if number not in self.contents or self.contents[number].content != content
+        ]
+        for number in changed:
+            content = numbers[number]
+            voices = [n for n, one in numbers.items() if one.targets == content.targets]
+            if len(voices) > 1 and restarted_by(content.pattern.excitation, self.drive_of(number)):
+                restarting.update(voices)
+        return [n for n in numbers if n in changed or n in restarting], restarting
+
+    def drive_of(self, number: int) -> Drive:
+        """Return what plays in a layer, at the frequencies that were asked for."""
+        return self.contents[number].continued if number in self.contents else {}
 
 
 def all_left(targets: Targets, now: float) -> list[float]:

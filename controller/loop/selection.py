@@ -4,14 +4,15 @@ One question is answered at a time, with the fingers as they are when the one be
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 
 from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db
 from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
-from controller.loop.intent import HapticIntent, Target
+from controller.loop.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
 
@@ -36,7 +37,7 @@ class _Intended:
 
     def is_met_by(self, chosen: Selection) -> bool:
         """Whether what was chosen also serves what lasts among these contacts."""
-        if not (chosen.targets and self._is_part_of(chosen, lambda target: target)):
+        if not (chosen.targets and self._is_part_of(chosen, _targets_of)):
             return False
         is_whole, then = chosen.is_whole, chosen.contacts
         now = {each.key: each for each in self.contacts}
@@ -50,26 +51,31 @@ class _Intended:
 
     def is_moved_from(self, chosen: Selection) -> bool:
         """Whether those that feel what was chosen are to feel it still, in other places."""
-        return self.is_among(chosen) and self._is_part_of(
-            chosen, lambda target: replace(target, level_db_sl=None)
-        )
+        return self.is_among(chosen) and self._is_part_of(chosen, _of_any_level)
 
     def is_among(self, chosen: Selection) -> bool:
         """Whether all contacts were there when it was chosen, and have not lifted since."""
         then = {(each.key, each.since) for each in chosen.contacts.values()}
         return all((each.key, each.since) in then for each in self.contacts)
 
-    def _is_part_of(self, chosen: Selection, of_target: Callable[[Target], Target]) -> bool:
+    def _is_part_of(self, chosen: Selection, kinds: Callable[[Targets], set[Target]]) -> bool:
         """Whether what lasts was chosen, and no more that would leave others more if it ended.
 
         The content of a finger that feels a short pulse meanwhile has not ended.
         """
-        intended = {of_target(target) for _, target in self.lasting}
-        had = {of_target(target) for _, target in chosen.targets}
+        intended, had = kinds(self.lasting), kinds(chosen.targets)
         if not intended <= had:
             return False
         pulsing = {contact.key for contact, _ in self.short}
         return chosen.is_whole or all(target.key in pulsing for target in had - intended)
+
+
+def _targets_of(targets: Targets) -> set[Target]:
+    return {target for _, target in targets}
+
+
+def _of_any_level(targets: Targets) -> set[Target]:
+    return {replace(target, level_db_sl=None) for _, target in targets}
 
 
 class Selector:
@@ -93,13 +99,12 @@ class Selector:
         self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
-        self._fingers: set[tuple[ContactKey, float]] = set()  # of what lasts, down since [s]
-        self._current = _NOTHING
+        self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
         self._waits_since = math.inf  # s; when the first change came that waits for the thread
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer the last selection has."""
         self.due = math.inf
-        """When [s] to select anew though no contact changes, since a finger that moved rests."""
+        """When [s] to select anew though no contact changes: a finger rests, a pulse has ended."""
 
     @property
     def is_choosing(self) -> bool:
@@ -114,7 +119,7 @@ class Selector:
         *,
         triggered_at: float = math.inf,
     ) -> Selection:
-        """Return the selection for contacts in their order of arrival; the same object if kept.
+        """Return the selection for contacts in their order of arrival; equal if it is kept.
 
         While the thread computes, what played and is still to be felt stays. triggered_at [s]: when
         their change arrived.
@@ -128,12 +133,11 @@ class Selector:
         for each in served:
             (short if each[1].is_short else lasting).append(each)
         intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
-        fingers = {(contact.key, contact.since) for contact, _ in lasting}
-        came = {key for key, _ in fingers - self._fingers}
-        self._fingers = fingers
-        if came and not intended.is_met_by(self._lasting):  # who has come back may be elsewhere
-            others = tuple([each for each in self._lasting.targets if each[0].key not in came])
-            self._lasting = _felt(self._lasting, others)
+        fingers = {contact.key: contact.since for contact, _ in lasting}
+        came, self._fingers = fingers.items() - self._fingers.items(), fingers
+        if came and self._lasting.targets and not intended.is_met_by(self._lasting):
+            # Who has come back may be elsewhere.
+            self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
         self.triggered_at = math.inf
         arrived = self._thread.take()
         if arrived is not None:
@@ -149,18 +153,20 @@ class Selector:
         if self._thread.is_busy:
             self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
         else:
+            chooser = self.chooser
             for requested in self._to_request(
                 intended, pulses, triggered_at, has_waited=arrived is not None
             ):
-                self._request(requested, capabilities)
+                if requested.takes_long:
+                    self._thread.compute(partial(chooser.choose, requested, capabilities))
+                else:
+                    self._take(chooser.choose(requested, capabilities))
             self._waits_since = math.inf
-        parts = [_felt(self._lasting, intended.lasting), *self._short.values()]
+        parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
             found = replace(found, is_pending=True)
-        if found != self._current:
-            self._current = found
-        return self._current
+        return found
 
     def _to_request(
         self,
@@ -169,8 +175,8 @@ class Selector:
         triggered_at: float,
         *,
         has_waited: bool,
-    ) -> list[Requested]:
-        """Return what is to be asked now; pulses: of all fingers, until now.
+    ) -> Iterator[Requested]:
+        """Yield what is to be asked now, one after the other; pulses: of all fingers, until now.
 
         A pulse that has waited for the thread goes before what lasts, for which it would be late.
         """
@@ -182,45 +188,40 @@ class Selector:
             self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
         new = tuple([each for each in intended.short if each[0].key not in self._short])
         if is_kept and not is_rested and not new:
-            return []
-        felt = _felt(self._lasting, lasting)
+            return
+        felt = _felt(self._lasting, self._fingers.keys())
         before = {one.key: one for one in felt.contents}
         for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
-        playing = [part for part in self._short.values() if _plays(part, triggered_at)]
+        playing = _playing(self._short, triggered_at)
         requested = Requested(
             new, intended.contacts, intended.protected, before, (felt, *playing), self._waits_since
         )
-        if is_kept and not is_rested:
-            return [requested]
+        if has_waited or is_kept:
+            if new:
+                yield requested
+                new, playing = (), _playing(self._short, triggered_at)
+            if is_kept and not is_rested:
+                return
         takes_long = not is_alone(lasting, intended.protected)
         is_moving = takes_long and not is_rested and intended.is_moved_from(self._lasting)
         self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
-        first = [requested] if has_waited and new else []
-        last = replace(
+        yield replace(
             requested,
-            short=() if first else new,
-            kept=tuple(playing),
+            short=new,
+            kept=playing,
             lasting=lasting,
             takes_long=takes_long,
             is_moving=is_moving,
             is_rested=is_rested,
         )
-        return [*first, last]
-
-    def _request(self, requested: Requested, capabilities: PlaybackCapabilities) -> None:
-        """Choose at once what does not take long, else in the thread."""
-        chooser = self.chooser
-        if requested.takes_long:
-            self._thread.compute(lambda: chooser.choose(requested, capabilities))
-        else:
-            self._take(chooser.choose(requested, capabilities))
 
     def _is_intended(self, chosen: Chosen, intended: _Intended) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
 
-        Levels and places may have changed since: else a finger that moves would get nothing. What
-        plays may do again, since a finger that came has lifted meanwhile.
+        Levels and places may have changed since: else a finger that moves would get nothing; an
+        effect in its old form would be felt for one answer. What plays may do again, since a finger
+        that came has lifted meanwhile.
         """
         found = chosen.lasting
         return (
@@ -228,8 +229,7 @@ class Selector:
             and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
             and intended.is_among(found)
             and intended.protected <= found.protected
-            and {each.key for each, _ in intended.lasting}
-            <= {each.key for each, _ in found.targets}
+            and _of_any_level(intended.lasting) <= _of_any_level(found.targets)
         )
 
     def _take(self, chosen: Chosen, *, is_late: bool = False) -> None:
@@ -237,6 +237,9 @@ class Selector:
         self._short = {**self._short, **chosen.short}
         if chosen.lasting is not None and not is_late:
             self._lasting = chosen.lasting
+            if chosen.is_limited:
+                ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
+                self.due = max(ends) + FADED_AFTER
         if chosen.short or not is_late:
             self.triggered_at = chosen.requested.triggered_at
 
@@ -270,15 +273,14 @@ def _together(
     )
 
 
-def _plays(pulse: Selection, now: float) -> bool:
-    """Whether a short pulse has not ended at a time [s]."""
-    return any(target.pulse is not None and now < target.pulse.end for _, target in pulse.targets)
+def _playing(short: Mapping[ContactKey, Selection], now: float) -> tuple[Selection, ...]:
+    """Return the short pulses that have not ended at a time [s]."""
+    return tuple([part for part in short.values() if any(now < each.end for each in part.pulses)])
 
 
-def _felt(chosen: Selection, lasting: Targets) -> Selection:
-    """Return what was chosen, without the contents of fingers that are to feel it no more."""
-    keys = {contact.key for contact, _ in lasting}
-    if keys >= chosen.contacts.keys() - {each.key for each in chosen.quiet}:
+def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
+    """Return what was chosen, without the contents of all fingers but some, by key."""
+    if keys >= chosen.target_keys:
         return chosen
     return replace(
         chosen,

@@ -8,7 +8,7 @@ from typing import Any
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.intent import Target, band_of_table
-from controller.sources.contacts import Contact
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError
@@ -18,6 +18,7 @@ from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.pattern_query import UnreachableLevel
 from model.table.pulse_gains import OverEffect
 from model.table.question import MAX_LEVEL_DB_SL, Question
+from model.table.request import OWN_CONTRAST_DB, Finger, Request
 from model.table.table import LocalizationTable
 
 MAX_DB_SL = 26.0
@@ -107,6 +108,40 @@ def question_of(contact: Contact, quiet: Sequence[Contact], **others: Any) -> Qu
         loads=() if loads.count(1) == len(loads) else tuple(loads),
         **others,
     )
+
+
+def requests_of(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    playable: tuple[float, float],
+    protected: frozenset[ContactKey],
+) -> list[Request]:
+    """Return one request per finger; playable: the lowest and highest frequency [Hz]."""
+    return [
+        Request(
+            (contact.x, contact.y),
+            playable_band(target.band, table.frequencies, playable),
+            FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
+            target.priority,
+            may_share=target.may_share,
+            load=contact.load,
+            content=None if target.is_own else target.content,
+            min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+            max_foreign_db_sl=_bound(contact, protected),
+            modulation_hz=target.modulation_hz,
+        )
+        for contact, target in targets
+    ]
+
+
+def fingers_of(quiet: Sequence[Contact], protected: frozenset[ContactKey]) -> list[Finger]:
+    """Return the fingers that are to feel nothing, with what they may feel of others' contents."""
+    return [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
+
+
+def _bound(contact: Contact, protected: frozenset[ContactKey]) -> float:
+    """The level [dB SL] of others' contents that a finger may feel."""
+    return IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
 
 
 def playable_band(

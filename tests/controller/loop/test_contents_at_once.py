@@ -184,8 +184,11 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
 
 
 @in_virtual_time
-async def test_what_a_loud_click_leaves_no_stroke_for_is_felt_after_it() -> None:
-    """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes."""
+async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
+    """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
+
+    It is never silent, nor refused by the amplifiers.
+    """
     regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
     effects = {**LAYOUT.effects, "click": Click(level=44.0), "loud": Buzz(level=44.0)}
     layout = SurfaceLayout(regions, effects, elsewhere=None)
@@ -198,12 +201,42 @@ async def test_what_a_loud_click_leaves_no_stroke_for_is_felt_after_it() -> None
         player.play("loud", contact, asyncio.get_running_loop().time(), level_db_sl=None)
         fingers.controller.request_update()
         await fingers.hold(0.2)
-        assert max(each.time for each in fingers.silenced) > begin  # refused amid the click
-        (felt,) = fingers.applied[-1].targets
-        assert (felt.contact.key.id, felt.held_back) == (1, None)
-        assert fingers.applied[-1].time - begin <= 0.15
+        raised = [each for each in fingers.applied if each.time > begin + 0.012]
+        felt = [each for applied in raised for each in applied.targets if each.contact.key.id == 1]
+        assert {each.held_back for each in felt} == {None}
+        assert felt[0].level_db_sl < felt[-1].level_db_sl - 0.5
+        assert not fingers.silenced
+        assert raised[-1].time - begin <= 0.15
         await fingers.hold(0.3)
         assert fingers.levels_db_sl()[1] >= 43
+
+
+@in_virtual_time
+async def test_what_is_refused_beside_a_click_is_felt_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The refusal does not say until when; 20 ms after its end the click has faded."""
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
+        apply, refused, loop = fingers.controller.group.apply, [], asyncio.get_running_loop()
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.012)
+        clicked = fingers.applied[-1].time
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            (own,) = [each for each in layers["main"] if each.number == 0] or [Layer(0)]
+            if loop.time() < clicked + 0.06 and any(tone.level for tone in own.tones):
+                refused.append(loop.time())
+                raise CommandRefused("too much power")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
+        await fingers.hold(0.3)
+        assert refused
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
+        assert fingers.applied[-1].time - clicked <= 0.15
 
 
 @in_virtual_time
@@ -465,6 +498,26 @@ async def test_an_answer_is_shaped_by_the_timing_it_began_with(
         await fingers.hold(0.3)
         (applied,) = fingers.applied
         assert all(one.pattern.onset for one in applied.contents.values())
+
+
+@in_virtual_time
+async def test_an_answer_of_a_former_layout_is_not_played(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A finger joins; the effects change while the answer is computed: only the new ones play."""
+    answering_after(0.07, monkeypatch)
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.5) as fingers:
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.03)
+        player, count = fingers.controller._intent_source, len(fingers.applied)
+        assert isinstance(player, EffectPlayer)
+        bands = [replace(region, band=(200.0, 320.0)) for region in LAYOUT.regions]
+        player.replace(replace(LAYOUT, regions=tuple(bands)))
+        fingers.controller.request_update()
+        await fingers.hold(0.3)
+        (applied,) = fingers.applied[count:]
+        assert len(applied.contents) == 2
+        assert all((one.content.frequency or 0) >= 200 for one in applied.contents.values())
 
 
 @in_virtual_time

@@ -10,8 +10,17 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
+from controller.loop.content import Content, Targets
+from controller.loop.intent import Pulse, Target
+from controller.loop.plate_set import PlateSet
+from controller.loop.playing import PlayedContent, Playing
+from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from model.config.shapes import Rectangle
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Tone
+from paper_table import smooth_rig
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
 
@@ -144,3 +153,24 @@ async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
         assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1
         assert {one.content.key[0].id for one in fingers.applied[-1].contents.values()} == {2}
         group.apply = apply  # type: ignore[method-assign]
+
+
+def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() -> None:
+    """It is of another content, in a layer of its own: carrier and side bands play on."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
+    click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
+
+    def content(targets: Targets, frequency: float, voice: int = 0) -> Content:
+        pattern = Pattern({"SW": Tone(frequency, 1e-6)}, 0.02, 14.0, None, None)
+        return Content(targets, Question((LEFT,)), pattern, voice=voice)
+
+    voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
+    playing = Playing(smooth_rig(), 4, lambda key: 0.0)
+    contents = {
+        number: PlayedContent(one, PlateSet({}, 0.0), one.pattern, drive={})
+        for number, one in enumerate(voices)
+    }
+    playing.start(contents, frozenset(contents))
+    every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
+    assert playing.starting(every) == ([3], set())

@@ -46,10 +46,10 @@ async def set_chain(
 
 @asynccontextmanager
 async def set_running(
-    *amplifiers: str, breaks: str | None = None, **options: Any
-) -> AsyncIterator[Chain]:
+    *amplifiers: str, of: type[Made] = Chain, breaks: str | None = None, **options: Any
+) -> AsyncIterator[Made]:
     """The same, armed, and judged at its end; breaks: the only rule that is broken."""
-    async with set_chain(*amplifiers, **options) as chain:
+    async with set_chain(*amplifiers, of=of, **options) as chain:
         await chain.open()
         await chain.operate("arm")
         await asyncio.sleep(0.001)

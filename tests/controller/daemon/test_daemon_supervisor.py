@@ -8,13 +8,14 @@ import pytest
 
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
+from courses import courses, follow
 from drivers import clock
 from drivers.errors import CommandRefused
 from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from virtual_loop import in_virtual_time
-from watched_supervisor import Watched, courses, follow, watched
+from watched_supervisor import Watched, watched
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 ENABLED = DaemonState.OPERATION_ENABLED
@@ -27,7 +28,7 @@ COURSES = courses(Path(__file__).with_name("courses.yaml"))
 @pytest.mark.parametrize("name", COURSES)
 def test_supervisor_keeps_to_its_course(name: str) -> None:
     """Every step is as it is in the file."""
-    follow(COURSES[name])
+    follow(COURSES[name], watched)
 
 
 def slow_down(controller: Controller, *, stop: float) -> None:
@@ -236,7 +237,7 @@ async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
             return {**reply, "staged": 0, "played": 0}
 
         daemon.far_end.lie(stage_nothing)
-        daemon.touch()
+        daemon.touch("finger")
         await asyncio.sleep(0.1)
         assert daemon.far_end.state == STOPPED
         assert daemon.state is DaemonState.FAULT
@@ -273,13 +274,13 @@ async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
 
         with monkeypatch.context() as planted:
             planted.setattr("controller.loop.loop.applied_by", fail)
-            daemon.touch()
+            daemon.touch("finger")
             await asyncio.sleep(0.1)
         assert daemon.state is DaemonState.FAULT
         assert "a bug" in daemon.supervisor.operation.cause
         assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
         await daemon.handle(CLEAR)
         await daemon.handle(ARM)
-        daemon.touch_elsewhere()
+        daemon.touch("elsewhere")
         await asyncio.sleep(0.1)
         assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,10 +9,10 @@ import pytest
 
 from chain import Chain
 from controller.loop.loop import Controller
-from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.errors import LinkError
 from drivers.host.members import GroupState
 from drivers.opening import Lines
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from model.errors import InputError
 from model.rig.rig import Channel
 from model.table.timing import Timing
@@ -30,45 +29,6 @@ ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 def states(chain: Chain) -> set[str]:
     """The states of all amplifiers."""
     return {end.state for end in chain.far_ends}
-
-
-def refusing(name: str, code: str) -> Callable[[str, Values], None]:
-    """An answer that refuses requests of a name."""
-
-    def answer(asked: str, values: Values) -> None:
-        if asked == name:
-            raise Refusal("as told", code)
-
-    return answer
-
-
-@in_virtual_time
-async def test_lost_link_stops_the_others() -> None:
-    """The loss is reported, and arming needs all to be opened again."""
-    async with set_running("a", "b") as chain:
-        await chain.hold(0.1, down=[FINGER])
-
-        chain.far_ends[0].fault("unplug")
-        await asyncio.sleep(0.1)
-        assert chain.controller.group.state is GroupState.LOST
-        assert len(chain.far_ends[1].requests("Stop")) == 1
-        (lost,) = chain.lost
-        assert "/dev/memory0 was lost" in lost
-        with pytest.raises(CommandError, match=r"LOST.*open"):
-            await chain.controller.arm()
-    assert not chain.far_ends[1].is_open
-
-
-@in_virtual_time
-async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> None:
-    """150 ms after its last frame, as with a link; not only once all are open again."""
-    async with set_running() as chain:
-        await chain.leave(0.05, FINGER)
-        chain.far_end.fault("unplug")
-        await asyncio.sleep(0.0021)
-        assert chain.contacts == [1]
-        await asyncio.sleep(0.151)
-        assert chain.contacts == [1, 0]
 
 
 @in_virtual_time
@@ -112,46 +72,6 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
 
 
 @in_virtual_time
-async def test_stop_is_latched_until_clear() -> None:
-    """Arming is refused before, even if the amplifier restarts; touches are felt after it."""
-    async with set_running() as chain:
-        await chain.controller.stop()
-        with pytest.raises(CommandRefused):
-            await chain.controller.arm()
-        chain.far_end.fault("reboot", lasts=0.1)
-        await asyncio.sleep(0.2)
-        assert chain.far_end.state not in (STOPPED, ENABLED)
-        with pytest.raises(CommandRefused):
-            await chain.controller.arm()
-        assert chain.controller.group.state is GroupState.STOPPED
-        await chain.controller.clear()
-        await chain.controller.arm()
-        await chain.leave(0.01, FINGER)
-        assert not chain.far_end.sent()[-1].is_silent
-
-
-@pytest.mark.parametrize("order", ["stop", "disarm"])
-@in_virtual_time
-async def test_arm_is_refused_while_silencing(order: str) -> None:
-    """Nothing is sent, because the order of arrival would decide; afterwards arming works."""
-    async with set_chain("a", "b") as chain:
-        await chain.open()
-        for end in chain.far_ends:
-            end.delay(0.02)
-        silencing = asyncio.create_task(getattr(chain.controller, order)())
-        await asyncio.sleep(0)
-        with pytest.raises(CommandRefused, match="arm again"):
-            await chain.controller.arm()
-        await silencing
-        assert not chain.controller.group.is_armed
-        assert [end.requests("Arm") for end in chain.far_ends] == [[], []]
-        await chain.controller.clear()
-        await chain.controller.arm()
-        assert chain.controller.group.state is GroupState.ARMED
-        await chain.close()
-
-
-@in_virtual_time
 async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
     """One that another program has disarmed plays again, in a session that all have."""
     async with set_running("a", "b", breaks="state") as chain:
@@ -161,33 +81,6 @@ async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
         assert states(chain) == {ENABLED}
         (session,) = {end.amplifier.session for end in chain.far_ends}
         assert session not in held
-
-
-@in_virtual_time
-async def test_failed_disarm_stops_all() -> None:
-    """The error is raised after that."""
-    async with set_running("a", "b", breaks="stop") as chain:
-        chain.far_ends[1].answer = refusing("Disarm", "BUSY")
-        with pytest.raises(CommandRefused, match="BUSY"):
-            await chain.controller.disarm()
-        assert states(chain) == {STOPPED}
-
-
-@in_virtual_time
-async def test_stop_completes_when_its_caller_is_cancelled_twice() -> None:
-    """While the amplifiers do not hear; they hear again after the second."""
-    async with set_running("a", "b") as chain:
-        for end in chain.far_ends:
-            end.fault("drop", toward="amplifier")
-        stopping = asyncio.create_task(chain.controller.stop())
-        for _ in range(2):
-            await asyncio.sleep(0.005)
-            stopping.cancel()
-        for end in chain.far_ends:
-            end.recover()
-        with pytest.raises(asyncio.CancelledError):
-            await stopping
-        assert states(chain) == {STOPPED}
 
 
 @in_virtual_time
@@ -291,41 +184,3 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
             await chain.controller.open()
         assert chain.controller.group.state is GroupState.CLOSED
         assert not chain.far_end.is_open
-
-
-@in_virtual_time
-async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
-    """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
-    async with set_running("a", "b") as chain:
-        await chain.hold(0.2, down=[FINGER])
-        chain.far_ends[1].fault("drop", toward="amplifier")
-        await chain.leave(0.6)
-        assert chain.lost
-        assert chain.controller.group.state is GroupState.LOST
-        assert not any(chain.far_ends[0].levels)
-
-
-@pytest.mark.parametrize("is_armed", [False, True])
-@pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
-@in_virtual_time
-async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> None:
-    """Arming that is under way is refused; what was armed before is not armed anew."""
-    async with set_chain("a", "b") as chain:
-        await chain.open()
-        if is_armed:
-            await chain.controller.arm()
-        for end in chain.far_ends:
-            end.delay(0.005)
-        arming = asyncio.create_task(chain.controller.arm())
-        await asyncio.sleep(0.001)
-        await getattr(chain.controller, silencing)()
-        with pytest.raises(CommandRefused, match=r"arm again|superseded"):
-            await arming
-        left = {
-            "disarm": GroupState.DISARMED,
-            "stop": GroupState.STOPPED,
-            "close": GroupState.CLOSED,
-        }
-        assert chain.controller.group.state is left[silencing]
-        if silencing != "close":
-            assert ENABLED not in states(chain)

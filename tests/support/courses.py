@@ -1,0 +1,322 @@
+"""Courses of a chain in virtual time: lists of steps in a YAML file, by the sentence they prove.
+
+A step is a method of what is played, or `is`: values of its properties, by their names.
+"""
+
+import asyncio
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from chain import Chain
+from drivers import clock
+from drivers.errors import CommandError, CommandRefused
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import FAULTS, STATES
+from model.vibration.excitation import Tone
+from set_chain import FINGER, OTHER
+from sim.faults.fault_window import FaultKind
+from virtual_loop import run_virtual
+
+Step = str | Mapping[str, Any]
+FINGERS = {
+    "finger": FINGER,
+    "near": (FINGER[0], FINGER[1] + 0.001, FINGER[2]),
+    "moved": (FINGER[0], 0.18, 0.1),
+    "elsewhere": (FINGER[0], *OTHER[1:]),
+    "other": OTHER,
+}
+"""Fingers by name; those that are near, moved or elsewhere are the finger at another place."""
+
+
+@dataclass
+class Acted(Chain):
+    """A chain that takes the steps of courses."""
+
+    under_way: dict[str, "asyncio.Task[None]"] = field(default_factory=dict)
+
+    @property
+    def group(self) -> str:
+        """The state of all amplifiers together."""
+        return self.controller.group.state.name
+
+    @property
+    def amplifiers(self) -> str:
+        """Their states, each once."""
+        return ", ".join(dict.fromkeys(each.state for each in self.far_ends))
+
+    @property
+    def is_loud(self) -> bool:
+        """Whether any amplifier plays."""
+        return any(map(any, self.levels().values()))
+
+    @property
+    def opened(self) -> int:
+        """How often a line to the first amplifier was opened."""
+        return self.operation.attempts[self.far_end.port]
+
+    @property
+    def degraded(self) -> list[str]:
+        """Amplifiers that do not reply but may play."""
+        return [*self.controller.group.degraded]
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether any amplifier is."""
+        return "OPERATION_ENABLED" in self.amplifiers.split(", ")
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether a touch is being prepared."""
+        return self.controller.is_preparing
+
+    @property
+    def from_rest(self) -> list[bool]:
+        """Of each pattern, whether the plate was at rest before."""
+        return [each.from_rest for each in self.applied]
+
+    @property
+    def latencies_ms(self) -> list[float]:
+        """Of each pattern."""
+        return [round(1e3 * (each.latency or math.nan), 2) for each in self.applied]
+
+    @property
+    def refusals(self) -> str:
+        """Why sets were refused."""
+        return ", ".join(self.refused)
+
+    @property
+    def reason(self) -> str:
+        """Why it fell silent last."""
+        return self.silenced[-1].reason
+
+    def played(self) -> list[list[Any]]:
+        """The commands of each set that vibrates, of the first amplifier."""
+        return [[*one.layer.commands] for one in self.far_end.sent() if not one.is_silent]
+
+    @property
+    def keep_phase(self) -> list[list[bool]]:
+        """Of each set that vibrates, the channels that continue their phase."""
+        return [[each.keep_phase for each in commands] for commands in self.played()]
+
+    @property
+    def frequencies(self) -> list[int]:
+        """Of each set that vibrates, that of the first channel [0.05 Hz]."""
+        return [commands[0].frequency for commands in self.played()]
+
+    async def waits(self, seconds: float) -> None:
+        """Let time pass."""
+        await asyncio.sleep(seconds)
+
+    def touch(self, *fingers: str, ago: float = 0.0) -> None:
+        """Put fingers down in place of all that are, once."""
+        self.put(*(FINGERS[each] for each in fingers), ago=ago)
+
+    def touch_of(self, ago: float, *fingers: str) -> None:
+        """Do the same by a frame that arrived some time ago."""
+        self.touch(*fingers, ago=ago)
+
+    async def holds(self, seconds: float, *fingers: str) -> None:
+        """Hold fingers for a time."""
+        await self.hold(seconds, down=[FINGERS[each] for each in fingers])
+
+    def answers_by(self, **tones: Sequence[float]) -> None:
+        """Have the table answer by frequencies [Hz] and amplitudes [m], by ERA."""
+        self.table.excitation = {era: Tone(*tone) for era, tone in tones.items()}
+
+    async def operator(self, command: str) -> None:
+        """Let the operator command the control loop."""
+        await getattr(self.controller, command)()
+
+    async def begins(self, step: Step) -> None:
+        """Begin a step, and let the loop turn."""
+        self.under_way[_name(step)] = asyncio.create_task(self.take(step))
+        await asyncio.sleep(0)
+
+    async def ends(self, step: Step) -> None:
+        """Wait until a step was taken."""
+        await self.under_way.pop(_name(step))
+
+    async def ends_anyhow(self, step: Step) -> None:
+        """Wait until a step was taken, or refused."""
+        await asyncio.gather(self.under_way.pop(_name(step)), return_exceptions=True)
+
+    def cancels(self, step: Step) -> None:
+        """Cancel a step that has begun."""
+        self.under_way[_name(step)].cancel()
+
+    async def is_late_for(self, kind: str, seconds: float) -> None:
+        """Wait for a request of a kind; its reply, and those after it, leave so much later."""
+        requested = asyncio.Event()
+
+        def note(name: str, values: Values) -> None:
+            if name == kind:
+                self.far_end.delay(seconds)
+                requested.set()
+
+        self.far_end.answer = note
+        await requested.wait()
+        self.far_end.answer = lambda name, values: None
+        await asyncio.sleep(0.001)
+
+    def fault(self, kind: FaultKind, of: int | None = None, **given: Any) -> None:
+        """Let a fault of all amplifiers begin, or of one by its number."""
+        for each in self.far_ends if of is None else [self.far_ends[of]]:
+            each.fault(kind, **given)
+
+    def recovers(self) -> None:
+        """End all faults."""
+        for each in self.far_ends:
+            each.recover()
+
+    def delays(self, seconds: float) -> None:
+        """Let replies of all amplifiers leave them so much later."""
+        for each in self.far_ends:
+            each.delay(seconds)
+
+    def obey(self) -> None:
+        """Let the amplifiers obey again, and forget the requests so far."""
+        self.forget()
+        self.delays(0.0)
+        self.recovers()
+        for each in self.far_ends:
+            each.answer = lambda name, values: None
+
+    def forget(self) -> None:
+        """Forget the requests so far, and how often a line was opened."""
+        self.operation.attempts.clear()
+        for each in self.far_ends:
+            each.asked.clear()
+
+    def answer(self, *names: str, **changed: object) -> None:
+        """Let the amplifier report something else in replies of some names."""
+        changed = {what: _coded(what, value) for what, value in changed.items()}
+        self.far_end.lie(
+            lambda name, values: {**self.far_end.status(), **changed} if name in names else None
+        )
+
+    def answers(self, to: Sequence[str], **changed: object) -> None:
+        """Do the same by names in a list."""
+        self.answer(*to, **changed)
+
+    def freezes(self, seconds: float) -> None:
+        """Let the amplifier ignore Clear, and report what it reports now, for so long."""
+        until = clock.now() + seconds
+        status = self.far_end.status()
+        self.far_end.lie(
+            lambda name, values: (
+                status if clock.now() < until and name in ("Clear", "GetStatus") else None
+            )
+        )
+
+    def reports(self, when: str, **event: Any) -> None:
+        """Let the amplifier send an event as it is about to carry out a request of a name."""
+        values = {"latch": 0, **{what: _coded(what, value) for what, value in event.items()}}
+
+        def report(name: str, _: Values) -> None:
+            for listener in self.far_end.device.listeners:
+                if name == when:
+                    listener(values, clock.now())
+
+        self.far_end.lie(report)
+
+    def refuse(self, *names: str) -> None:
+        """Let the last amplifier refuse requests of some names."""
+
+        def answer(name: str, values: Values) -> None:
+            if name in names:
+                raise Refusal("as told", "WRONG_STATE")
+
+        self.far_ends[-1].lie(answer)
+
+    def asked(self, of: int = 0, **least: int) -> None:
+        """Require that an amplifier, by its number, was asked so often or more; never for 0."""
+        for name, count in least.items():
+            found = len(self.far_ends[of].requests(name))
+            assert found >= count, (name, found)
+            assert count or not found, (name, found)
+
+    def asked_in_order(self, *names: str) -> None:
+        """Require that the amplifier was asked first for the one, then for the other."""
+        kinds = self.far_end.names()
+        found = [kinds.index(name) for name in names]
+        assert found == sorted(found), kinds
+
+    def says(self, what: str, text: str) -> None:
+        """Require a part of a text."""
+        assert text in getattr(self, what)
+
+    def counts(self, **numbers: int) -> None:
+        """Require the numbers of what was reported."""
+        found = {what: len(attrgetter(what)(self)) for what in numbers}
+        assert found == numbers
+
+    def asked_exactly(self, *names: str) -> None:
+        """Require what each amplifier was asked of these kinds, in order."""
+        for each in self.far_ends:
+            assert [name for name in each.names() if name in names] == [*names]
+
+    async def refuses(self, step: Step) -> None:
+        """Require that a step is refused."""
+        await self.refuses_saying(".", step)
+
+    async def refuses_saying(self, text: str, step: Step) -> None:
+        """Require that a step is refused, with this text."""
+        with pytest.raises((CommandError, CommandRefused), match=text):
+            await self.take(step)
+
+    async def take(self, step: Step) -> None:
+        """Take a step."""
+        ((name, given),) = step.items() if isinstance(step, Mapping) else [(step, [])]
+        if name == "is":
+            found = {what: attrgetter(what)(self) for what in given}
+            assert found == {**given}, (found, self.far_end.names()[-5:])
+            return
+        method = getattr(self, name.replace(" ", "_"))
+        if name in _OF_A_STEP or not isinstance(given, list | Mapping):
+            done = method(given)
+        else:
+            done = method(**given) if isinstance(given, Mapping) else method(*given)
+        if inspect.isawaitable(done):
+            await done
+
+
+_OF_A_STEP = ("refuses", "begins", "ends", "ends anyhow", "cancels")
+
+
+def _name(step: Step) -> str:
+    return str(step)
+
+
+def _coded(what: str, value: Any) -> Any:
+    """The number of a state or a fault that is named; all else as it is."""
+    codes = {"state": STATES, "fault": FAULTS}.get(what, {})
+    return codes.get(value, value) if isinstance(value, str) else value
+
+
+def courses(path: Path) -> dict[str, Mapping[str, Any]]:
+    """The courses of a file by their names: `steps`, and options of what they are played on."""
+    return dict(YAML(typ="safe").load(path))
+
+
+def follow(
+    course: Mapping[str, Any], made: Callable[..., AbstractAsyncContextManager[Acted]]
+) -> None:
+    """Take all steps of a course, in virtual time, on what is made with its options."""
+    given = {**course}
+
+    async def run() -> None:
+        steps, amplifiers = given.pop("steps"), given.pop("amplifiers", ())
+        async with made(*amplifiers, **given) as chain:
+            for step in steps:
+                await chain.take(step)
+
+    run_virtual(run())

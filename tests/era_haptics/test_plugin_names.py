@@ -39,3 +39,5 @@ def test_module_exports_its_imports_and_page_documents_them(kind: str) -> None:
         rf"^\.\. (?:auto|py:)\w+:: era_haptics\.plugins\.{kind}\.(\w+)", PAGE, re.M
     )
     assert sorted(documented) == sorted(module.__all__)
+    # Where the directive is not filled in, a link leads to the docstrings.
+    assert f"](../../era_haptics/plugins/{kind}.py)" in PAGE

@@ -143,6 +143,7 @@ class Rounding:
                 raise _refused(tone.channel, "must occur once in a layer")
             channels.add(command.channel)
             commands.append(command)
+        self._check_envelopes(layer.tones)
         return LayerSet(
             number,
             min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
@@ -173,8 +174,6 @@ class Rounding:
         phase = round(tone.phase * _PHASE.per_unit)
         if not _PHASE.minimum <= phase <= _PHASE.maximum:
             phase = _PHASE.to_wire(float(tone.phase))
-        if onset or tone.ending:
-            self._check_envelopes(tone)
         return Command(
             channel,
             self.achieved.get((channel, frequency), frequency),
@@ -189,26 +188,30 @@ class Rounding:
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
         return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
 
-    def _check_envelopes(self, tone: Tone) -> None:
+    def _check_envelopes(self, tones: Sequence[Tone]) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
-        knots: list[tuple[int, ...]] = []
-        for envelope in (tone.onset, tone.ending):
-            if envelope is None:
+        low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
+        limit = self._can["knots"]
+        for tone in tones:
+            knots: list[tuple[int, ...]] = []
+            for envelope in (tone.onset, tone.ending):
+                if envelope is None:
+                    continue
+                if not low <= (step := envelope.step) <= high:
+                    text = f"step of an envelope must be {low} to {high} (0.1 ms), got {step}"
+                    raise _refused(tone.channel, text)
+                if (count := len(envelope.knots)) > limit:
+                    text = f"knots of an envelope must be at most {limit}, got {count}"
+                    raise _refused(tone.channel, text)
+                knots += envelope.knots
+            if not knots:
                 continue
-            low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
-            if not low <= envelope.step <= high:
-                text = f"step of an envelope must be {low} to {high} (0.1 ms), got {envelope.step}"
-                raise _refused(tone.channel, text)
-            if (count := len(envelope.knots)) > (limit := self._can["knots"]):
-                text = f"knots of an envelope must be at most {limit}, got {count}"
-                raise _refused(tone.channel, text)
-            knots += envelope.knots
-        try:
-            KNOT.check_rows(knots)
-        except (TypeError, ValueError) as error:
-            raise _refused(tone.channel, f"knot of an envelope: {error}") from error
-        if knots and (peak := max(knots)[0]) > self._limits.level:
-            raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
+            try:
+                KNOT.check_rows(knots)
+            except (TypeError, ValueError) as error:
+                raise _refused(tone.channel, f"knot of an envelope: {error}") from error
+            if (peak := max(knots)[0]) > self._limits.level:
+                raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

@@ -197,7 +197,8 @@ class Line:
         job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
         job.delays, job.is_last_look = 0, False
         self._current = job
-        self._schedule()
+        if self._timer is None:
+            self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
 
     def _go_on(self, job: Job, data: bytes) -> None:
         """Send the rest of the request on the line, unless one that silences waits."""
@@ -318,29 +319,21 @@ class Line:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
-        self._schedule()
+        if self._timer is not None and self._timer.when() > current.due:
+            self._timer.cancel()
+            self._timer = self._loop.call_at(current.due, self._look)
 
-    def _schedule(self) -> None:
-        """Have the timer look at the request on the line by the next time that matters."""
-        if self._current is None:
-            return
-        due = min(self._current.due, self.time() + _LOOK_INTERVAL)
-        if self._timer is None or self._timer.when() > due:
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer = self._loop.call_at(due, self._look, due)
-
-    def _look(self, planned: float) -> None:
+    def _look(self) -> None:
         """Give up the request on the line if it is due, once the port was read once more.
 
-        planned [s]: when it should have been called. By what it is late this process was delayed,
-        and the reply has as much time left as it had then.
+        By what the timer is late this process was delayed, and the reply has as much time left as
+        it had then.
         """
-        self._timer = None
+        timer, self._timer = self._timer, None
         job, now = self._current, self.time()
-        if job is None:
+        if job is None or timer is None:
             return
-        since = max(planned, job.sent_at)
+        since = max(timer.when(), job.sent_at)
         if now - since > _LATE and job.delays < _DELAYS:
             job.delays += 1
             left = 0.0 if self._must_yield(job) else job.due - since
@@ -353,7 +346,9 @@ class Line:
                     self.pump()
                     return
                 job.due, job.is_last_look = now, True
-        self._schedule()
+        if self._current is not None and self._timer is None:
+            due = min(self._current.due, self.time() + _LOOK_INTERVAL)
+            self._timer = self._loop.call_at(due, self._look)
 
     def _not_answered(self, job: Job) -> None:
         """Take the request off the line, and repeat it or give it up."""

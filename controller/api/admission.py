@@ -13,6 +13,7 @@ first, but none whose first bytes have arrived unread.
 
 import asyncio
 import contextlib
+import os
 import resource
 import socket
 from collections import Counter
@@ -123,6 +124,7 @@ class Acceptor:
         self._loop = asyncio.get_running_loop()
         self._beginning: set[asyncio.Task[object]] = set()
         self._rates = Rates(MAX_CONNECTION_RATE, burst=CONNECTION_BURST, clock=clock)
+        self._spare = _spare_descriptor()
         bound.setblocking(False)
         bound.listen(_QUEUE)
         self._start_serving()
@@ -131,6 +133,8 @@ class Acceptor:
         """Stop listening."""
         self._loop.remove_reader(self._bound)
         self._bound.close()
+        if self._spare is not None:
+            os.close(self._spare)
 
     def _start_serving(self) -> None:
         if self._bound.fileno() >= 0:
@@ -143,9 +147,8 @@ class Acceptor:
                 accepted, _ = self._bound.accept()
             except (BlockingIOError, InterruptedError, ConnectionAbortedError):
                 return
-            except OSError:  # no descriptor is left: clients wait until there is one
-                self._loop.remove_reader(self._bound)
-                self._loop.call_later(_PAUSE, self._start_serving)
+            except OSError:
+                self._refuse_without_descriptors()
                 return
             process, _ = credentials_of(accepted) or (0, 0)
             if self._rates.of(process).take():
@@ -155,6 +158,25 @@ class Acceptor:
                 task.add_done_callback(self._beginning.discard)
                 return
             accepted.close()
+
+    def _refuse_without_descriptors(self) -> None:
+        """Refuse a connection by means of the spare descriptor; pause if it was taken meanwhile."""
+        if self._spare is not None:
+            os.close(self._spare)
+            with contextlib.suppress(OSError):
+                self._bound.accept()[0].close()
+        self._spare = _spare_descriptor()
+        if self._spare is None:
+            self._loop.remove_reader(self._bound)
+            self._loop.call_later(_PAUSE, self._start_serving)
+
+
+def _spare_descriptor() -> int | None:
+    """A descriptor to be given up for another, or None if there is no more."""
+    try:
+        return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
 
 
 MIN_DESCRIPTORS = 64

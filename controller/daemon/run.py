@@ -147,6 +147,8 @@ def _run(config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: s
     except Exception:
         _logger.exception("daemon: terminated")
         raise
+    finally:
+        manager.close()
 
 
 def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:

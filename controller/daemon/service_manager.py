@@ -17,19 +17,20 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
+        # Opened at once: the watchdog is to be fed when no descriptor is left, too.
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if self._address else None
         self._watchdog_interval = _watchdog_interval(environment)
         self._last_alive = float("-inf")
 
     def notify(self, *assignments: str) -> None:
         """Send assignments such as STATUS=..., one a line; control characters are removed."""
-        if not self._address:
+        if self._socket is None:
             return
         lines = ("".join(c for c in text if c.isprintable())[:_MAX_TEXT] for text in assignments)
         # @ marks an address in the abstract namespace
         address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
-        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
-            own.setblocking(False)
-            own.sendto("\n".join(lines).encode(), address)
+        with contextlib.suppress(OSError):
+            self._socket.sendto("\n".join(lines).encode(), socket.MSG_DONTWAIT, address)
 
     def ready(self, status: str) -> None:
         """Report that the daemon serves requests."""
@@ -41,6 +42,11 @@ class ServiceManager:
         if interval is not None and now - self._last_alive >= interval:
             self._last_alive = now
             self.notify("WATCHDOG=1")
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
 
 
 def _watchdog_interval(environment: Mapping[str, str]) -> float | None:

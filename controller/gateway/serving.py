@@ -8,7 +8,7 @@ import re
 import signal
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import uvicorn
 
@@ -26,7 +26,14 @@ _SHUTDOWN_TIMEOUT = 0.3  # s; for connections to close by themselves
 
 
 class _Server(uvicorn.Server):
-    """Ends within a short time, whatever its clients do."""
+    """Ends within a short time, whatever its clients do; at a signal with an exit status of 0."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Shut down at SIGINT and SIGTERM; else the exit status would be the signal's."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, self.handle_exit, number, None)
+        yield
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close connections, aborting those that do not close in time."""
@@ -69,12 +76,9 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     logging.getLogger("uvicorn.error").addFilter(
         lambda record: not (record.exc_info and record.exc_info[0] is UnicodeDecodeError)
     )
-    server, loop = _Server(config), asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):  # else the exit status would be the signal's
-        loop.add_signal_handler(number, server.handle_exit, number, None)
     own = asyncio.create_task(gateway.run())
     announce(listening.getsockname()[1])
-    await server._serve(sockets=[listening])
+    await _Server(config).serve(sockets=[listening])
     own.cancel()
     await asyncio.wait({own})
 

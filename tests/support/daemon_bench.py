@@ -159,6 +159,7 @@ async def daemon_at(
         finally:
             logging.getLogger().removeHandler(log)
             log.close()
+            manager.close()
             lock.release()
     if witness is not None:
         found = witness.finish(clock.now())

@@ -1,5 +1,6 @@
 """The daemon's log, notices to systemd, dumps and latencies; none may block the daemon."""
 
+import errno
 import io
 import json
 import logging
@@ -8,7 +9,9 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -150,14 +153,19 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
     manager_socket: socket.socket,
     more: dict[str, str],
     count: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not one of another process, nor without a valid interval; no assignment can be forged."""
-    manager = ServiceManager({"NOTIFY_SOCKET": manager_socket.getsockname(), **more})
-    manager.ready("all is well\nERRNO=5")
-    assert manager_socket.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
-    for milliseconds in range(0, 3500, 50):
-        manager.alive(milliseconds / 1000)
-    manager.notify("STOPPING=1")
+    """Not one of another process, nor without a valid interval; no assignment can be forged.
+
+    Fed when no descriptor is left, too.
+    """
+    with closing(ServiceManager({"NOTIFY_SOCKET": manager_socket.getsockname(), **more})) as told:
+        monkeypatch.setattr(socket, "socket", Mock(side_effect=OSError(errno.EMFILE, "too many")))
+        told.ready("all is well\nERRNO=5")
+        assert manager_socket.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
+        for milliseconds in range(0, 3500, 50):
+            told.alive(milliseconds / 1000)
+        told.notify("STOPPING=1")
     messages = []
     while (message := manager_socket.recv(100)) != b"STOPPING=1":
         messages.append(message)
@@ -166,9 +174,10 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
 
 def test_service_manager_may_be_missing() -> None:
     """Neither a missing variable nor a missing socket is an error."""
-    for manager in (ServiceManager({}), ServiceManager({"NOTIFY_SOCKET": "/nowhere/at/all"})):
-        manager.ready("well")
-        manager.alive(0.0)
+    for environment in ({}, {"NOTIFY_SOCKET": "/nowhere/at/all"}):
+        with closing(ServiceManager(environment)) as manager:
+            manager.ready("well")
+            manager.alive(0.0)
 
 
 def message(time_s: float, way: str, name: str) -> dict[str, object]:

@@ -37,11 +37,19 @@ FINGERS = {
 """Fingers by name; those that are near, moved or elsewhere are the finger at another place."""
 
 
+class Planted(Exception):
+    """A bug."""
+
+
 @dataclass
 class Acted(Chain):
-    """A chain that takes the steps of courses."""
+    """A chain that takes the steps of courses.
+
+    under_way: steps that have begun; whole: methods that fail, as they are.
+    """
 
     under_way: dict[str, "asyncio.Task[None]"] = field(default_factory=dict)
+    whole: dict[str, Any] = field(default_factory=dict)
 
     @property
     def group(self) -> str:
@@ -136,6 +144,21 @@ class Acted(Chain):
         """Let the operator command the control loop."""
         await getattr(self.controller, command)()
 
+    def fails(self, *methods: str) -> None:
+        """Let methods of the control loop fail from now on."""
+
+        def fail(*_: object) -> None:
+            raise Planted(*methods)
+
+        for method in methods:
+            self.whole[method] = getattr(self.controller, method)
+            setattr(self.controller, method, fail)
+
+    def works(self, *methods: str) -> None:
+        """Let methods that fail work again."""
+        for method in methods:
+            setattr(self.controller, method, self.whole.pop(method))
+
     async def begins(self, step: Step) -> None:
         """Begin a step, and let the loop turn."""
         self.under_way[_name(step)] = asyncio.create_task(self.take(step))
@@ -199,9 +222,13 @@ class Acted(Chain):
     def answer(self, *names: str, **changed: object) -> None:
         """Let the amplifier report something else in replies of some names."""
         changed = {what: _coded(what, value) for what, value in changed.items()}
-        self.far_end.lie(
-            lambda name, values: {**self.far_end.status(), **changed} if name in names else None
-        )
+
+        def lie(name: str, values: Values) -> Values | None:
+            if name in names:
+                return {**self.far_end.obey(name, values, clock.now()), **changed}
+            return None
+
+        self.far_end.lie(lie)
 
     def answers(self, to: Sequence[str], **changed: object) -> None:
         """Do the same by names in a list."""
@@ -252,7 +279,7 @@ class Acted(Chain):
 
     def says(self, what: str, text: str) -> None:
         """Require a part of a text."""
-        assert text in getattr(self, what)
+        assert text in attrgetter(what)(self)
 
     def counts(self, **numbers: int) -> None:
         """Require the numbers of what was reported."""
@@ -280,7 +307,7 @@ class Acted(Chain):
             found = {what: attrgetter(what)(self) for what in given}
             assert found == {**given}, (found, self.far_end.names()[-5:])
             return
-        method = getattr(self, name.replace(" ", "_"))
+        method = attrgetter(name.replace(" ", "_"))(self)
         if name in _OF_A_STEP or not isinstance(given, list | Mapping):
             done = method(given)
         else:

@@ -10,14 +10,10 @@ from typing import Any
 from controller.daemon.states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.daemon.supervisor import Supervisor
 from controller.loop.observer import Observer
-from courses import Acted, Step
+from courses import Acted, Planted, Step
 from drivers import clock
 from drivers.errors import LinkError
 from set_chain import set_chain
-
-
-class Planted(Exception):
-    """A bug."""
 
 
 @dataclass

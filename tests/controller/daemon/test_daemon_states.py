@@ -1,8 +1,6 @@
-"""The operation's states against a table written by hand, and invariants over histories."""
+"""The operation's states against a table written by hand."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from controller.daemon.states import (
     Action,
@@ -152,48 +150,3 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
         assert after.state is state
     else:
         assert (after.state, after.cause) == (DaemonState.FAULT, "a bug")
-
-
-events = st.lists(st.tuples(st.sampled_from(Trigger), st.floats(0, 0.5)), min_size=1, max_size=40)
-
-
-@given(events)
-def test_step_energises_only_by_arm(history: list[tuple[Trigger, float]]) -> None:
-    """OPERATION_ENABLED is entered from SWITCHED_ON, and that by ARM in READY_TO_SWITCH_ON."""
-    operation, now = Operation(), 0.0
-    for trigger, pause in history:
-        now += pause
-        before, (operation, actions) = operation, step(operation, DaemonEvent(trigger), now)
-        if operation.state is DaemonState.OPERATION_ENABLED and before.state is not operation.state:
-            assert (before.state, trigger) == (DaemonState.SWITCHED_ON, Trigger.ARMED)
-        if operation.state is DaemonState.SWITCHED_ON and before.state is not operation.state:
-            assert (before.state, trigger) == (DaemonState.READY_TO_SWITCH_ON, Trigger.ARM)
-        if Action.ARM in actions:
-            assert operation.state is DaemonState.SWITCHED_ON
-
-
-@given(events)
-def test_step_arms_after_latch_only_when_verified(history: list[tuple[Trigger, float]]) -> None:
-    """A stop, fault or loss while energised requires VERIFIED before the next arm.
-
-    Whoever says VERIFIED has cleared since: `test_clear_does_not_acknowledge_later_stop`.
-    """
-    operation, now, owed = Operation(), 0.0, False
-    for trigger, pause in history:
-        now += pause
-        before, (operation, _) = operation, step(operation, DaemonEvent(trigger), now)
-        if before.state is not DaemonState.NOT_READY and (
-            (trigger is Trigger.STOP)
-            or (trigger is Trigger.FAULT and before.state is not DaemonState.COMM_LOST)
-            or (
-                trigger is Trigger.LINK_LOST
-                and before.state in (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
-            )
-        ):
-            owed = True
-        elif trigger is Trigger.VERIFIED and before.state in LATCHED:
-            owed = False
-        if trigger is Trigger.CLOSE:  # a new start reads everything back by itself
-            owed = False
-        if operation.state is DaemonState.SWITCHED_ON:
-            assert not owed

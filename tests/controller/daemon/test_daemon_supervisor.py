@@ -44,37 +44,6 @@ def slow_down(controller: Controller, *, stop: float) -> None:
 
 
 @in_virtual_time
-async def test_control_loop_whose_failure_cannot_be_stopped_runs_again_once_it_can() -> None:
-    """No heartbeat is sent before that; once cleared and armed, they are."""
-    async with watched(breaks="heartbeat latched") as daemon:
-        await daemon.handle(ARM)
-        controller = daemon.controller
-        step, stop = controller.step, controller.stop
-
-        async def fail() -> None:
-            raise ZeroDivisionError("a bug")
-
-        def fail_to_stop() -> None:
-            raise OSError("another bug")
-
-        controller.step, controller.stop = fail, fail_to_stop
-        controller.request_update()
-        await asyncio.sleep(0.02)
-        controller.step = step
-        begun = len(daemon.far_end.times("Ping"))
-        await asyncio.sleep(0.5)
-        assert len(daemon.far_end.times("Ping")) == begun
-        assert daemon.far_end.state != ARMED  # its watchdog has expired
-        controller.stop = stop
-        await asyncio.sleep(0.5)
-        await daemon.handle(CLEAR)
-        await daemon.handle(ARM)
-        await asyncio.sleep(1)
-        assert daemon.state is ENABLED
-        assert len(daemon.far_end.times("Ping")) >= begun + 18
-
-
-@in_virtual_time
 async def test_end_of_the_control_loop_ends_the_daemon() -> None:
     """By whatever cancels it: nothing can be armed without it."""
 
@@ -221,27 +190,6 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests("Stop")
-
-
-@in_virtual_time
-async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
-    """An amplifier says so of one set: no request says more, and the plate does not stay armed."""
-    async with watched() as daemon:
-        await daemon.handle(ARM)
-        await asyncio.sleep(0.01)
-
-        def stage_nothing(name: str, values: Values) -> Values | None:
-            if name != "Set":
-                return None
-            reply = daemon.far_end.obey(name, values, clock.now())
-            return {**reply, "staged": 0, "played": 0}
-
-        daemon.far_end.lie(stage_nothing)
-        daemon.touch("finger")
-        await asyncio.sleep(0.1)
-        assert daemon.far_end.state == STOPPED
-        assert daemon.state is DaemonState.FAULT
-        assert "era clear" in (daemon.supervisor.operation.remedy or "")
 
 
 @in_virtual_time

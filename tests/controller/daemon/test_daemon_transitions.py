@@ -16,10 +16,11 @@ from controller.daemon.states import (
     Operation,
     Trigger,
 )
+from courses import Planted
 from drivers.errors import DriverError
 from stop_path import stop_path
 from virtual_loop import in_virtual_time
-from watched_supervisor import Planted, Watched, watched
+from watched_supervisor import Watched, watched
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
 SILENCING = (Trigger.STOP, Trigger.DISARM, Trigger.FAULT, Trigger.LINK_LOST)

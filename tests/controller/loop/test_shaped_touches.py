@@ -134,17 +134,6 @@ async def test_lifted_target_fades_along_its_ending(shapes: Shapes) -> None:
         assert chain.far_end.names()[-1] == "Silence"
 
 
-@pytest.mark.parametrize("held", [0.05, 0.3])
-@in_virtual_time
-async def test_last_lift_skips_the_ending(shapes: Shapes, held: float) -> None:
-    """Zero at once and within 20 ms, whether the onset is over or not."""
-    async with set_running(knots=32, timing=shapes) as chain:
-        await chain.hold(held, down=[FINGER])
-        await chain.leave(0)
-        await asyncio.sleep(0.020)
-        assert not any(chain.far_end.levels)
-
-
 @in_virtual_time
 async def test_lift_before_the_onset_is_over_skips_the_ending(shapes: Shapes) -> None:
     """An ending leads from the full level; lifted half way up the target fades along 20 ms."""

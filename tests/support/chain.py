@@ -1,13 +1,14 @@
 """The one chain, in virtual time: control loop, wires in memory, far ends, plate and witness.
 
 Everything between the touch frames and the plate is the project's own, with the durations of the
-wires; only the lines are memory. The witness reads every byte and is the judge.
+wires; only the lines are memory. The witness reads every byte, and the plate is judged beside it.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Self, cast
 
@@ -22,6 +23,7 @@ from drivers.protocol.sets import LayerSet, is_vibrating
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
+from plate_judge import STEP, PlateJudge
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.contract import Amplifier
@@ -47,13 +49,16 @@ class Chain:
     on its panel alone; must_be_felt: whether each that comes must lead to a pattern;
     timeout [s]: how long they are taken for down after a report, None for a panel's;
     far_ends: the amplifiers; applied, silenced, refused, lost, contacts: what the control loop has
-    reported, of contacts their number at each change.
+    reported, of contacts their number at each change; turning: unless the loop is to stall before
+    its next turn.
     """
 
     far: FarSide
     operation: MemoryMachine
     witness: LoopWitness
-    controller: Controller
+    plate_judge: PlateJudge
+    make_controller: Callable[..., Controller]
+    controller: Controller = field(init=False)
     at: dict[int, Position] = field(default_factory=dict)
     is_felt: bool = True
     must_be_felt: bool = True
@@ -66,12 +71,21 @@ class Chain:
     lost: list[str] = field(default_factory=list)
     contacts: list[int] = field(default_factory=list)
     running: "asyncio.Task[None] | None" = None
+    turning: asyncio.Event = field(default_factory=asyncio.Event)
 
     def __post_init__(self) -> None:
-        """Hear of what the control loop reports, and of all that is requested of the far ends."""
-        self.table = self.controller.table
+        """Make the control loop, and hear of all that is requested of the far ends."""
         self.far_ends = [FarEnd(self.far, name, self.witness.disturb) for name in self.far.devices]
-        self.controller.observers.append(
+        self.make_host()
+        self.table = self.controller.table
+
+    def make_host(self, **more: Any) -> None:
+        """Make a control loop in place of the one before, if any; more: as a `Controller` takes."""
+        controller = self.controller = self.make_controller(**more)
+        self.witness.follow(controller)
+        controller.step = partial(self._turn, controller.step)  # type: ignore[method-assign]
+        self.turning.set()
+        controller.observers.append(
             Observer(
                 contacts_changed=lambda contacts, change: self.contacts.append(len(contacts)),
                 pattern_applied=self.applied.append,
@@ -80,6 +94,16 @@ class Chain:
                 link_lost=self.lost.append,
             )
         )
+
+    async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
+        """Turn the control loop once, unless it stalls."""
+        if not self.turning.is_set():
+            self.witness.set_stalled(clock.now())
+            try:
+                await self.turning.wait()
+            finally:
+                self.witness.set_stalled(clock.now(), False)
+        await step()
 
     @property
     def far_end(self) -> "FarEnd":
@@ -98,33 +122,36 @@ class Chain:
         plate: Rig | None = None,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
         judged: Mapping[str, Any] | None = None,
+        sensed_every: float = STEP,
         capabilities: Mapping[str, int] = MappingProxyType({}),
+        seed: int = 1,
         **options: Any,
     ) -> AsyncIterator[Self]:
         """A chain whose wires are not open yet; wires: of all amplifiers, or of each by name.
 
         passing [s]: shortest and longest time of bytes on serial lines, None for those of machines;
         plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
-        `witness_config`; capabilities: what each amplifier has in place of its own; options: as a
-        `Controller` takes them.
+        `witness_config`; sensed_every [s]: while a channel vibrates; capabilities: what each
+        amplifier has in place of its own; seed: of faults; options: as a `Controller` takes them.
         """
-        far_end = far_side(wires, plate or rig, seed=1, imperfections=imperfections)
+        far_end = far_side(wires, plate or rig, seed=seed, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
                 amplifier.capabilities.update(capabilities)
             witness = LoopWitness(far.urls, **(judged or {}))
-            controller = Controller(
-                rig,
-                table,
-                lines=Lines,
-                urls=far.urls,
-                **{"intent_source": BuzzNewestContact(), "timing": SetTiming(), **options},
-            )
-            witness.follow(controller)
+            plate_judge = PlateJudge(far, witness, step=sensed_every)
+            given = {"timing": SetTiming(), **options}
+
+            def make(**more: Any) -> Controller:
+                own = {"intent_source": BuzzNewestContact(), **given, **more}
+                return Controller(rig, table, lines=Lines, urls=far.urls, **own)
+
             assert far.machine is not None
             far.machine.passing = passing or far.machine.passing
-            chain = cls(far, far.machine, witness, controller)
-            yield chain
+            try:
+                yield cls(far, far.machine, witness, plate_judge, make)
+            finally:
+                plate_judge.close()
 
     @classmethod
     @asynccontextmanager
@@ -143,9 +170,10 @@ class Chain:
             chain.judge(breaks)
 
     def judge(self, breaks: str | None = None) -> None:
-        """Ask the witness; breaks: the only rules that are broken, with spaces between."""
+        """Ask the witness and what judges the plate; breaks: the only rules, spaces between."""
         found = self.witness.finish(clock.now())
         assert {one.invariant for one in found} == {*(breaks or "").split()}, found[:1]
+        assert breaks or not self.plate_judge.violations
         assert self.witness.frames
 
     async def open(self) -> None:
@@ -166,11 +194,16 @@ class Chain:
         now, plate = clock.now(), self.far.bench.rig.plate
         if self.is_felt:
             self.far.bench.place_fingers({str(id): at for id, at in self.at.items()}, now=now)
-        self.witness.contacts(now, tuple(self.at), is_answerable=self.must_be_felt)
         touches = tuple(
             Touch(id, x / plate.length, 1 - y / plate.width) for id, (x, y) in self.at.items()
         )
-        self.controller.deliver(TouchFrame("panel", now - ago, touches, self.timeout))
+        frame = TouchFrame("panel", now - ago, touches, self.timeout)
+        self.deliver(frame, must_be_felt=self.must_be_felt)
+
+    def deliver(self, frame: TouchFrame, *, must_be_felt: bool = False) -> None:
+        """Deliver a frame to the judges, then to the control loop."""
+        self.plate_judge.touched(frame, must_be_felt=must_be_felt)
+        self.controller.deliver(frame)
 
     def put(self, *fingers: Finger, ago: float = 0.0) -> None:
         """Have these fingers in place of all that are down, and report them."""

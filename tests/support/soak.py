@@ -5,6 +5,7 @@ python tests/support/soak.py --seed 17 --trace trace.txt         one of the long
 """
 
 import argparse
+import gc
 import math
 import os
 import resource
@@ -20,10 +21,12 @@ from pathlib import Path
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
-from soak_chain import Outcome, run_plan  # noqa: E402
+from soak_chain import Outcome, Trace, run_plan  # noqa: E402
 from soak_plan import KINDS, make_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
+gc.freeze()  # what is loaded stays
+gc.set_threshold(100_000)  # a run leaves few cycles
 
 
 def run_seed(job: tuple[int, bool], wire: str | None = None) -> tuple[Outcome, bool]:
@@ -97,8 +100,9 @@ def _run_one(options: argparse.Namespace) -> int:
     """Run one seed."""
     plan = make_plan(options.seed, options.wire, short=options.short)
     with options.trace.open("w") if options.trace else nullcontext() as file:
-        outcome = run_plan(plan, trace=file)
-    ends = f"{len(outcome.violations)} violations, trace {outcome.digest}"
+        trace = Trace(file)
+        outcome = run_plan(plan, trace=trace)
+    ends = f"{len(outcome.violations)} violations, trace {trace.digest}"
     _print(*outcome.violations, f"seed {outcome.seed} on {plan.wire}: {ends}")
     return 1 if outcome.violations else 0
 

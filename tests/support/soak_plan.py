@@ -26,6 +26,8 @@ KINDS: Mapping[str, Sequence[int | None]] = {
 SOURCES = ("panel", "table", "page")
 BEGIN = 0.5  # s; all wires are open by then
 SETTLED = 7.0  # s; maximum recovery time after a fault: a pause before a reopening, of 5 s at most
+ENDED = 3.0  # s; after the only scene of a short plan, which nothing follows but the end
+PAUSES = (60.0, 3600.0)  # s; shortest and longest between scenes, short ones more often
 
 FRAME_FAULTS: Sequence[FaultKind] = (
     "drop",
@@ -141,11 +143,12 @@ def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Pla
         length = rng.uniform(2.0, 4.0) if short else rng.uniform(4.0, 15.0)
         actions.append(OperatorAction(time, "ready"))
         actions += scene(rng, time + 1.0, length, amplifiers)
-        time += 1.0 + length + SETTLED
-        busy += 1.0 + length + SETTLED
+        lasts = 1.0 + length + (ENDED if short else SETTLED)
+        time += lasts
+        busy += lasts
         if not short and rng.random() < 0.3:
             actions.append(OperatorAction(time, "disarm"))
-            time += 60 * rng.uniform(2, 60)
+            time += math.exp(rng.uniform(*map(math.log, PAUSES)))
     ordered = tuple(sorted(actions, key=lambda action: action.at))
     return Plan(seed, tuple(lines), amplifiers, ordered, time, busy)
 

@@ -48,15 +48,18 @@ class _Selector(selectors.DefaultSelector):
         if self._turns > _TURNS_MAX:
             self._turns = 0
             raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
-        ready = super().select(0)
+        is_alone = (
+            len(self.get_map()) == 1 == threading.active_count()
+        )  # nothing but the loop's own
+        ready = [] if is_alone else super().select(0)
         if ready or timeout == 0:
             return ready
         self._turns = 0
         if timeout is None:
-            if len(self.get_map()) == 1 == threading.active_count():  # nothing but the loop's own
+            if is_alone:
                 raise Stuck("deadlock: no timer and no ready task")
             return super().select(timeout)
-        if any(each.name in _AWAITED for each in threading.enumerate()):
+        if not is_alone and any(each.name in _AWAITED for each in threading.enumerate()):
             return super().select(_REAL_WAIT)
         self._loop.now = max(self._loop.now, self._loop._scheduled[0].when())
         return ready

@@ -1,6 +1,7 @@
 """A witness of amplifiers by their URLs, and of a control loop in virtual time."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from typing import Any, get_args
@@ -8,6 +9,7 @@ from typing import Any, get_args
 from controller.loop.loop import Controller
 from drivers import clock
 from sim.amplifier.contract import Amplifier
+from sim.faults.fault_window import FaultWindow
 from sim.witness.witness import OperatorCommand, Witness
 from sim.witness_relay import parse_endpoint
 from virtual_loop import VirtualLoop
@@ -53,19 +55,23 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
 class LoopWitness(Witness):
     """A witness of all wires of a control loop, in virtual time, by the URLs of its amplifiers.
 
-    judged: by what it judges, as for `witness_config`.
+    It hears only what a host hears that has the wires open. judged: by what it judges, as for
+    `witness_config`.
     """
 
     def __init__(self, urls: Mapping[str, str], **judged: Any) -> None:
         super().__init__(witness_config(urls, **judged))
+        self._is_open = False
+        self._active_faults = 0
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.seen = self.seen
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
-        """Hear bytes."""
-        self.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+        """Hear bytes, unless no host has the link open."""
+        if self._is_open:
+            self.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
 
     def follow(self, controller: Controller) -> None:
         """Hear of each command, opening and closing of a control loop."""
@@ -80,11 +86,13 @@ class LoopWitness(Witness):
 
     def opens(self) -> None:
         """A host is about to open all wires."""
+        self._is_open = True
         for link in self.wires:
             self.opened(link, clock.now())
 
     def closes(self) -> None:
         """The host has closed all, or died."""
+        self._is_open = False
         for link in self.wires:
             self.closed(link, clock.now())
 
@@ -94,10 +102,18 @@ class LoopWitness(Witness):
         finally:
             self.closes()
 
-    def disturb(self, *, are_on: bool = True) -> None:
-        """Faults begin or end; one wire's may show on each."""
+    def inject_fault(self, window: FaultWindow) -> None:
+        """A fault begins. What it does to one wire, a controller of all may show on each."""
+        self.disturb()
+        lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
+        if lasts < math.inf:
+            self.loop.call_later(lasts, self.disturb, -1)
+
+    def disturb(self, change: int = 1) -> None:
+        """One more fault is active on all wires, or by -1 one less."""
+        self._active_faults += change
         for link in self.wires:
-            self.faults(clock.now(), link, are_on=are_on)
+            self.faults(clock.now(), link, are_on=self._active_faults > 0)
 
 
 def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:

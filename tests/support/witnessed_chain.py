@@ -25,7 +25,6 @@ from sim.far_ends.wires import Wire
 from sim.witness.capture import Violation
 from sim.witness.witness import OperatorCommand
 from virtual_loop import run_virtual
-from witness_config import sense
 
 SENSED_EVERY = 0.001  # s
 _LONGEST = 5.0  # s; a planted bug may cause a deadlock
@@ -63,22 +62,18 @@ class Scene(Chain):
         await self.rest(rest)
 
     def run(self) -> None:
-        """Start the control loop."""
-        self.witness.set_stalled(clock.now(), False)
-        self.running = asyncio.create_task(self.tried(self.controller.run()))
+        """Start the control loop, or let it go on."""
+        self.turning.set()
+        if self.running is None:
+            self.running = asyncio.create_task(self.tried(self.controller.run()))
 
-    async def hang(self) -> None:
+    def hang(self) -> None:
         """Stall the control loop."""
-        if self.running is not None:
-            self.running.cancel()
-            await asyncio.gather(self.running, return_exceptions=True)
-            self.running = None
-        await self.rest(0.002)  # until bytes in flight are on the wire
-        self.witness.set_stalled(clock.now())
+        self.turning.clear()
 
     def touch_beside(self) -> None:
         """Deliver a touch beside the plate."""
-        self.controller.deliver(TouchFrame("panel", clock.now(), (Touch(9, 1.3, 0.5),)))
+        self.deliver(TouchFrame("panel", clock.now(), (Touch(9, 1.3, 0.5),)))
 
     async def touch(self, *fingers: int, answerable: bool = True, rest: float = 0.0) -> None:
         """Replace the fingers on the plate, which the source repeats, then sleep for `rest` [s]."""
@@ -102,6 +97,7 @@ class Scene(Chain):
     async def reopen(self) -> None:
         """Close and reopen all, including the control loop."""
         await super().close()
+        self.running = None
         await self.rest(0.01)
         await self.open()
 
@@ -116,7 +112,6 @@ class Scene(Chain):
         if self._holding is not None:
             self._holding.cancel()
         await self.rest(0.150)
-        self.witness.contacts(clock.now(), ())
 
     def inject(self, kind: int, words: Sequence[int]) -> None:
         """Inject a request of another program toward the amplifier on the first wire."""
@@ -162,15 +157,6 @@ class Scene(Chain):
         except Exception as error:
             self.errors.append(error)
 
-    async def keep_sensing(self) -> None:
-        """Have sensors on every channel, a thousand times a second."""
-        while True:
-            now = clock.now()
-            self.far.bench.advance(now)
-            for name, amplifier in self.far.bench.amplifiers.items():
-                sense(self.witness, now, name, amplifier)
-            await asyncio.sleep(SENSED_EVERY)
-
 
 def play(
     wire: str, scenario: Sequence[Callable[[Scene], Any]], *, amplifiers: Sequence[str] = ("main",)
@@ -187,16 +173,15 @@ def play(
         rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
         table = SetTable(ALONE, rig.plate, SHARED)
         judged = {"channels": 3, "level": 0.5, "slew_per_s": 100}
-        async with Scene.on(Wire(wire), rig, table, judged=judged) as scene:
+        options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
+        async with Scene.on(Wire(wire), rig, table, **options) as scene:
             scene.witness.contacts(clock.now(), ())
-            sensing = asyncio.create_task(scene.keep_sensing())
             await scene.tried(scene.open())
             if not scene.errors:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(_LONGEST):
                         await scene.tried(steps(scene))
             await scene.close()
-            sensing.cancel()
             return scene, scene.witness.finish(clock.now())
 
     return run_virtual(run(), rng=random.Random(1))

@@ -32,7 +32,7 @@ async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_
 
     def press(*loads: float) -> None:
         touches = (Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=load) for load in loads))
-        chain.controller.deliver(TouchFrame("panel", now(), touches))
+        chain.deliver(TouchFrame("panel", now(), touches))
 
     async with set_running() as chain:
         for base, decisions in ((1.0, 1), (2.0, 2), (1.2, 3)):

@@ -242,11 +242,11 @@ async def test_vibration_of_a_silent_sender_is_not_renewed() -> None:
     """It lasts as long as the contact does, and a little; any frame of the sender prolongs both."""
     async with set_running() as chain:
         begin = asyncio.get_running_loop().time()
-        chain.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
+        chain.deliver(frame(Touch(*FINGER), timeout=3.0))
         await asyncio.sleep(2.5)
         ((sent, only),) = vibrations(chain)
         assert 3.0 <= sent - begin + valid_for(only) <= 3.3
-        chain.controller.deliver(frame(Touch(*FINGER), timeout=3.0))
+        chain.deliver(frame(Touch(*FINGER), timeout=3.0))
         await asyncio.sleep(0.1)
         _, (again, renewed) = vibrations(chain)
         assert 5.5 <= again - begin + valid_for(renewed) <= 5.8
@@ -261,7 +261,7 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Were it never lifted, heartbeats alone would keep nothing playing."""
-    async with set_running() as chain:
+    async with set_running(breaks="lift") as chain:
         never = property(lambda tracker: math.inf, lambda tracker, at: None)
         monkeypatch.setattr(ContactTracker, "next_expiry", never, raising=False)
         monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())

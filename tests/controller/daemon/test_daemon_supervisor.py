@@ -175,7 +175,7 @@ async def stall(daemon: Watched, seconds: float) -> None:
 @in_virtual_time
 async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> None:
     """Another program may have played it meanwhile."""
-    async with watched() as daemon:
+    async with watched(breaks="plate") as daemon:
         await daemon.handle(ARM)
         await asyncio.sleep(0.02)
         await stall(daemon, 0.15)

@@ -18,6 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Response
+from websockets.protocol import Event
+from websockets.typing import Subprotocol
+from websockets.uri import parse_uri
+
 from controller.api.client import Client
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -55,6 +62,7 @@ from rig_files import write_rig
 
 T = TypeVar("T")
 TOKEN = "a-token-of-these-tests-only"
+_KEY = "dGhlIHNhbXBsZSBub25jZQ=="  # of RFC 6455
 
 
 class ScriptedDaemon:
@@ -419,29 +427,32 @@ def upgrade(
     """The handshake request of a WebSocket."""
     lines = [f"GET {target} HTTP/1.1", f"Host: {host or gateway.host}", "Upgrade: websocket"]
     lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13"]
-    lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]  # of RFC 6455
+    lines += [f"Sec-WebSocket-Key: {_KEY}"]
     lines += [f"Sec-WebSocket-Protocol: {', '.join(protocols)}"] if protocols else []
     lines += [] if origin is None else [f"Origin: {origin}"]
     return "\r\n".join([*lines, *more, "", ""]).encode()
 
 
 class RawWebSocket:
-    """A WebSocket client that sends any frames, by RFC 6455, section 5.
+    """A WebSocket client that sends any frames, and leaves what it receives as it is.
 
     hello: the first frame, the daemon's response to the gateway's hello.
     """
 
     def __init__(self, gateway: GatewayProcess, *, target: str = "/api/v1/ws") -> None:
         self.connection = gateway.connect()
+        self._protocol = ClientProtocol(
+            parse_uri(f"ws://{gateway.host}"),
+            subprotocols=[Subprotocol("era-haptics.v1")],
+            max_size=None,
+        )
+        self._protocol.key = _KEY
+        self._events: list[Event] = []
         origin = f"http://{gateway.host}"
         self.connection.sendall(upgrade(gateway, target=target, origin=origin))
-        self._rest = b""
-        while b"\r\n\r\n" not in self._rest:
-            part = self.connection.recv(1 << 16)
-            assert part, f"no handshake: {self._rest!r}"
-            self._rest += part
-        self.head, _, self._rest = self._rest.partition(b"\r\n\r\n")
-        assert b" 101 " in self.head, self.head
+        head = self._event()
+        assert isinstance(head, Response), "no handshake"
+        assert head.status_code == 101, head
         _, self.hello = self.next()
 
     def __enter__(self) -> "RawWebSocket":
@@ -450,9 +461,9 @@ class RawWebSocket:
     def __exit__(self, *_: object) -> None:
         self.connection.close()
 
-    def send(self, payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> None:
+    def send(self, payload: bytes, *, first: int = 0x81) -> None:
         """Send a frame; first: its first byte, by default FIN and text."""
-        self.connection.sendall(frame(payload, first=first, is_masked=is_masked))
+        self.connection.sendall(frame(payload, first=first))
 
     def call(self, method: str, params: object, *, id: int = 1) -> None:
         """Send a request."""
@@ -461,16 +472,8 @@ class RawWebSocket:
 
     def next(self) -> tuple[int, bytes]:
         """Opcode and payload of the next frame; (8, b"") at the end of the connection."""
-        try:
-            head = self._take(2)
-            size = head[1] & 0x7F
-            if size == 126:
-                size = int.from_bytes(self._take(2), "big")
-            elif size == 127:
-                size = int.from_bytes(self._take(8), "big")
-            return head[0] & 0x0F, self._take(size)
-        except ConnectionError:
-            return 8, b""
+        event = self._event()
+        return (event.opcode, bytes(event.data)) if isinstance(event, Frame) else (8, b"")
 
     def response(self, id: int | None = 1) -> dict[str, object]:
         """The response with an id; frames before it are skipped."""
@@ -487,26 +490,23 @@ class RawWebSocket:
             if opcode == 8:
                 return int.from_bytes(payload[:2], "big")
 
-    def _take(self, count: int) -> bytes:
-        while len(self._rest) < count:
-            part = self.connection.recv(1 << 16)
+    def _event(self) -> Event | None:
+        """The next head or frame; None at the end of the connection."""
+        while not self._events:
+            try:
+                part = self.connection.recv(1 << 16)
+            except ConnectionError:
+                return None
             if not part:
-                raise ConnectionResetError
-            self._rest += part
-        taken, self._rest = self._rest[:count], self._rest[count:]
-        return taken
+                return None
+            self._protocol.receive_data(part)
+            self._events = self._protocol.events_received()
+        return self._events.pop(0)
 
 
-def frame(payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> bytes:
-    """A client's frame, masked with zeros."""
-    mask, key = (0x80, bytes(4)) if is_masked else (0, b"")
-    if len(payload) < 126:
-        size = bytes([mask | len(payload)])
-    elif len(payload) < 1 << 16:
-        size = bytes([mask | 126]) + len(payload).to_bytes(2, "big")
-    else:
-        size = bytes([mask | 127]) + len(payload).to_bytes(8, "big")
-    return bytes([first]) + size + key + payload
+def frame(payload: bytes, *, first: int = 0x81) -> bytes:
+    """A client's frame."""
+    return Frame(Opcode(first & 0x0F), payload, fin=bool(first & 0x80)).serialize(mask=True)
 
 
 UNCONFIRMED = {

@@ -34,7 +34,7 @@ from controller.daemon.api_views import (
     amplifier_silence,
     effects_result,
     hello_result,
-    predicted_of,
+    playing_of,
 )
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.operation import LEASE_OVER
@@ -114,7 +114,6 @@ class ApiService:
     def _status(self, client: Connection, params: Empty) -> StatusResult:
         operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
         lease = operation.lease_at(now)
-        pattern = view.pattern_event() if operation.state is _ENABLED else None
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
@@ -128,10 +127,8 @@ class ApiService:
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.statuses_now(self._controller.table),
-            drive=view.drive() if pattern else {},
-            layers=view.layers() if pattern else {},
             silence_reason=view.silenced.reason if view.silenced and lease else None,
-            **predicted_of(view.applied if pattern else None),
+            **playing_of(view.applied if operation.state is _ENABLED else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
             rejected_touches=dict(self._controller.rejected_touches),

@@ -89,9 +89,7 @@ class PlateView:
                 contact_status(contact, applied, self.effect_of(contact.key))
                 for contact in applied.contacts
             ],
-            drive=self.drive(),
-            layers=self.layers(),
-            **predicted_of(applied),
+            **playing_of(applied),
             latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
 
@@ -109,20 +107,14 @@ class PlateView:
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
         )
 
-    def drive(self) -> dict[str, PlayedTone]:
-        """The tones of the newest content, by ERA."""
-        return {} if self.applied is None else played_tones(self.applied.drive)
 
-    def layers(self) -> dict[str, dict[str, PlayedTone]]:
-        """The tones of every content, by layer, then by ERA."""
-        contents = {} if self.applied is None else self.applied.contents
-        return {str(number): played_tones(each.drive) for number, each in contents.items()}
-
-
-def predicted_of(applied: Applied | None) -> dict[str, Any]:
-    """What is promised and predicted of a pattern; None throughout while nothing plays."""
+def playing_of(applied: Applied | None) -> dict[str, Any]:
+    """What of a `Playing` is of a pattern: its tones, what is promised and predicted, if any."""
     pattern = None if applied is None else applied.pattern
+    contents = {} if applied is None else applied.contents
     return {
+        "drive": {} if applied is None else played_tones(applied.drive),
+        "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
         "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
         "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
         "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),

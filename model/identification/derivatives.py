@@ -63,7 +63,7 @@ def _by_plate(plate: PlateAt) -> Columns:
         change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
         if plate.bending is not None:
             change += seen @ (plate.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
-        rest = functions.by_logarithms(0.0, of_rest)[:, -TERMS:]
+        rest = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
         further = _attached(plate, combined(rest, plate.located.truncated))
         return np.asarray(plate.scale * (further - functions.thickness**3 * change))[..., None]
 

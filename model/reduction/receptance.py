@@ -95,24 +95,8 @@ class FreeReceptance:
         weights = truncation_weights(self._shifted, self.largest, terms)
         return np.asarray(weights / self._scale)
 
-    def by_logarithms(
-        self, of_modes: ComplexArray | float, of_rest: ComplexArray | float
-    ) -> ComplexArray:
-        """Derivative of `values` (..., f, r + TERMS) by what changes logarithms of the stiffness.
-
-        of_modes (..., f, r), of_rest (..., f): by how much those of modes and of truncated sums.
-        """
-        rest = np.asarray(of_rest)[..., None] * self._by_log_q
-        return np.concatenate([of_modes * self.by_mode, rest], axis=-1)
-
     @cached_property
-    def by_mode(self) -> ComplexArray:
-        """Derivative of each mode's receptance by the logarithm of its stiffness, (..., f, r)."""
-        h = np.asarray(self.thickness)[..., None, None]
-        return np.asarray(-(h**3) * self.elastic * self.modal**2)
-
-    @cached_property
-    def _by_log_q(self) -> ComplexArray:
+    def truncated_by_log_q(self) -> ComplexArray:
         """Derivative of the truncated sums by ln q, (..., f, TERMS)."""
         weights = truncation_weights(self._shifted, self.largest, TERMS)
         slopes = truncation_slopes(self._shifted, self.largest, TERMS)

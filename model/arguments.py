@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections.abc import Iterable
 from numbers import Integral, Real
 from pathlib import Path
 
@@ -44,13 +43,6 @@ def expect_values(
             raise InputError(f"{what}: {name} must be finite and not negative, got {value}")
         if is_above and value == 0:
             raise InputError(f"{what}: {name} must be above zero, got {value}")
-
-
-def expect_one_of(names: Iterable[str], value: object, *, what: str) -> None:
-    """Raise InputError for anything but one of these names."""
-    known = tuple(names)
-    if not isinstance(value, str) or value not in known:
-        raise InputError(f"{what} must be one of {', '.join(known)}, got {shown(value)}")
 
 
 def is_whole(value: object) -> bool:

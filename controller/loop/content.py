@@ -125,16 +125,6 @@ class Selection:
         served = {each.contact.key: each for one in self.contents for each in one.predictions}
         return (*served.values(), *self.not_served)
 
-    @property
-    def pattern(self) -> Pattern | None:
-        """The pattern of the last content."""
-        return self.contents[-1].pattern if self.contents else None
-
-    @property
-    def question(self) -> Question | None:
-        """The question of the last content."""
-        return self.contents[-1].question if self.contents else None
-
 
 def no_layer_free(count: int) -> str:
     """Return why a content is held back where the layers of the amplifiers are all taken."""

@@ -53,11 +53,6 @@ class Forms:
     fine: Complex64Array | None = None
 
     @property
-    def frequency_count(self) -> int:
-        """Number of frequencies."""
-        return len(self.quiet)
-
-    @property
     def era_count(self) -> int:
         """Number of ERAs."""
         return int(self.quiet.shape[-1])

@@ -28,7 +28,6 @@ class DiscRule:
 
     points: FloatArray
     weights: FloatArray
-    degree: int
 
     def cut(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Points (k, p, 2) and weights (..., k, p) for the disc's parts in rectangles.
@@ -63,7 +62,7 @@ class DiscRule:
         return np.asarray(fitted / fitted.sum(axis=-1, keepdims=True))
 
 
-def _rings(degree: int, *rings: tuple[float, int, float]) -> DiscRule:
+def _rings(*rings: tuple[float, int, float]) -> DiscRule:
     """A rule of rings: radius, number of points, and weight of all of them together."""
     points, weights = [], []
     for radius, count, weight in rings:
@@ -71,19 +70,18 @@ def _rings(degree: int, *rings: tuple[float, int, float]) -> DiscRule:
         points.append(radius * np.column_stack([np.cos(angles), np.sin(angles)]))
         weights.append(np.full(count, weight / count))
     # Rounded, for points that shall lie on the axes.
-    return DiscRule(np.concatenate(points).round(15), np.concatenate(weights), degree)
+    return DiscRule(np.concatenate(points).round(15), np.concatenate(weights))
 
 
-FIVE_POINTS = _rings(3, (0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
-"""The centre and four points of the rim: for searches."""
+FIVE_POINTS = _rings((0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
+"""The centre and four points of the rim, exact to degree 3: for searches."""
 
-FINE_POINTS = _rings(7, (0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
-"""Twenty-one points, twelve of them on the rim: for figures."""
+FINE_POINTS = _rings((0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
+"""Twenty-one points, twelve of them on the rim, exact to degree 7: for figures."""
 
 FIVE_AND_FINE = DiscRule(
     np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
     np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),
-    degree=3,
 )
 """Both, the five points first: weights (2, 26) for the mean by either."""
 

@@ -79,7 +79,6 @@ class Carrier:
     that ends; gain_variance: var(d).
     """
 
-    frequency: float
     hats: Complex64Array
     steady: ComplexArray
     residual_form: Complex64Array
@@ -141,7 +140,6 @@ def solve_carrier(
     form = flat.conj().T @ residual_form @ flat
     _add_errors(form, len(plate.eras), gain_variance)
     return Carrier(
-        frequency,
         np.ascontiguousarray(hats, dtype=np.complex64),
         steady,
         np.asarray(form, dtype=np.complex64),

@@ -66,7 +66,7 @@ class MeshError:
 
 @dataclass(frozen=True)
 class Convergence:
-    """Errors of several meshes against a reference mesh, response at frequencies (f,) [Hz].
+    """Errors of several meshes against a reference mesh, response at f frequencies.
 
     natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,). For
     comparison, by how much the response changes, as `MeshError.response`, where every ERA stands
@@ -74,7 +74,6 @@ class Convergence:
     """
 
     reference: PlateMesh
-    frequencies: FloatArray
     natural_frequencies: FloatArray
     errors: tuple[MeshError, ...]
     by_place: FloatArray
@@ -159,7 +158,6 @@ def study_convergence(
     )
     return Convergence(
         reference.mesh,
-        checked,
         exact[supported],
         tuple(errors),
         by_place=by_place,

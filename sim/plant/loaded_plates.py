@@ -38,7 +38,6 @@ _MAX_SOLVED = 32  # sets of contacts, of about a megabyte each
 class LoadedPlate:
     """The plate under a set of contacts, reduced for forces at them."""
 
-    contacts: tuple[FingertipLoad, ...]
     reduced: ReducedPlate
     plate: PlateInTime
     _tables: dict[float, ComplexArray] = field(default_factory=dict)
@@ -126,10 +125,10 @@ class LoadedPlateCache:
     ) -> LoadedPlate:
         if not points:
             unloaded = _solve_unloaded(self._unloaded, self._eras, self._loads)
-            return LoadedPlate(contacts, self._unloaded, unloaded)
+            return LoadedPlate(self._unloaded, unloaded)
         reduced = self._reduced_at(points)
         plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
-        return LoadedPlate(contacts, reduced, plate)
+        return LoadedPlate(reduced, plate)
 
     def _reduce(self, points: tuple[Footprint, ...]) -> ReducedPlate:
         return self._unloaded.with_attachments_at(np.array(points))

@@ -95,20 +95,6 @@ class Plant:
         """The present contacts by id of the finger."""
         return self._contacts
 
-    @property
-    def state(self) -> tuple[FloatArray, FloatArray]:
-        """Present displacement and velocity, (r,) each, in the coordinates of `reduced`."""
-        q, v = self._state()
-        r = len(self.reduced.omega)
-        return q[:r], v[:r]
-
-    @property
-    def phalanges(self) -> tuple[FloatArray, FloatArray]:
-        """Present displacement [m] and velocity [m/s] of each contact's phalanx, (n,) each."""
-        q, v = self._state()
-        r = len(self.reduced.omega)
-        return q[r:], v[r:]
-
     def set_input(self, era: int, motion: Motion, *, since: float | None = None) -> None:
         """Set the base motion of an ERA after a time [s], by default the present one.
 
@@ -139,7 +125,7 @@ class Plant:
         if contacts == self._contacts:
             return
         before = self._current, self._contacts
-        state = np.concatenate(self._state())
+        state = np.concatenate(self.state)
         self._current = loaded or self.solution(contacts, time=self.time)()
         self._contacts = dict(contacts)
         remainder = carried_state(state, before, (self._current, contacts))
@@ -211,8 +197,12 @@ class Plant:
             )
         return kept
 
-    def _state(self) -> tuple[FloatArray, FloatArray]:
-        """Displacement and velocity of all coordinates, the phalanges' last."""
+    @property
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """Present displacement and velocity, (r + n,) each.
+
+        Of the coordinates of `reduced`, then of each contact's phalanx [m], [m/s].
+        """
         self._advance(self.time)
         plate, since = self._current.plate, self._forced.times[self._solution]
         free = self._free * np.exp(plate.decay * (self.time - since))

@@ -126,10 +126,10 @@ def test_selector_scales_to_what_the_neighbours_allow(table: Table) -> None:
     table.quiet_level = -2.0
     selection = selector_of(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
     assert table.asked[0].level_db_sl == 12.0
-    assert selection.pattern is not None
+    (content,) = selection.contents
     assert selection.predictions[0].level_db_sl == pytest.approx(4.0)
-    assert selection.pattern.quiet_level_db_sl == pytest.approx(-10.0)
-    assert selection.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
+    assert content.pattern.quiet_level_db_sl == pytest.approx(-10.0)
+    assert content.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
 
 
 @pytest.mark.parametrize(
@@ -174,12 +174,12 @@ def test_selector_saturates_a_level_or_less(table: Table) -> None:
     contacts = (at(1, 0.1), at(2, 0.2))
     for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
         selection = selector_of(table).select(contacts, allow_weaker(wanted), capabilities)
-        assert selection.pattern is not None
+        (content,) = selection.contents
         assert selection.predictions[0].level_db_sl == pytest.approx(level)
-        assert selection.question is table.asked[-1]
+        assert content.question is table.asked[-1]
     table.most = 11.0
     selection = selector_of(table).select(contacts, allow_weaker(30.0), capabilities)
-    assert (selection.pattern, selection.reason) == (None, "too loud")
+    assert (selection.contents, selection.reason) == ((), "too loud")
 
 
 def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
@@ -187,9 +187,9 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
     selection = selector_of(table).select((at(1, 0.1),), allow_weaker(60.0), capabilities)
-    assert selection.pattern is not None
+    (content,) = selection.contents
     assert 12 < selection.predictions[0].level_db_sl < 60
-    loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
+    loudest = max(tone.amplitude for tone in content.pattern.excitation.values())
     assert loudest == pytest.approx(1e-4)
 
 
@@ -296,10 +296,12 @@ def test_selector_asks_again_when_it_must(table: Table, name: str) -> None:
         chosen = selector.select(step.contacts, step.intent, CAPABILITIES)
         assert len(table.asked) - count == step.is_asked, step
         assert step.is_asked is (chosen is not before) or not chosen.targets, step
-        assert (chosen.pattern is None) is bool(step.reason), step
+        assert bool(chosen.contents) is not bool(step.reason), step
         assert step.reason in ("", chosen.reason), step
         for wanted, found in ((step.loads, "loads"), (step.frequencies, "frequencies")):
-            assert wanted in (None, getattr(chosen.question, found, None)), step
+            assert wanted in (None, *(getattr(one.question, found) for one in chosen.contents)), (
+                step
+            )
         before = chosen
 
 

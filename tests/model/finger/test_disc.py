@@ -26,14 +26,14 @@ def disc_mean(i: int, j: int) -> float:
     return beta / math.pi * 2 / (i + j + 2)
 
 
-@pytest.mark.parametrize("rule", [FIVE_POINTS, FINE_POINTS])
-def test_rules_integrate_polynomials_up_to_their_degree(rule: DiscRule) -> None:
+@pytest.mark.parametrize(("rule", "degree"), [(FIVE_POINTS, 3), (FINE_POINTS, 7)])
+def test_rules_integrate_polynomials_up_to_their_degree(rule: DiscRule, degree: int) -> None:
     """Every monomial up to the degree has the exact mean over the disc, one beyond has not."""
     x, y = rule.points.T
-    for i in range(rule.degree + 1):
-        for j in range(rule.degree + 1 - i):
+    for i in range(degree + 1):
+        for j in range(degree + 1 - i):
             assert rule.weights @ (x**i * y**j) == pytest.approx(disc_mean(i, j), abs=1e-14)
-    beyond = rule.degree + 1
+    beyond = degree + 1
     assert abs(rule.weights @ x**beyond - disc_mean(beyond, 0)) > 1e-3
 
 

@@ -34,7 +34,7 @@ def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, Felt]:
     form = rows.conj().T @ rows
     single = np.complex64
     carrier = Carrier(
-        100.0, hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
+        hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
     )
     at = rng.standard_normal((1 + 5 * quiet, r))
     return carrier, Felt.at(carrier, at[:1], at[1:])

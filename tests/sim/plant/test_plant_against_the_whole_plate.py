@@ -76,7 +76,7 @@ def test_plant_with_changing_contacts_agrees_with_newmark(
     for until, contacts in [*COMING_AND_GOING, (0.12, None)]:
         shapes = plant.reduced.at(points)
         pieces.append(plant.advance(until, sample_rate=RATE, shapes=shapes)[1])
-        states.append([shapes @ part for part in plant.state])
+        states.append([shapes @ part[: shapes.shape[1]] for part in plant.state])
         if contacts is not None:
             plant.set_contacts(contacts)
     motions = [base.motion for base in BASES]

@@ -130,7 +130,7 @@ def realised(
     plate, eras = rig.plate, rig.eras
     around = np.exp(0.25j * np.pi * np.arange(8))
     at = np.concatenate([[0], np.sqrt(0.5) * around, around])
-    rule = DiscRule(np.column_stack([at.real, at.imag]), np.repeat([4, 2, 0.5], [1, 8, 8]) / 24, 7)
+    rule = DiscRule(np.column_stack([at.real, at.imag]), np.repeat([4, 2, 0.5], [1, 8, 8]) / 24)
     discs, weights = fingertips_on(
         np.array(asked.contacts), length=plate.length, width=plate.width, rule=rule
     )

@@ -349,11 +349,15 @@ class Bench:
             playing = self.amplifiers[wired.amplifier].outputs[wired.number]
             before = self._outputs[index]
             if playing is not before and playing != before:
-                self._plant.set_input(index, self._motion(index, playing), since=self._time)
-                self._played.append((before, self._time))
-                self._outputs[index] = playing
+                self._apply(index, playing)
         while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
+
+    def _apply(self, index: int, playing: Voices) -> None:
+        """Let an output move the base of an ERA."""
+        self._plant.set_input(index, self._motion(index, playing), since=self._time)
+        self._played.append((self._outputs[index], self._time))
+        self._outputs[index] = playing
 
     def _motion(self, index: int, playing: Voices) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""

@@ -177,7 +177,7 @@ class Chain:
         """
         found = self.witness.finish(clock.now())
         assert {one.invariant for one in found} == {*(breaks or "").split()} - {"plate"}, found[:1]
-        assert breaks or not self.plate_judge.violations
+        assert breaks or not self.plate_judge.violations, self.plate_judge.violations
         assert self.witness.frames
 
     async def open(self) -> None:

@@ -1,6 +1,6 @@
 """Courses of a chain in virtual time: lists of steps in a YAML file, by the sentence they prove.
 
-A step is a method of what is played, or `is`: values of its properties, by their names.
+A step is a method of what is played or, with dots, of its parts; or `is`: values of properties.
 """
 
 import asyncio
@@ -52,11 +52,6 @@ class Acted(Chain):
     whole: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def group(self) -> str:
-        """The state of all amplifiers together."""
-        return self.controller.group.state.name
-
-    @property
     def amplifiers(self) -> str:
         """Their states, each once."""
         return ", ".join(dict.fromkeys(each.state for each in self.far_ends))
@@ -82,11 +77,6 @@ class Acted(Chain):
         return "OPERATION_ENABLED" in self.amplifiers.split(", ")
 
     @property
-    def is_preparing(self) -> bool:
-        """Whether a touch is being prepared."""
-        return self.controller.is_preparing
-
-    @property
     def from_rest(self) -> list[bool]:
         """Of each pattern, whether the plate was at rest before."""
         return [each.from_rest for each in self.applied]
@@ -95,11 +85,6 @@ class Acted(Chain):
     def latencies_ms(self) -> list[float]:
         """Of each pattern."""
         return [round(1e3 * (each.latency or math.nan), 2) for each in self.applied]
-
-    @property
-    def refusals(self) -> str:
-        """Why sets were refused."""
-        return ", ".join(self.refused)
 
     @property
     def reason(self) -> str:
@@ -140,10 +125,6 @@ class Acted(Chain):
         """Have the table answer by frequencies [Hz] and amplitudes [m], by ERA."""
         self.table.excitation = {era: Tone(*tone) for era, tone in tones.items()}
 
-    async def operator(self, command: str) -> None:
-        """Let the operator command the control loop."""
-        await getattr(self.controller, command)()
-
     def fails(self, *methods: str) -> None:
         """Let methods of the control loop fail from now on."""
 
@@ -161,20 +142,20 @@ class Acted(Chain):
 
     async def begins(self, step: Step) -> None:
         """Begin a step, and let the loop turn."""
-        self.under_way[_name(step)] = asyncio.create_task(self.take(step))
+        self.under_way[str(step)] = asyncio.create_task(self.take(step))
         await asyncio.sleep(0)
 
     async def ends(self, step: Step) -> None:
         """Wait until a step was taken."""
-        await self.under_way.pop(_name(step))
+        await self.under_way.pop(str(step))
 
     async def ends_anyhow(self, step: Step) -> None:
         """Wait until a step was taken, or refused."""
-        await asyncio.gather(self.under_way.pop(_name(step)), return_exceptions=True)
+        await asyncio.gather(self.under_way.pop(str(step)), return_exceptions=True)
 
     def cancels(self, step: Step) -> None:
         """Cancel a step that has begun."""
-        self.under_way[_name(step)].cancel()
+        self.under_way[str(step)].cancel()
 
     async def is_late_for(self, kind: str, seconds: float) -> None:
         """Wait for a request of a kind; its reply, and those after it, leave so much later."""
@@ -286,11 +267,6 @@ class Acted(Chain):
         found = {what: len(attrgetter(what)(self)) for what in numbers}
         assert found == numbers
 
-    def asked_exactly(self, *names: str) -> None:
-        """Require what each amplifier was asked of these kinds, in order."""
-        for each in self.far_ends:
-            assert [name for name in each.names() if name in names] == [*names]
-
     async def refuses(self, step: Step) -> None:
         """Require that a step is refused."""
         await self.refuses_saying(".", step)
@@ -317,10 +293,6 @@ class Acted(Chain):
 
 
 _OF_A_STEP = ("refuses", "begins", "ends", "ends anyhow", "cancels")
-
-
-def _name(step: Step) -> str:
-    return str(step)
 
 
 def _coded(what: str, value: Any) -> Any:

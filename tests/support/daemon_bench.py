@@ -10,12 +10,13 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from chain import Chain
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import ErrorCode, RpcError
@@ -24,12 +25,12 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.host.amplifier import WATCHDOG
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
+from plate_judge import PlateJudge
 from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
 from small_table import small_table
@@ -144,7 +145,7 @@ async def daemon_at(
         dashboard=None,
         watchdog=WATCHDOG if is_virtual else 2.0,
     )
-    witness = judged(daemon, far) if is_virtual else None
+    chain = chain_of(daemon, far) if is_virtual else None
     task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(log)
     try:
@@ -161,27 +162,22 @@ async def daemon_at(
             log.close()
             manager.close()
             lock.release()
-    if witness is not None:
-        found = witness.finish(clock.now())
-        assert not found, found[0]
-        assert witness.frames
+    if chain is not None:
+        chain.plate_judge.close()
+        chain.judge()
 
 
-def judged(daemon: Daemon, far: FarSide) -> LoopWitness:
-    """A witness of a daemon's lines in virtual time, which is told of commands, fingers, faults."""
-    witness, down = LoopWitness(far.urls), dict[str, list[tuple[str, int]]]()
-    witness.follow(daemon._controller)
-
-    def touched(frame: TouchFrame) -> None:
-        down[frame.source] = [(frame.source, touch.id) for touch in frame.touches]
-        witness.contacts(
-            clock.now(), [one for each in down.values() for one in each], is_answerable=False
-        )
-
-    tell_first(daemon._controller, "deliver", touched)
+def chain_of(daemon: Daemon, far: FarSide) -> Chain:
+    """The chain of a daemon in virtual time, which hears of its fingers and faults."""
+    assert far.machine is not None
+    witness = LoopWitness(far.urls)
+    chain = Chain(far, far.machine, witness, PlateJudge(far, witness), lambda: daemon._controller)
+    touched = partial(chain.plate_judge.touched, must_be_felt=False)
+    for owner, method in ((daemon._controller, "deliver"), (daemon._inputs, "_deliver")):
+        tell_first(owner, method, touched)
     for device in far.devices.values():
         tell_first(device, "inject_fault", lambda *_: witness.disturb())
-    return witness
+    return chain
 
 
 @asynccontextmanager

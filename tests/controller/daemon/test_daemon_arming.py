@@ -195,8 +195,7 @@ async def test_reload_ends_after_unexpected_error(
         for _ in range(10):  # the start is reported within three cycles of the event loop
             await asyncio.sleep(0)
         manager = bench.daemon._manager
-        monkeypatch.setattr(manager, "reloading", lambda: notices.append("reloading"))
-        monkeypatch.setattr(manager, "ready", lambda status: notices.append("ready"))
+        monkeypatch.setattr(manager, "notify", lambda first, *_: notices.append(first))
 
         def fail(path: Path) -> None:
             raise RuntimeError("injected")
@@ -205,7 +204,7 @@ async def test_reload_ends_after_unexpected_error(
             patched.setattr("controller.daemon.daemon.read_in_child", fail)
             await bench.daemon.reload()
         await bench.daemon.reload()
-        assert notices == ["reloading", "ready"] * 2
+        assert notices == ["RELOADING=1", "READY=1"] * 2
 
 
 @in_virtual_time

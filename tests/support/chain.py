@@ -12,14 +12,13 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, Self, cast
 
-from committed_sets import CommittedSets
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.opening import Lines
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_vibrating
+from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
@@ -267,7 +266,8 @@ class Sent:
 class FarEnd:
     """An amplifier of a chain: what is requested of it, and what it does in place of its duty.
 
-    asked: times [s], names and values of all requests; answer may override a reply, or raise
+    asked: times [s], names and values of all requests; committed: time, token and layers of every
+    set, no layers for a silence, as they are carried out; answer may override a reply, or raise
     Refusal; `delay` is of serial lines alone.
     """
 
@@ -280,7 +280,8 @@ class FarEnd:
         self.answer: Callable[[str, Values], Values | None] = lambda name, values: None
         self.obey = self.device.handle
         self.device.handle = self._handle  # type: ignore[method-assign]
-        self.committed = CommittedSets()
+        self.committed: list[tuple[float, int, tuple[LayerSet, ...]]] = []
+        self._staged: dict[int, dict[int, list[int]]] = {}
         self._far = far
         assert far.machine is not None
         self._machine = far.machine
@@ -289,8 +290,21 @@ class FarEnd:
         self.asked.append((now, name, values))
         answer = self.answer(name, values)
         reply = self.obey(name, values, now) if answer is None else answer
-        self.committed.note(name, values, reply, now)
+        self._note(name, values, reply, now)
         return reply
+
+    def _note(self, name: str, values: Values, reply: Values, now: float) -> None:
+        """Note what a request and its reply at a time [s] change."""
+        if name == "Silence":
+            self.committed.append((now, 0, ()))
+        if name == "Set":
+            parts = self._staged.setdefault(values["token"], {})
+            parts[values["index"]] = list(values["stream"])
+        if name == "Commit" or (name == "Set" and reply["played"]):
+            parts = self._staged.pop(values["token"], {})  # none if it was repeated
+            words = [word for index in sorted(parts) for word in parts[index]]
+            if words:
+                self.committed.append((now, values["token"], unpack_layers(words)))
 
     @property
     def port(self) -> str:
@@ -339,7 +353,7 @@ class FarEnd:
         """All sets that were committed, and silences, in order."""
         return [
             Sent(time, token, one)
-            for time, token, layers in self.committed.all
+            for time, token, layers in self.committed
             for one in layers or (LayerSet(0, 0, 0),)
         ]
 

@@ -60,7 +60,7 @@ class Fingers(Chain):
     def __post_init__(self) -> None:
         """Note what requests of the host change."""
         super().__post_init__()
-        self.committed = self.far_end.committed.all
+        self.committed = self.far_end.committed
 
     def reached(
         self, *, over: float = 0.25

@@ -40,7 +40,7 @@ from controller.api.rate_limit import RateLimiter
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
-from controller.gateway.bridge import KeptLink, bridge, client_name, too_many
+from controller.gateway.bridge import KeptLink, bridge, client_name
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -236,9 +236,10 @@ class Gateway:
             if method in SILENCING:  # over the own connection, from any client
                 return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
-            if not (kept.is_open or self._openings.take()):
-                raise too_many()
-            return result_of(read_line(await kept.request(self._daemon, name, method, params)))
+            line = await kept.request(
+                self._daemon, name, method, params, may_open=self._openings.take
+            )
+            return result_of(read_line(line))
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
 

@@ -6,7 +6,7 @@ On a WebSocket frames are lines of the API to the daemon, and the other way.
 import asyncio
 import contextlib
 import itertools
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 
 from starlette.requests import HTTPConnection
@@ -24,9 +24,6 @@ _MAX_NAME = 80  # characters; as in the API
 
 UNSUPPORTED_DATA = 1003  # close code of RFC 6455
 NO_DAEMON = 4001  # one of those for private use; the page connects again
-
-too_many = partial(RpcError, ErrorCode.BUSY, "too many connections", remedy="keep one open")
-"""The error of a further connection over HTTP that calls methods."""
 
 _numbers = itertools.count(1)
 
@@ -130,15 +127,18 @@ class KeptLink:
         """Whether there is one now."""
         return self._link is not None and self._link.is_open
 
-    async def request(self, path: Path, name: str, method: str, params: bytes) -> bytes:
+    async def request(
+        self, path: Path, name: str, method: str, params: bytes, *, may_open: Callable[[], bool]
+    ) -> bytes:
         """Send a request of a client by its name, and return the response.
 
-        Raises RpcError and Unreachable.
+        may_open: whether a connection may be opened now, which counts it; called only where it has
+        a place. Raises RpcError and Unreachable.
         """
         try:
             if self._link is None or not self._link.is_open:
-                if len(self._kept - {self}) >= MAX_KEPT:
-                    raise too_many()
+                if len(self._kept - {self}) >= MAX_KEPT or not may_open():
+                    raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
                 self._kept.add(self)
                 self._link = await DaemonLink.open(path, name)
             if self._is_over:  # sent all the same

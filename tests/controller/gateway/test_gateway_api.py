@@ -15,6 +15,7 @@ import pytest
 from controller.api.methods import METHODS, RequestedBy
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
+from controller.gateway.app import OPENING_BURST
 from gateway_bench import (
     TOKEN,
     UNCONFIRMED,
@@ -123,7 +124,7 @@ def test_http_touches_belong_to_their_connection(
 def test_http_connections_leave_places_of_the_daemon_to_others(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """A ninth is refused until one of them closes."""
+    """A ninth is refused until one of them closes; however often, it takes nothing of browsers."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with contextlib.ExitStack() as stack:
         first, *kept, ninth = [
@@ -133,7 +134,10 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
         for each in (first, *kept, first):
             assert each.post("api/v1/status").status_code == 200
         assert len({id(each) for each in daemon.callers}) == 8
-        assert ninth.post("api/v1/status").status_code == 429
+        refused = [ninth.post("api/v1/status").status_code for _ in range(2 * round(OPENING_BURST))]
+        assert {*refused} == {429}
+        with RawWebSocket(gateway):
+            pass
         first.close()
         wait_for(lambda: ninth.post("api/v1/status").status_code == 200)
 

@@ -151,6 +151,8 @@ class KeptLink:
     def close(self) -> None:
         """Close it: the HTTP connection is over."""
         self._is_over = True
+        if self._link is None:  # it may be on its way to the daemon, and has its place until then
+            return
         self._kept.discard(self)
-        if self._link is not None and self._link.is_open:
+        if self._link.is_open:
             self._link.close()

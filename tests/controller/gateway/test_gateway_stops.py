@@ -5,13 +5,14 @@ import socket
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from controller.api import link
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Unreachable
+from controller.api.jsonrpc import RpcError
 from controller.api.schema import API_VERSION
 from controller.gateway import bridge
 from controller.gateway.field import DrawnField
@@ -90,6 +91,30 @@ async def test_stop_is_answered_although_the_daemon_hangs(
             await link.DaemonLink.open(full_queue, "browser")
         with pytest.raises(Unreachable, match="does not respond"):
             await AsyncClient(full_queue, name="gateway", timeout=0.05).stop()
+
+
+async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
+    full_queue: Path,
+) -> None:
+    """Until their connections have failed: else any number of them would wait for the daemon."""
+    kept: set[bridge.KeptLink] = set()
+
+    def request() -> "asyncio.Task[bytes]":
+        connection = bridge.KeptLink(kept)
+        may_open = Mock(return_value=True)
+        call = connection.request(full_queue, "http", "status", b"{}", may_open=may_open)
+        task = asyncio.create_task(call)
+        asyncio.get_running_loop().call_soon(connection.close)
+        return task
+
+    waiting = [request() for _ in range(bridge.MAX_KEPT)]
+    await asyncio.sleep(0)
+    with pytest.raises(RpcError, match="too many connections"):
+        await request()
+    for each in waiting:
+        each.cancel()
+    await asyncio.wait(waiting)
+    assert not kept
 
 
 class DeafBrowser:

@@ -97,12 +97,15 @@ class _Lane:
     def _take_turn(self) -> None:
         """Serve a line of each client, round and round, until the turn's time is up."""
         self._is_turn_scheduled = False
-        turns, delay = self._turns, 0.0 if self._is_urgent else self._delay()
+        if not self._is_urgent and (delay := self._delay()) > 0:
+            self.schedule(delay)
+            return
+        turns = self._turns
         began_at, end = turns.processor_time(), time.perf_counter() + MAX_TURN
         reading_time = 0.0
+        self._deferred_since = None
         try:
-            while self.waiting and delay <= 0:
-                self._deferred_since = None
+            while self.waiting:
                 connection = self.waiting.popleft()
                 turns.serve(connection)
                 reading_time += connection.reading_time
@@ -114,7 +117,7 @@ class _Lane:
                     break
         finally:  # whatever fails: others wait, perhaps with a stop
             self._budget.spend(turns.processor_time() - began_at + reading_time)
-            self.schedule(delay)
+            self.schedule()
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""

@@ -70,14 +70,20 @@ def feed(client: Connection, data: bytes) -> None:
 
 
 class ServedApi:
-    """A server whose methods take a processor time [s] each; clock [s].
+    """A server whose methods take a processor time [s] each, as does a reading of it; clock [s].
 
     calls: name, parameters and time of each; is_busy: whether a touch is on its way to the wire;
     may_arm: what arming waits for; called: called with each name, and its exceptions are those of
     the method; stops: how often the server itself has stopped all.
     """
 
-    def __init__(self, *, clock: Callable[[], float] = lambda: 0.0, costs: float = 0.0) -> None:
+    def __init__(
+        self,
+        *,
+        clock: Callable[[], float] = lambda: 0.0,
+        costs: float = 0.0,
+        reading_costs: float = 0.0,
+    ) -> None:
         self.calls: list[tuple[str, Message, float]] = []
         self.is_busy = False
         self.may_arm = asyncio.Event()
@@ -85,7 +91,7 @@ class ServedApi:
         self.called: Callable[[str], object] = lambda name: None
         self._processor_time = 0.0
         self.clock = clock
-        self._costs = costs
+        self._costs, self._reading_costs = costs, reading_costs
         self._clients: list[Connection] = []
         self._server = ApiServer(
             {name: partial(self._handle, name) for name in METHODS},
@@ -94,7 +100,7 @@ class ServedApi:
             is_busy=lambda: self.is_busy,
             stop_all=self._stop_all,
             clock=clock,
-            processor_time=lambda: self._processor_time,
+            processor_time=self._read_processor_time,
         )
 
     @property
@@ -124,6 +130,10 @@ class ServedApi:
         while left:
             await asyncio.sleep(0)
             left = 8 if any(client.has_lines for client in self._clients) else left - 1
+
+    def _read_processor_time(self) -> float:
+        self._processor_time += self._reading_costs
+        return self._processor_time
 
     def _stop_all(self) -> None:
         self.stops += 1

@@ -15,11 +15,11 @@ LOOKALIKE = request("renew", '{"lease":"stop"}')
 STOP = request("stop")
 
 
-def serve(*, costs: float = 0.0) -> ServedApi:
-    """A server that counts time from now on, whose methods take a processor time [s] each."""
+def serve(**costs: float) -> ServedApi:
+    """A server that counts time from now on; costs: as for `ServedApi`."""
     loop = asyncio.get_running_loop()
     began_at = loop.time()
-    return ServedApi(clock=lambda: loop.time() - began_at, costs=costs)
+    return ServedApi(clock=lambda: loop.time() - began_at, **costs)
 
 
 @pytest.fixture(autouse=True)
@@ -105,6 +105,16 @@ async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
     served.is_busy = False
     await asyncio.sleep(0.0006)
     assert len(served.times("renew")) == 4
+
+
+@in_virtual_time
+async def test_a_turn_that_is_deferred_costs_its_clients_nothing() -> None:
+    """Else what was saved until it is due may be spent by finding that it is not due yet."""
+    served = serve(costs=0.015, reading_costs=3e-6)
+    client, _ = served.client()
+    feed(client, REQUEST * 3)
+    await asyncio.sleep(0.1)
+    assert served.times("renew") == pytest.approx([0.0, 0.0, 0.04], abs=0.001)
 
 
 @in_virtual_time

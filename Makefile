@@ -30,8 +30,8 @@ firmware-test: .venv/installed-test
 # What needs the processors, and sometimes waits for processes: one worker more than there are; what
 # plays in real time; what loads the processors itself.
 WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
-# A test that never ends is one failure, which says where it was.
-ENDING := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true
+# A test that never ends is one failure, which says where it was; a worker begun anew would wait for ever.
+ENDING := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true --max-worker-restart 0
 test: .venv/installed-test
 	$(BIN)/pytest $(ENDING) -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'real_time and not alone and not long' --numprocesses 2 --dist loadfile --no-loadscope-reorder

@@ -106,7 +106,7 @@ def check(
     else:
         low, high = verdict.frequencies.min(), verdict.frequencies.max()
         rows.append(
-            f"{rig_file}: {counted(verdict.sensor_count, 'sensor')}, "
+            f"{rig_file}: {counted(len(verdict.sensors), 'sensor')}, "
             f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
             f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
         )

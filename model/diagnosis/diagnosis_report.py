@@ -53,8 +53,12 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     if not verdict.plate_matches:
         rows += _plate_rows(verdict)
     elif verdict.match is not None and verdict.match.outliers.any():
-        count = counted(int(verdict.match.outliers.sum()), "value")
-        rows.append(f"OUTLIERS: {count} left out: check for loose contacts if they are many")
+        by_sensor = verdict.match.outliers.sum(axis=(0, 1))
+        worst = best_of(by_sensor)
+        rows.append(
+            f"OUTLIERS: {counted(int(by_sensor.sum()), 'value')} left out, {by_sensor[worst]} of "
+            f"them of sensor {verdict.sensors[worst]}: check for loose contacts if they are many"
+        )
     if rows:
         return rows
     if difference_rows(verdict):
@@ -190,7 +194,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             ],
         },
         "bad_sensors": [{"sensor": each.name, "problem": each.why} for each in verdict.bad_sensors],
-        "sensor_count": verdict.sensor_count,
+        "sensor_count": len(verdict.sensors),
         "drive_frequencies_hz": verdict.frequencies.tolist(),
         "findings": verdict_rows(verdict),
     }

@@ -72,8 +72,8 @@ class Verdict:
 
     plate_matches: whether the rig's plate within its priors explains the measurement; match: that
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
-    out; swapped: cycles of channels by their ERAs; difference: of that plate from the
-    rig's, None without a plate that fits.
+    out; swapped: cycles of channels by their ERAs; difference: of that plate from the rig's, None
+    without a plate that fits; sensors: names of those that were not left out.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -83,7 +83,7 @@ class Verdict:
     bad_sensors: tuple[BadSensor, ...]
     swapped: tuple[tuple[str, ...], ...]
     difference: PlateDifference | None
-    sensor_count: int
+    sensors: tuple[str, ...]
     frequencies: FloatArray
 
     @property
@@ -142,7 +142,7 @@ def diagnose(
             removed,
             (),
             None,
-            len(observation.sensors),
+            observation.sensors,
             observation.frequencies,
         )
     match, drives = best_wiring(plate, values, shapes)
@@ -185,7 +185,7 @@ def diagnose(
         removed,
         _cycles(rig, drives, dead),
         plate_difference(rig, plate.responses(), match) if match.error <= MAX_FIT_ERROR else None,
-        len(observation.sensors),
+        observation.sensors,
         observation.frequencies,
     )
 

@@ -310,6 +310,16 @@ def test_diagnose_passes_a_plate_of_which_some_values_are_glitches(coarse_rig, b
     assert row.startswith("OUTLIERS: 1")
 
 
+def test_diagnose_names_a_sensor_with_a_loose_contact(coarse_rig, built):
+    """Its sign is another one at four of ten frequencies: it is well at most of its values."""
+    values = built.values.copy()
+    values[:8:2, :, 4] *= -1
+    verdict = diagnose(coarse_rig, replace(built, values=values))
+    assert verdict.is_well
+    (row,) = verdict_rows(verdict)
+    assert "16 of them of sensor P5" in row
+
+
 def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
     """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
     rng = np.random.default_rng(1003)

@@ -78,6 +78,10 @@ def _of_any_level(targets: Targets) -> set[Target]:
     return {replace(target, level_db_sl=None) for _, target in targets}
 
 
+def _of_any_course(targets: Targets) -> set[Target]:
+    return {replace(target, pulse=None, modulation_hz=None) for target in _of_any_level(targets)}
+
+
 class Selector:
     """Chooses the contents of a table that realise an intent for the contacts on its plate.
 
@@ -219,9 +223,9 @@ class Selector:
     def _is_intended(self, chosen: Chosen, intended: _Intended) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
 
-        Levels and places may have changed since: else a finger that moves would get nothing; an
-        effect in its old form would be felt for one answer. What plays may do again, since a finger
-        that came has lifted meanwhile.
+        Places may have changed since, and what effects change, or a program that plays them again:
+        else such a finger would get nothing. Those of another layout are not played. What plays may
+        do again, since a finger that came has lifted meanwhile.
         """
         found = chosen.lasting
         return (
@@ -229,7 +233,7 @@ class Selector:
             and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
             and intended.is_among(found)
             and intended.protected <= found.protected
-            and _of_any_level(intended.lasting) <= _of_any_level(found.targets)
+            and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
 
     def _take(self, chosen: Chosen, *, is_late: bool = False) -> None:

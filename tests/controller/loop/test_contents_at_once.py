@@ -521,6 +521,29 @@ async def test_an_answer_of_a_former_layout_is_not_played(
 
 
 @in_virtual_time
+async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A program repeats it every 30 ms, and answers take 50: each is to the play before."""
+    answering_after(0.05, monkeypatch)
+    layout = replace(LAYOUT, effects={**LAYOUT.effects, "long": Buzz(level=14.0, duration=0.5)})
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.3) as fingers:
+        player, count = fingers.controller._intent_source, len(fingers.applied)
+        assert isinstance(player, EffectPlayer)
+        (contact,) = [each for each in fingers.applied[-1].contacts if each.key.id == 1]
+        for _ in range(10):
+            player.play("long", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+            fingers.controller.request_update()
+            await fingers.hold(0.03)
+        names = {
+            one.content.targets[0][1].content
+            for each in fingers.applied[count:]
+            for one in each.contents.values()
+        }
+        assert "long" in names
+
+
+@in_virtual_time
 async def test_an_answer_that_takes_more_than_a_second_is_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

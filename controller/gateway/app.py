@@ -6,6 +6,7 @@ import json
 import math
 import operator
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
@@ -36,7 +37,7 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.methods import METHODS, SILENCING, Method, StatusResult
-from controller.api.rate_limit import RateLimiter
+from controller.api.rate_limit import RateLimiter, Rates
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
@@ -140,8 +141,10 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
 
 MAX_BODY = 1 << 16  # bytes
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-MAX_OPENING_RATE, OPENING_BURST = 16.0, 48.0  # 1/s; connections to the daemon, and in a burst:
-# fewer than it accepts of one process, so that there are always some for the gateway's own
+MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to the daemon, and in
+# a burst
+MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
+# accepts of one process, so that there are always some for the gateway's own
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
@@ -156,7 +159,9 @@ class Gateway:
         self.field = DrawnField(settings.socket)
         self._daemon = settings.socket
         self._session_count = 0
-        self._openings = RateLimiter(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
+        # Of connections to the daemon, by host.
+        self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
+        self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
         # For what must not wait for a new connection, which the daemon may refuse.
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
@@ -237,7 +242,7 @@ class Gateway:
                 return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
             line = await kept.request(
-                self._daemon, name, method, params, may_open=self._openings.take
+                self._daemon, name, method, params, may_open=partial(self._may_connect, request)
             )
             return result_of(read_line(line))
         except Unreachable as error:
@@ -257,7 +262,7 @@ class Gateway:
         if SUBPROTOCOL not in socket.scope["subprotocols"]:
             await socket.close(1002, f"the subprotocol must be {SUBPROTOCOL}")
             return
-        if self._session_count >= MAX_SESSIONS or not self._openings.take():
+        if self._session_count >= MAX_SESSIONS or not self._may_connect(socket):
             await socket.close(TRY_AGAIN_LATER, "too many clients")
             return
         self._session_count += 1  # before the first await, so that the limit holds
@@ -266,6 +271,11 @@ class Gateway:
             await bridge(socket, self._daemon, self.field)
         finally:
             self._session_count -= 1
+
+    def _may_connect(self, client: HTTPConnection) -> bool:
+        """Whether a client's host may open a connection to the daemon; counts it."""
+        host = "" if client.client is None else client.client.host
+        return self._rates.of(host).take() and self._rate.take()
 
 
 async def _body(request: Request) -> bytes:

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 
 import httpx
@@ -140,6 +141,25 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
             pass
         first.close()
         wait_for(lambda: ninth.post("api/v1/status").status_code == 200)
+
+
+def test_who_connects_without_pause_leaves_connections_to_other_hosts(
+    daemon: ScriptedDaemon, tmp_path: Path
+) -> None:
+    """It is refused at its own rate, before the one of all hosts is used up."""
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with gateway_process(tmp_path, daemon.socket) as made:
+        wait_for_daemon(made)
+
+        def status(host: str) -> int:
+            port = httpx.URL(made.url).port
+            client = HTTPConnection("127.0.0.1", port, source_address=(host, 0))
+            with contextlib.closing(client):
+                client.request("POST", "/api/v1/status", headers=headers)
+                return client.getresponse().status
+
+        assert any(status("127.0.0.2") == 429 for _ in range(400))
+        assert status("127.0.0.3") == 200
 
 
 def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:

@@ -32,7 +32,7 @@ from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vib
 from sim.plant.imperfections import Imperfections, PlateErrors, realised
 from sim.plant.loaded_plates import LoadedPlate, Placement
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.plant.voiced_base import motion_of
+from sim.plant.voiced_base import delayed, motion_of
 
 _TICK = 0.01  # s; of `keep_time`
 _MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
@@ -61,7 +61,8 @@ class Bench:
     """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
 
     Fingers load the plate as the rig's fingertip. probes: listeners beside them; imperfections: in
-    what the bench differs from the rig. Raises InputError for unknown channels.
+    what the bench differs from the rig. Raises
+    InputError for unknown channels.
     """
 
     def __init__(
@@ -99,9 +100,10 @@ class Bench:
         ]
         for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
             amplifier.attach(sensing)
-        # By ERA: its channel, and what that plays.
+        # By ERA: what its channel plays, and what moves its base, later by the amplifier's delay.
         self._wired = [rig.wiring[era.name] for era in rig.eras]
-        self._outputs: list[Voices] = [()] * len(rig.eras)
+        self._commanded: list[Voices] = [()] * len(rig.eras)
+        self._applied_outputs: list[Voices] = [()] * len(rig.eras)
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
@@ -223,7 +225,7 @@ class Bench:
         self._sample_plate()
         plant = _plant_of(errors.realised(self.rig), self._time)
         plant.set_contacts(self._plant.contacts)
-        for index, playing in enumerate(self._outputs):
+        for index, playing in enumerate(self._applied_outputs):
             plant.set_input(index, self._motion(index, playing))
         self.imperfections = replace(self.imperfections, plate=errors)
         self._plant = plant
@@ -344,20 +346,23 @@ class Bench:
             probe.record(times, part)
 
     def _update_plant(self) -> None:
-        """Pass changed outputs of the channels on to the plant."""
+        """Pass changed outputs of the channels on to the plant, after their delay."""
         for index, wired in enumerate(self._wired):
             playing = self.amplifiers[wired.amplifier].outputs[wired.number]
-            before = self._outputs[index]
-            if playing is not before and playing != before:
+            commanded = self._commanded[index]
+            if playing is not commanded and playing != commanded:
+                self._commanded[index] = playing
                 self._apply(index, playing)
         while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
 
     def _apply(self, index: int, playing: Voices) -> None:
-        """Let an output move the base of an ERA."""
-        self._plant.set_input(index, self._motion(index, playing), since=self._time)
-        self._played.append((self._outputs[index], self._time))
-        self._outputs[index] = playing
+        """Let an output move the base of an ERA, after its amplifier's delay."""
+        delay = self.imperfections.delay(self._wired[index].amplifier)
+        late, since = delayed(playing, delay) if delay else playing, self._time + delay
+        self._plant.set_input(index, self._motion(index, late), since=since)
+        self._played.append((self._applied_outputs[index], since))
+        self._applied_outputs[index] = late
 
     def _motion(self, index: int, playing: Voices) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
@@ -366,7 +371,7 @@ class Bench:
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""
-        present = [(output, math.inf) for output in self._outputs]
+        present = [(output, math.inf) for output in self._applied_outputs]
         return sorted(
             {
                 tone.frequency

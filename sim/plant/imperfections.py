@@ -1,8 +1,8 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
-Errors of gain and phase of the amplifiers; a plate and ERAs that differ from the rig's, and
-fingers that do not weigh alike. Not modelled: delays of amplifiers, clock drift, distortion,
-drifting errors, ERAs in other places.
+Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
+from the rig's, and fingers that do not weigh alike. Not modelled: clock drift, distortion, drifting
+errors, ERAs in other places.
 """
 
 import cmath
@@ -88,17 +88,27 @@ class PlateErrors:
 class Imperfections:
     """Imperfections of a bench, by default none.
 
-    channels: errors by channel; plate: errors of the plate and its ERAs; fingertip: standard
-    deviation of the logarithm of a finger's load; seed: of these loads.
+    channels: errors by channel; delays [s]: from a command to the base motion, by amplifier; plate:
+    errors of the plate and its ERAs; fingertip: standard deviation of the logarithm of a finger's
+    load; seed: of these loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
+    delays: Mapping[str, float] = field(default_factory=dict)
     plate: PlateErrors = field(default_factory=PlateErrors)
     fingertip: float = 0.0
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Check that every delay is finite and not negative."""
+        for name, delay in self.delays.items():
+            if not (math.isfinite(delay) and delay >= 0):
+                raise InputError(
+                    f"delay of {name} must be finite and not negative, got {delay:g} s"
+                )
+
     def check(self, rig: Rig) -> None:
-        """Raise InputError for channels that the rig does not have."""
+        """Raise InputError for amplifiers and channels that the rig does not have."""
         wired = set(rig.wiring.values())
         for channel in self.channels:
             if channel not in wired:
@@ -106,6 +116,16 @@ class Imperfections:
                     f"imperfections: no ERA is wired to channel {channel.number} of amplifier "
                     f"{channel.amplifier}"
                 )
+        for name in self.delays:
+            if name not in rig.amplifiers:
+                raise InputError(
+                    f"imperfections: amplifier must be one of {', '.join(rig.amplifiers)}, "
+                    f"got {name}"
+                )
+
+    def delay(self, amplifier: str) -> float:
+        """Delay from a command of this amplifier to the base motion [s]."""
+        return self.delays.get(amplifier, 0.0)
 
     def errors_of(self, era: str, rig: Rig) -> ChannelErrors:
         """Errors of the channel to which an ERA is wired."""

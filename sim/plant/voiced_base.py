@@ -3,6 +3,7 @@
 import cmath
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from drivers.playback import Voice
 from model.transients.base_motion import Term, along_lines, raised_cosine
@@ -20,3 +21,19 @@ def _terms(voice: Voice, stroke: float) -> tuple[Term, ...]:
         return raised_cosine(way.start, way.step, omega, factor * way.first, factor * way.last)
     values = [factor * value for value in (way.first, *way.knots, way.last)]
     return along_lines(way.start, way.step, omega, values)
+
+
+def delayed(voices: Sequence[Voice], delay: float) -> tuple[Voice, ...]:
+    """Return the voices of a channel, delayed [s]."""
+    return tuple(
+        replace(
+            voice,
+            origin=voice.origin + delay,
+            transition=replace(
+                voice.transition,
+                start=voice.transition.start + delay,
+                end=voice.transition.end + delay,
+            ),
+        )
+        for voice in voices
+    )

@@ -30,7 +30,7 @@ from sim.plant.imperfections import (
     PlateErrors,
     draw_imperfections,
 )
-from sim.plant.voiced_base import motion_of
+from sim.plant.voiced_base import delayed, motion_of
 
 AT = (0.08, 0.06)
 PERFECT = Imperfections()
@@ -86,6 +86,38 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     assert shares[2] == pytest.approx(shares[0], rel=1e-9)
     turned = 1.2 * np.exp(1j * math.radians(10)) * shares[1]
     assert abs(shares[3] - turned) < 1e-6 * abs(turned)
+
+
+def test_imperfections_skew_shifts_the_phase(two_amplifiers: Rig) -> None:
+    """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
+    drive = {"right": (Tone(0, 110.0, 0.5),)}
+    skewed = Imperfections(delays={"right": 0.003, "left": 0.0015})
+    shares = [
+        phasor(*played(two_amplifiers, each, drive, until=3.0), 110.0, since=2.5)
+        for each in (Imperfections(delays=dict.fromkeys(("left", "right"), 0.002)), skewed)
+    ]
+    lag = np.degrees(np.angle(shares[0] / shares[1]))
+    assert lag == pytest.approx(360 * 110 * 0.001, abs=1e-4)
+
+
+def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) -> None:
+    """Two sets within the latency: both are played, each as long as it was meant to be."""
+    frequencies = []
+    for latency in (0.0, 0.05):
+        bench = Bench(
+            two_amplifiers, now=0.0, imperfections=Imperfections(delays={"left": latency})
+        )
+        bench.place_fingers({"a": AT}, now=0.0)
+        arm(bench, 2.0, now=0.0, name="left")
+        for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
+            play(bench, Tone(0, frequency, 0.5), now=now, name="left", token=token)
+        bench.advance(0.4)
+        windows = [(0.09, 0.0999), (0.1001, 0.1199), (0.1201, 0.15)]
+        frequencies.append(
+            [bench.felt(a + latency, b + latency)["a"].frequencies for a, b in windows]
+        )
+    assert frequencies[0] == [(), (110.0,), (170.0,)]
+    assert frequencies[1] == frequencies[0]
 
 
 def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> None:
@@ -165,18 +197,22 @@ def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) ->
     [
         (lambda: ChannelErrors(gain=-0.1), "negative"),
         (lambda: ChannelErrors(phase=math.nan), "finite"),
+        (lambda: Imperfections(delays={"left": -0.001}), "delay"),
+        (lambda: Imperfections(delays={"left": math.inf}), "delay"),
     ],
 )
 def test_imperfections_refuse_invalid_values(make, words: str) -> None:
-    """Negative gains, and values that are not finite."""
+    """Negative gains and delays, and values that are not finite."""
     with pytest.raises(InputError, match=words):
         make()
 
 
 def test_imperfections_refuse_unknown_channels(two_amplifiers: Rig) -> None:
-    """A channel without an ERA is named."""
+    """A channel without an ERA and an amplifier that the rig does not have are named."""
     with pytest.raises(InputError, match="channel 7 of amplifier left"):
         Imperfections({Channel("left", 7): ChannelErrors()}).check(two_amplifiers)
+    with pytest.raises(InputError, match="middle"):
+        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(delays={"middle": 0.001}))
 
 
 STROKE = 1e-4
@@ -193,9 +229,10 @@ def defined(voices: tuple[Voice, ...], time: float) -> float:
     )
 
 
+@pytest.mark.parametrize("late", [0.0, 0.003])
 @pytest.mark.parametrize("seed", range(3))
-def test_base_moves_by_its_voices(seed: int) -> None:
-    """Fades, kept phases, envelopes and jumps of random sets: within 1e-16 m."""
+def test_base_moves_by_its_voices(seed: int, late: float) -> None:
+    """Fades, kept phases, envelopes and jumps of random sets, delayed or not: within 1e-16 m."""
     random_ = random.Random(seed)
     playback, now = Playback(1, 8), 0.0
     for token in range(1, 40):
@@ -209,10 +246,10 @@ def test_base_moves_by_its_voices(seed: int) -> None:
         )
         ramp = random_.choice((0, 5, 30))
         playback.commit([LayerSet(random_.randrange(2), ramp, 0, (command,))], token, now)
-        motion = motion_of(playback.voices_of(0), stroke=STROKE)
+        motion = motion_of(delayed(playback.voices_of(0), late), stroke=STROKE)
         for _ in range(5):
             now += random_.uniform(0.0005, 0.004)
-            moved = sampled(motion, np.array([now]))[0]
+            moved = sampled(motion, np.array([now + late]))[0]
             assert moved == pytest.approx(defined(playback.voices_of(0), now), abs=1e-16)
 
 

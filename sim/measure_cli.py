@@ -10,7 +10,7 @@ import typer
 from model.commands.options import JsonOption, RigArgument, next_line
 
 if TYPE_CHECKING:
-    from sim.measuring.measure import Measured
+    from sim.measuring.measure import Measured, Stepped
 
 DEFAULT_LEVEL = 0.3
 
@@ -47,6 +47,9 @@ def measure(
     periods: Annotated[
         int, typer.Option(metavar="N", help="Seconds of each run that count.", min=2, max=60)
     ] = 2,
+    stepped: Annotated[
+        bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
+    ] = False,
     seed: Annotated[int, typer.Option(metavar="N", help="Draw other phases.", min=0)] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -61,14 +64,15 @@ def measure(
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
+    from sim.measuring.measure import check_by_steps, open_desk
     from sim.measuring.measure import measure as measured_by
-    from sim.measuring.measure import open_desk
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")
     rig = load_rig(rig_file)
     lines = parse_frequencies(frequencies) if frequencies else None
     started = time.perf_counter()
+    check: Stepped | None = None
     with open_desk(rig, sensors_file, device, level=level, frequencies=lines, seed=seed) as (
         desk,
         card,
@@ -76,19 +80,24 @@ def measure(
     ):
         with progress_bar("runs") as progress:
             found = measured_by(desk, card, multisine, periods=periods, progress=progress)
+        if stepped:
+            with progress_bar("tones") as progress:
+                check = check_by_steps(desk, card, found, level=level, progress=progress)
         rate = card.rate
     write = write_responses_csv if output.suffix.lower() == ".csv" else write_responses_uff
     write(output, found.responses, rig)
     elapsed = time.perf_counter() - started
     if as_json:
-        print(json.dumps(_as_json(found) | {"measure_time_s": elapsed, "files": [str(output)]}))
+        print(
+            json.dumps(_as_json(found, check) | {"measure_time_s": elapsed, "files": [str(output)]})
+        )
         return
-    _print(found, rate=rate)
+    _print(found, check, rate=rate)
     print(f"measured in {elapsed:.1f} s; wrote {output}")
     print(next_line("era", "calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated")))
 
 
-def _as_json(found: "Measured") -> dict[str, Any]:
+def _as_json(found: "Measured", check: "Stepped | None") -> dict[str, Any]:
     import numpy as np
 
     names = found.responses.sensors
@@ -105,10 +114,11 @@ def _as_json(found: "Measured") -> dict[str, Any]:
             }
             for n, name in enumerate(names)
         },
+        "stepped": None if check is None else check.as_json(),
     }
 
 
-def _print(found: "Measured", *, rate: float) -> None:
+def _print(found: "Measured", check: "Stepped | None", *, rate: float) -> None:
     import numpy as np
 
     lines = found.responses.frequencies
@@ -123,4 +133,9 @@ def _print(found: "Measured", *, rate: float) -> None:
             f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
             f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
             f"{100 * found.even[n]:8.2f} %"
+        )
+    if check is not None:
+        print(
+            f"stepped tones differ by {check.level_db[0]:.3f} dB rms, {check.level_db[1]:.2f} dB "
+            f"at most, and {check.phase_deg[0]:.2f}° rms, {check.phase_deg[1]:.1f}° at most"
         )

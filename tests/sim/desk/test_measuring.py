@@ -16,7 +16,7 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
-from sim.measuring.measure import Measured, measure
+from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
 from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import WiredSensor
@@ -79,6 +79,17 @@ def test_measured_responses_are_those_of_the_plate(
     assert found.responses.sensors == ("P1", "P2", "P3")
     assert found.latency * RATE == pytest.approx(DELAY, abs=1)
     assert (found.repeated, found.coherence.min() > 0.999) == (0, True)
+
+
+def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
+    """Single tones of single ERAs give the responses that all ERAs gave at once."""
+    desk = Desk(rig, SENSORS)
+    sound = card(truth)
+    found = measure(desk, sound, sines(desk, np.array([61.0, 233.0])))
+    check = check_by_steps(desk, sound, found, level=LEVEL)
+    assert check.frequencies.tolist() == [61.0, 233.0]
+    assert check.level_db[0] < 0.1
+    assert check.phase_deg[0] < 1.0
 
 
 def test_lost_block_repeats_its_run(rig: Rig, truth: Truth, undisturbed: Measured) -> None:

@@ -64,6 +64,7 @@ def measure(
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
+    from sim.measuring.live_plot import live_plot
     from sim.measuring.measure import check_by_steps, open_desk
     from sim.measuring.measure import measure as measured_by
 
@@ -78,8 +79,8 @@ def measure(
         card,
         multisine,
     ):
-        with progress_bar("runs") as progress:
-            found = measured_by(desk, card, multisine, periods=periods, progress=progress)
+        with live_plot(multisine, desk.sensors) as show:
+            found = measured_by(desk, card, multisine, periods=periods, show=show)
         if stepped:
             with progress_bar("tones") as progress:
                 check = check_by_steps(desk, card, found, level=level, progress=progress)

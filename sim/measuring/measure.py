@@ -1,6 +1,6 @@
 """A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,6 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
-from model.identification.measurement import Progress
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import (
@@ -94,6 +93,9 @@ def blocks_lost() -> LinkError:
 LEVEL = 0.3
 """Usual largest sample of each output."""
 
+Show = Callable[[Sequence[FloatArray]], None]
+"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -147,11 +149,11 @@ def measure(
     multisine: Multisine,
     *,
     periods: int = 2,
-    progress: Progress = lambda done, of: None,
+    show: Show = lambda recorded: None,
 ) -> Measured:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: of each run that are analysed; progress: called with the runs done and all.
+    periods: of each run that are analysed. show: called with the runs recorded so far, after each.
     Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
     times.
     """
@@ -166,7 +168,7 @@ def measure(
         repeated += run.repeated
         is_lost = is_lost or not run.is_whole
         recorded.append(run.recorded)
-        progress(len(recorded), multisine.sources)
+        show(recorded)
     found = estimate(multisine, recorded)
     # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
     # cause to be told.

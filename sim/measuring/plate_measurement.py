@@ -56,7 +56,7 @@ def measure_through(
         card,
         multisine,
         periods=periods,
-        progress=lambda done, of: progress(done, of + 2),
+        show=lambda recorded: progress(len(recorded), runs + 2),
     )
     repeats = []
     for number, factor in enumerate((0.5, 1.0), start=1):

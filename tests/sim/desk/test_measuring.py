@@ -15,6 +15,7 @@ from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
+from sim.measuring.live_plot import STEPS, plot
 from sim.measuring.loopback import latency
 from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
@@ -188,6 +189,34 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):
         latency(drawn, lines)
+
+
+PLOT_RATE = 2000.0
+MULTISINE = Multisine(np.array([61.0, 121.0, 181.0, 241.0]), 3, PLOT_RATE, 0.3)
+PLOTTED = tuple(WiredSensor(f"P{n}", 0.1, 0.1, n, 1.0) for n in (1, 2))
+GAINS = np.array([[0.5, -0.25, 1.0], [0.05, 0.0, 0.0]])  # of inputs by sources
+
+
+def recorded(runs: int) -> list[np.ndarray]:
+    """Two periods of each run, of inputs that are sums of the sources."""
+    periods = [MULTISINE.signal(run, periods=3)[round(PLOT_RATE * 0.5) :] for run in range(runs)]
+    return [each[: round(2 * PLOT_RATE)] @ GAINS.T for each in periods]
+
+
+def test_plot_has_a_line_for_each_sensor_and_fits() -> None:
+    """The loudest sensor at the highest step, the other 27 dB lower; inputs by their peaks."""
+    runs = recorded(3)
+    first, second, axis, count = plot(MULTISINE, runs, PLOTTED, width=80, height=24).splitlines()
+    assert first.count(STEPS[-1]) == 4
+    difference = 10 * np.log10((0.25 + 0.0625 + 1) / 0.0025)  # 27.2 dB, in steps of 7.5
+    assert second.count(STEPS[int(8 - difference / 7.5)]) == 4
+    assert f"{-difference:.1f} dB" in second
+    peak = max(np.abs(each[:, 0]).max() for each in runs)
+    assert f"{100 * peak:.1f} %" in first
+    assert "61 Hz" in axis
+    assert count.startswith("3 of 3 runs")
+    few = plot(MULTISINE, runs, PLOTTED, width=80, height=6).splitlines()
+    assert (len(few), "1 more" in few[-1]) == (3, True)
 
 
 FRAMES = 64

@@ -181,25 +181,27 @@ class Dialogue:
         """
         cuts: list[Values] = []
         admitted: list[Staged] = []
-
-        def part() -> Values:
-            if not admitted:
-                admitted.append(self._admit(token, layers, cuts, now=now))
-            elif priority is Priority.SET:  # silence is never too late
-                self.while_admitted(token, cuts[0])
-            return cuts[0]
-
+        make = partial(self._admit, token, layers, admitted, cuts, now=now)
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=part, parts=cuts)
+        taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
         (staged,) = admitted
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
 
     def _admit(
-        self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
-    ) -> Staged:
-        """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
+        self,
+        token: int,
+        layers: Sequence[Layer],
+        staged: list[Staged],
+        cuts: list[Values],
+        *,
+        now: bool,
+    ) -> Values:
+        """Have the ledger admit a set, cut it into parts and return the first.
+
+        Raises CommandRefused.
+        """
         moment = self._time()
         takes = self.exchange_time("Set")
         # Longest time from the admission of a set until it is committed.
@@ -209,8 +211,9 @@ class Dialogue:
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         cuts += parts(stream, session=self.session, token=token, now=now)
-        staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
-        return staged
+        self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        staged.append(self._admitted)
+        return cuts[0]
 
     def commit(self, token: int, *, start: JointStart | None = None) -> "asyncio.Future[Values]":
         """Play the staged set; the future has the status, which shows its tokens.
@@ -219,27 +222,14 @@ class Dialogue:
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        make = partial(self.while_admitted, token, values)
-        return self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
+        return self.line.submit(self, Priority.SET, "Commit", values, start=start)
 
-    def while_admitted(self, token: int, values: Values) -> Values:
-        """Return the values of a request of a set; raises DriverError unless it may play now."""
-        admitted = self._admitted
-        if admitted is None or admitted.token != token:
-            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-        if (now := self._time()) > admitted.until:
-            raise CommandRefused(
-                f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
-                "s earlier; the wire is too slow or too busy",
-                until=now,
-            )
-        return values
-
-    def next_request(self, name: str, values: Values) -> float:
+    def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
 
         Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
-        another host, CommandRefused once a status has shown that it is not armed any more.
+        another host, CommandRefused once a status has shown that it is not armed any more; of a set
+        Preempted once it is not admitted any more, CommandRefused where it is too late.
         """
         takes = self._times.get(name)
         takes = self.exchange_time(name) if takes is None else takes
@@ -249,6 +239,16 @@ class Dialogue:
         longer = takes - FAST if takes > FAST else 0.0
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return longer
+        if name in ("Set", "Commit"):
+            admitted, token, now = self._admitted, values["token"], self._time()
+            if admitted is None or admitted.token != token:
+                raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+            if now > admitted.until and priority is Priority.SET:  # silence is never too late
+                raise CommandRefused(
+                    f"amplifier {self.name}: set {token} must be committed "
+                    f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
+                    until=now,
+                )
         if self._other_host_at > -math.inf:
             self.check_other_host()
         if self.silence_cause is not None:
@@ -303,12 +303,45 @@ class Dialogue:
             feeding.since, feeding.confirmed_at = sent_at, now
             if sent_at > feeding.plays:
                 feeding.plays, feeding.fade = sent_at, 0.0
-        if message.reply is _STATUS:
-            self._note_status(name, values, reply, sent_at, now)
-            if name == "Ping" and reply["state"] != ENABLED:
-                raise self.disarmed(reply)
-        elif name == "Set" and reply["played"]:
-            self._confirm(values["token"], now)
+        if message.reply is not _STATUS:
+            if name == "Set" and reply["played"]:
+                self._confirm(values["token"], now)
+            return
+        if (latch := reply["latch"]) != self.latch and (
+            self.latch is None or is_newer_token(latch, self.latch)
+        ):
+            self.latch = latch
+        self.status, self.status_at = reply, now
+        ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
+        if ledger is not None and name in _SILENCING:
+            ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
+            return
+        if ledger is not None and (
+            ledger.doubt or self._admitted or reply["token"] != self.committed
+        ):
+            self._confirm(reply["token"], now)
+        if name == "Ping" and not is_enabled:
+            raise self.disarmed(reply)
+        if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
+            return
+        # A status after a request that feeds says nothing of how the watchdog runs down.
+        problem = None
+        tells = not fed and self.feeding.tells(sent_at)
+        if not reply["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
+            problem = "high voltage must be on, got off"
+        elif not fed:
+            left = reply["watchdog_left"] / _LEFT.per_unit
+            problem = self.feeding.problem(left, sent_at, now)
+        problem = problem or ledger.problem_of(reply, sent_at, now)
+        if problem is None:
+            if tells or not self._was_unfed:
+                self._contradictions, self._contradicted_at = 0, -math.inf
+            return
+        self._was_unfed = not fed
+        if now - self._contradicted_at >= _SAME_MOMENT:
+            self._contradictions, self._contradicted_at = self._contradictions + 1, now
+            if self._contradictions >= MAX_CONTRADICTIONS:
+                raise self.contradicted(problem)
 
     def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
         """Note what came without a request; an event is handed on."""
@@ -335,43 +368,6 @@ class Dialogue:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
-
-    def _note_status(
-        self, name: str, values: Values, status: Values, sent_at: float, now: float
-    ) -> None:
-        """Note a status; raises CommandRefused once it contradicts what was sent twice."""
-        if (latch := status["latch"]) != self.latch and (
-            self.latch is None or is_newer_token(latch, self.latch)
-        ):
-            self.latch = latch
-        self.status, self.status_at = status, now
-        if self._ledger is None:
-            return
-        if name in _SILENCING:
-            self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
-            return
-        if self._ledger.doubt or self._admitted or status["token"] != self.committed:
-            self._confirm(status["token"], now)
-        if not self.session or name in ("Arm", "Clear") or status["state"] != ENABLED:
-            return
-        # A status after a request that feeds says nothing of how the watchdog runs down.
-        fed, problem = MESSAGES[name].feeds, None
-        tells = not fed and self.feeding.tells(sent_at)
-        if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
-            problem = "high voltage must be on, got off"
-        elif not fed:
-            left = status["watchdog_left"] / _LEFT.per_unit
-            problem = self.feeding.problem(left, sent_at, now)
-        problem = problem or self._ledger.problem_of(status, sent_at, now)
-        if problem is None:
-            if tells or not self._was_unfed:
-                self._contradictions, self._contradicted_at = 0, -math.inf
-            return
-        self._was_unfed = not fed
-        if now - self._contradicted_at >= _SAME_MOMENT:
-            self._contradictions, self._contradicted_at = self._contradictions + 1, now
-            if self._contradictions >= MAX_CONTRADICTIONS:
-                raise self.contradicted(problem)
 
     def contradicted(self, problem: str) -> CommandRefused:
         """Return the error of contradictions in a row."""

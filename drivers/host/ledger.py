@@ -273,8 +273,8 @@ class Ledger:
             for command in one.commands:
                 peak = command.level
                 for shape in (command.onset, command.ending):
-                    if shape is not None:
-                        peak = max(peak, shape.peak)
+                    if shape is not None and shape.knots:
+                        peak = max(peak, max(shape.knots)[0])
                 levels[command.channel] += peak / full
                 if is_at_once and command.onset is None and command.ending is None:
                     rising[one.layer, command.channel] = command.level / full

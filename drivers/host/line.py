@@ -105,21 +105,37 @@ class Line:
             if isinstance(arrival, Event | OtherHost | Several):
                 if self.seen is not None:
                     self.seen("event", arrival.address, type(arrival).__name__, arrival)
-                if (member := self.members.get(arrival.address)) is not None:
-                    member.note_unasked(arrival)
+                if (unasked := self.members.get(arrival.address)) is not None:
+                    unasked.note_unasked(arrival)
                 continue
             job = self._current
-            if job is None:
+            if job is None or (member := job.member) is None:  # no broadcast is on the line
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
-                self._go_on(job, arrival.data)
+                if self._must_yield(job):
+                    self._not_answered(job)
+                else:
+                    self._start(job, arrival.data)
+                continue
+            self._current = member.silence_cause = None
+            if self.seen is not None:
+                self.seen("in", member.address, type(arrival).__name__, arrival)
+            if not isinstance(arrival, Reply):
+                self._refused(job, member, arrival)
+                continue
+            try:
+                member.note_reply(job.name, job.values, arrival.values, job.sent_at)
+            except Exception as error:  # whatever it is, no caller may wait for ever
+                self._fail(job, error)
+                continue
+            if job.result.done():  # its caller has gone
+                continue
+            if job.parts is None or len(job.parts) == 1:
+                job.result.set_result(arrival.values)
             else:
-                self._current = None
-                if self.seen is not None:
-                    address = BROADCAST if job.member is None else job.member.address
-                    self.seen("in", address, type(arrival).__name__, arrival)
-                self._end(job, arrival)
+                del job.parts[0]
+                self._send_next_part(job)
         if self._queue.jobs:
             self.pump()
         elif self._current is None and self._timer is not None:
@@ -165,69 +181,61 @@ class Line:
         job.is_released = True
         self.pump()
 
-    def _start(self, job: Job) -> None:
-        """Make a request in its turn and send it, noted for all that it reaches: no other way."""
+    def _start(self, job: Job, rest: bytes = b"") -> None:
+        """Make a request in its turn and send it, noted for all that it reaches: no other way.
+
+        rest: of the request that is on the line already.
+        """
+        member, data = job.member, rest
+        address = BROADCAST if member is None else member.address
         try:
-            if job.make is not None:
-                job.values = job.make()
-            member, address = job.member, BROADCAST
-            if member is not None:
-                address = member.address
-                job.longer = member.next_request(job.name, job.values)
-            if self.seen is not None:
-                self.seen("out", address, job.name, job.values)
-            data = self.wire.request(address, job.name, job.values)
-            now = job.sent_at = self.time()
+            if not rest:
+                if job.parts:
+                    job.values = job.parts[0]
+                elif job.make is not None:
+                    job.values = job.make()
+                if member is not None:
+                    job.longer = member.next_request(job.name, job.values, job.priority)
+                if self.seen is not None:
+                    self.seen("out", address, job.name, job.values)
+                data = self.wire.request(address, job.name, job.values)
+            now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
-            for each in self.members.values():
-                if address in (BROADCAST, each.address):
-                    each.note_sent(job.name, job.values, now, begins + self.wire.takes)
-            self._send(job, data)
+            if not rest:
+                job.sent_at, job.due = now, 0.0
+                for each in self.members.values():
+                    if address in (BROADCAST, each.address):
+                        each.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            if trace.is_active():
+                what = job.name if member is None else f"{job.name} to {address}"
+                trace.frame(Direction.OUT, data, self.name, lambda: what)
+            self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
+            try:
+                self._port.write(data)
+            except LinkTimeout as error:  # it takes nothing: the amplifier counts as degraded
+                if member is not None:
+                    member.silence_cause = str(error)
+                raise
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
         except Exception as error:  # no caller may wait for ever
+            self._current = None
+            self.wire.withdraw()
             self._fail(job, error)
             return
         job.start = None
         if member is None:
             job.result.set_result({})
             return
-        job.due = begins + job.longer + job.timeout
-        # A slow wire: as long as on others until it counts as degraded.
-        job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
+        if not rest:
+            # A slow wire: as long as on others until it counts as degraded.
+            job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
+        # Each of the two responses on Modbus may begin late.
+        job.due = max(job.due, begins + job.longer + job.timeout)
         job.delays, job.is_last_look = 0, False
         self._current = job
         if self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
-
-    def _go_on(self, job: Job, data: bytes) -> None:
-        """Send the rest of the request on the line, unless one that silences waits."""
-        if self._must_yield(job):
-            self._not_answered(job)
-            return
-        try:
-            self._send(job, data)
-        except LinkError as error:
-            self._current = None
-            self.wire.withdraw()
-            self._fail(job, error)
-            return
-        # Each of the two responses may begin late.
-        job.due = max(job.due, self.time() + job.longer + job.timeout)
-        job.delays, job.is_last_look = 0, False
-
-    def _send(self, job: Job, data: bytes) -> None:
-        if trace.is_active():
-            what = job.name if job.member is None else f"{job.name} to {job.member.address}"
-            trace.frame(Direction.OUT, data, self.name, lambda: what)
-        begins = max(self.time(), self._sent_until)
-        self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
-        try:
-            self._port.write(data)
-        except LinkTimeout as error:  # it takes nothing: the amplifier counts as degraded
-            if job.member is not None:
-                job.member.silence_cause = str(error)
-            raise
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
@@ -235,40 +243,23 @@ class Line:
             return False
         return any(other.is_stop_class for other in self._queue.jobs)
 
-    def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
-        """End the request that was on the line by what came back."""
-        member = job.member
-        if member is None:  # no broadcast is on the line
-            return
-        member.silence_cause = None
-        if isinstance(arrival, Reply):
-            try:
-                member.note_reply(job.name, job.values, arrival.values, job.sent_at)
-            except Exception as error:  # whatever it is, no caller may wait for ever
-                self._fail(job, error)
-                return
-            if job.result.done():  # its caller has gone
-                return
-            if job.parts is None or len(job.parts) == 1:
-                job.result.set_result(arrival.values)
-            else:
-                del job.parts[0]
-                self._send_next_part(job)
-        elif isinstance(arrival, Broken):
+    def _refused(self, job: Job, member: "Dialogue", arrival: Nak | Broken) -> None:
+        """End the request that was on the line with an error, or repeat it to a busy amplifier."""
+        if isinstance(arrival, Broken):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
-        else:
-            member.counts.refusals += 1
-            if arrival.code == "BUSY" and job.attempts > 0:
-                self._repeat(job, member, pause=BUSY_PAUSE)
-                return
-            channel = "" if arrival.channel is None else f", channel {arrival.channel}"
-            refusal = CommandRefused(
-                f"{self.name}: the amplifier refused the request: {arrival.code}{channel}",
-                channel=arrival.channel,
-                may_play=job.had_no_reply,
-                is_disarmed=arrival.code in _NOT_ARMED,
-            )
-            self._fail(job, refusal)
+            return
+        member.counts.refusals += 1
+        if arrival.code == "BUSY" and job.attempts > 0:
+            self._repeat(job, member, pause=BUSY_PAUSE)
+            return
+        channel = "" if arrival.channel is None else f", channel {arrival.channel}"
+        refusal = CommandRefused(
+            f"{self.name}: the amplifier refused the request: {arrival.code}{channel}",
+            channel=arrival.channel,
+            may_play=job.had_no_reply,
+            is_disarmed=arrival.code in _NOT_ARMED,
+        )
+        self._fail(job, refusal)
 
     def _send_next_part(self, job: Job) -> None:
         """Go on with a request in parts, in its turn where others wait."""

@@ -365,7 +365,7 @@ def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
     """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
     values = {"session": several[0].session, "token": token}
     for amplifier in several:
-        amplifier.while_admitted(token, values)
+        amplifier.next_request("Commit", values, Priority.SET)
     return values
 
 

@@ -7,7 +7,6 @@ from drivers.codec.serial_line.frame import (
     FrameReader,
     encode_frame,
     frame_length,
-    pack_words,
     unpack_identity,
     unpack_words,
 )
@@ -51,15 +50,14 @@ class SerialWire(Wire):
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the frame of a request, which is on the wire from now on; address 0: of all."""
         self._sequence = (self._sequence + 1) & 0xFFFF
-        if name == "Hello":
-            frame = Frame(HELLO, address, self._sequence, b"", NEUTRAL)
-        else:
+        kind, version, words = HELLO, NEUTRAL, list[int]()
+        if name != "Hello":
             message = MESSAGES[name]
-            payload = pack_words(message.request.append([], values))
-            frame = Frame(message.number, address, self._sequence, payload, VERSION)
+            kind, version, words = message.number, VERSION, message.request.append([], values)
+        frame = Frame(kind, address, self._sequence, b"", version)
+        data = encode_frame(frame, words)
         self._pending = None if address == BROADCAST else frame
         self.counters.frames_out += 1
-        data = encode_frame(frame)
         self.takes = self._byte_time * len(data)
         return data
 
@@ -68,27 +66,43 @@ class SerialWire(Wire):
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
             self.counters.frames_in += 1
-            pending = self._pending
-            if frame.kind == EVENT:
-                words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
-                arrivals += read_event(frame.address, EVENT, words, self.counters)
-            elif (
+            pending, kind = self._pending, frame.kind ^ REPLY
+            if (
                 pending is None
-                or not frame.kind & REPLY
+                or kind & REPLY
                 or (frame.address, frame.sequence) != (pending.address, pending.sequence)
             ):
-                self.counters.unexpected_frames += 1
-                last = self._replied
-                if (
-                    last is not None
-                    and frame != last
-                    and (frame.address, frame.sequence) == (last.address, last.sequence)
-                ):
-                    arrivals.append(Several(frame.address))
-            else:
-                self._pending, self._replied = None, frame
-                arrivals.append(self._reply(frame, pending))
+                arrivals += self._unexpected(frame)
+                continue
+            self._pending, self._replied = None, frame
+            try:
+                if kind != NAK and (kind, frame.version) != (pending.kind, pending.version):
+                    expected = f"{pending.kind} in version {pending.version}"
+                    got = f"{kind} in {frame.version}"
+                    raise Refusal(f"type of the reply must be {expected}, got {got}")
+                if kind == HELLO:
+                    arrivals.append(Reply(unpack_identity(frame.payload)))
+                    continue
+                words = unpack_words(frame.payload)
+                if kind == NAK:
+                    arrivals.append(read_nak(words))
+                else:  # what follows is ignored
+                    arrivals.append(Reply(BY_NUMBER[kind].reply.read(words)[0]))
+            except Refusal as refusal:
+                arrivals.append(Broken(str(refusal)))
         return arrivals
+
+    def _unexpected(self, frame: Frame) -> list[Arrival]:
+        """Read a frame that is no reply to the request on the wire."""
+        if frame.kind == EVENT:
+            words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
+            return read_event(frame.address, EVENT, words, self.counters)
+        self.counters.unexpected_frames += 1
+        last = self._replied
+        if last is None or frame == last:
+            return []
+        is_same = (frame.address, frame.sequence) == (last.address, last.sequence)
+        return [Several(frame.address)] if is_same else []
 
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
@@ -97,22 +111,6 @@ class SerialWire(Wire):
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
         return self._byte_time * frame_length(2 * words)
-
-    def _reply(self, frame: Frame, request: Frame) -> Arrival:
-        """Read the reply to a request."""
-        kind, version = frame.kind ^ REPLY, frame.version
-        try:
-            if kind == NAK:
-                return read_nak(unpack_words(frame.payload))
-            if (kind, version) != (request.kind, request.version):
-                expected = f"{request.kind} in version {request.version}"
-                return Broken(f"type of the reply must be {expected}, got {kind} in {version}")
-            if kind == HELLO:
-                return Reply(unpack_identity(frame.payload))
-            # What follows is ignored.
-            return Reply(BY_NUMBER[kind].reply.read(unpack_words(frame.payload))[0])
-        except Refusal as refusal:
-            return Broken(str(refusal))
 
     def _count_invalid(self, piece: bytes) -> None:
         self.counters.invalid_frames += 1

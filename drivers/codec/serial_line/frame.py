@@ -57,12 +57,14 @@ class Frame(NamedTuple):
         return bool(self.kind & REPLY)
 
 
-def encode_frame(frame: Frame) -> bytes:
-    """Encode a frame with its delimiters; ValueError for a payload that is too long."""
-    if len(frame.payload) > PAYLOAD_MAX:
-        raise ValueError(f"payload must have at most {PAYLOAD_MAX} bytes, got {len(frame.payload)}")
-    header = _HEADER.pack(frame.kind, frame.version, frame.address, frame.sequence)
-    body = header + frame.payload
+def encode_frame(frame: Frame, words: Sequence[int] = ()) -> bytes:
+    """Encode a frame with its delimiters, words behind its payload; ValueError for too many."""
+    kind, address, sequence, payload, version = frame
+    length = len(payload) + 2 * len(words)
+    if length > PAYLOAD_MAX:
+        raise ValueError(f"payload must have at most {PAYLOAD_MAX} bytes, got {length}")
+    form = f"<BBBH{len(payload)}s{len(words)}H"
+    body = struct.pack(form, kind, version, address, sequence, payload, *words)
     stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
     return b"\0" + stuffed + b"\0"
 

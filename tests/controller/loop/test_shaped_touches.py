@@ -135,6 +135,15 @@ async def test_lifted_target_fades_along_its_ending(shapes: Shapes) -> None:
 
 
 @in_virtual_time
+async def test_last_lift_skips_the_ending(shapes: Shapes) -> None:
+    """Zero within 20 ms: endings are for fingers that stay."""
+    async with set_running(knots=32, timing=shapes) as chain:
+        await chain.hold(0.3, down=[FINGER])
+        await chain.leave(0.020)
+        assert not any(chain.far_end.levels)
+
+
+@in_virtual_time
 async def test_lift_before_the_onset_is_over_skips_the_ending(shapes: Shapes) -> None:
     """An ending leads from the full level; lifted half way up the target fades along 20 ms."""
     async with set_running(knots=32, timing=shapes) as chain:

@@ -34,6 +34,7 @@ from registry.plugins import failure_text
 # A step of a ramp or texture may be this far [dB] below its level before its frequency changes.
 _STEP_SHORT_OF = 1.0
 
+_USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
 _QUIETER = "lower its level, or lift that finger"
 
 _logger = logging.getLogger(__name__)
@@ -112,7 +113,11 @@ class Chooser:
         total = amplitudes_of([each.pattern.excitation for each in free.contents])
         if left.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
-        return self._chosen(requested, targets, left), True
+        limited = self._chosen(requested, targets, left)
+        if not limited.contents:
+            silent = _silent(targets, limited.quiet, _USED_UP)
+            limited = replace(silent, protected=requested.protected)
+        return limited, True
 
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
@@ -185,8 +190,7 @@ class Chooser:
             is_beside = bool(_contents(beside))
             is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
             if change < 0 or (is_beside and not is_heard):
-                used_up = "the contents of other fingers use the whole stroke; lift a finger"
-                return _silent(targets, quiet, used_up if is_beside else LIMITS_LEAVE_NOTHING)
+                return _silent(targets, quiet, _USED_UP if is_beside else LIMITS_LEAVE_NOTHING)
         others = sum_db(heard) if heard else None
         if others is not None:
             promised = min(math.inf if promised is None else promised, felt - others)

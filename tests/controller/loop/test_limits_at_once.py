@@ -148,6 +148,23 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
     assert "lift a finger" in str(held_back.held_back)
 
 
+def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
+    """The limits are no cause: without the click they allow it."""
+    click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
+    lasting = Target(CONTACTS[0].key, 20.0)
+    alone = a_selector().select(CONTACTS, HapticIntent((click,)), FREE)
+    hardly = replace(FREE, max_power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
+    selector = a_selector()
+    selector.select(CONTACTS, HapticIntent((click,)), hardly, triggered_at=0.0)
+    both = HapticIntent((lasting, click))
+    (held_back,) = selector.select(CONTACTS, both, hardly, triggered_at=0.01).not_served
+    assert held_back.contact == CONTACTS[0]
+    assert "contents of other fingers" in str(held_back.held_back)
+    after = HapticIntent((lasting,))
+    found = selector.select(CONTACTS, after, hardly, triggered_at=selector.due)
+    assert (found.not_served, len(found.contents)) == ((), 1)
+
+
 @pytest.mark.parametrize("what", ["level", "power"])
 def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
     """It is lowered to the limit, 0.8 of its amplitude, instead of refused by the amplifiers."""

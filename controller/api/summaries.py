@@ -10,8 +10,8 @@ SUMMARIES = {
     "renew": "Extend the lease.",
     "disarm": "Ramp to silence, then switch the high voltage off. Any client may.",
     "stop": (
-        "Quick-stop all amplifiers, latched until clear. Any client may, at any time; not an "
-        "emergency stop. Error 1006 unless every amplifier is confirmed silent."
+        "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client may, at "
+        "any time; error 1006 unless every amplifier is confirmed silent."
     ),
     "clear": "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.",
     "forget": (

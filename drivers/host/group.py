@@ -5,7 +5,7 @@ import logging
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from drivers.errors import (
     CommandError,
@@ -26,6 +26,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
@@ -103,7 +104,7 @@ class Group(Members):
                     return
                 self._leave_armed()
                 before = self.epoch
-                await self._silenced(self._disarm(amplifiers, STOP_RAMP))
+                await self._silenced(self._disarm, amplifiers, STOP_RAMP)
                 self.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
@@ -116,7 +117,7 @@ class Group(Members):
                 self.check_none_since(before)
             except BaseException as error:
                 self.note(error)
-                await self._silenced(self._disarm_armed(arming))
+                await self._silenced(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     self.check_none_since(before)
                 if self.is_degraded_only(error):
@@ -183,7 +184,7 @@ class Group(Members):
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self._silenced(self._disarm([*self.amplifiers.values()], ramp))
+        await self._silenced(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
         try:
@@ -218,7 +219,7 @@ class Group(Members):
                 stops[name] = asyncio.get_running_loop().create_future()
                 stops[name].set_exception(error)
         names = [*stops] if waits_for is None else waits_for
-        return self._silenced(self._outcomes({name: stops[name] for name in names}))
+        return self._silenced(self._outcomes, {name: stops[name] for name in names})
 
     def _broadcast(self, line: Line, ramp: float) -> None:
         """Request a stop of all amplifiers of a line, unless one is queued."""
@@ -293,13 +294,15 @@ class Group(Members):
             if not members:
                 return
             try:
-                await self._silenced(self._disarm(members, ramp))
+                await self._silenced(self._disarm, members, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
 
-    def _silenced(self, work: Coroutine[Any, Any, _T]) -> Coroutine[Any, Any, _T]:
+    def _silenced(
+        self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
+    ) -> Coroutine[Any, Any, _T]:
         """Begin a stop or disarm; nothing arms until it ends, whoever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work)
+        task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
         self._silencing.add(task)
         task.add_done_callback(self._silencing.discard)
         return _to_completion(task)

@@ -192,8 +192,8 @@ class Rounding:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
         low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
         limit = self._can["knots"]
+        knots: list[tuple[int, ...]] = []
         for tone in tones:
-            knots: list[tuple[int, ...]] = []
             for envelope in (tone.onset, tone.ending):
                 if envelope is None:
                     continue
@@ -204,14 +204,18 @@ class Rounding:
                     text = f"knots of an envelope must be at most {limit}, got {count}"
                     raise _refused(tone.channel, text)
                 knots += envelope.knots
-            if not knots:
-                continue
-            try:
-                KNOT.check_rows(knots)
-            except (TypeError, ValueError) as error:
-                raise _refused(tone.channel, f"knot of an envelope: {error}") from error
+        if not knots:
+            return
+        try:
+            KNOT.check_rows(knots)
             if (peak := max(knots)[0]) > self._limits.level:
                 raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
+        except (CommandRefused, TypeError, ValueError) as error:
+            for one in tones if len(tones) > 1 else ():
+                self._check_envelopes([one])  # which of them
+            if isinstance(error, CommandRefused):
+                raise
+            raise _refused(tone.channel, f"knot of an envelope: {error}") from error
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

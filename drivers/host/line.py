@@ -133,9 +133,13 @@ class Line:
                 continue
             if job.parts is None or len(job.parts) == 1:
                 job.result.set_result(arrival.values)
+                continue
+            del job.parts[0]
+            job.attempts, job.queued_at, job.had_no_reply = ATTEMPTS, self.time(), False
+            if self._queue.jobs:
+                self._queue_again(job)
             else:
-                del job.parts[0]
-                self._send_next_part(job)
+                self._start(job)
         if self._queue.jobs:
             self.pump()
         elif self._current is None and self._timer is not None:
@@ -261,27 +265,22 @@ class Line:
         )
         self._fail(job, refusal)
 
-    def _send_next_part(self, job: Job) -> None:
-        """Go on with a request in parts, in its turn where others wait."""
-        job.attempts, job.queued_at, job.had_no_reply = ATTEMPTS, self.time(), False
-        if not self._queue.jobs:
-            self._start(job)
-        elif self._queue.supersedes(job):
-            self._fail(job, Preempted(SUPERSEDED))
-        else:
-            self._queue.add(job)
-
-    def _repeat(self, job: Job, member: "Dialogue", *, pause: float = 0.0) -> None:
+    def _queue_again(self, job: Job) -> bool:
         """Queue a request again, unless another one of its amplifier comes before it."""
         if self._queue.supersedes(job):
             self._fail(job, Preempted(SUPERSEDED))
-            return
-        member.counts.retries += 1
-        if pause:
-            job.not_before = self.time() + pause
-            self._loop.call_at(job.not_before, self._pump_from, job.not_before)
+            return False
         # Behind those of its priority, so that a mute amplifier does not keep others waiting.
         self._queue.add(job)
+        return True
+
+    def _repeat(self, job: Job, member: "Dialogue", *, pause: float = 0.0) -> None:
+        """Send a request once more in its turn, after a pause [s]."""
+        if self._queue_again(job):
+            member.counts.retries += 1
+            if pause:
+                job.not_before = self.time() + pause
+                self._loop.call_at(job.not_before, self._pump_from, job.not_before)
 
     def _pump_from(self, time: float) -> None:
         """Pump at a time [s]; a timer may come too early, by up to a tick of the clock."""

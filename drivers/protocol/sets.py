@@ -99,8 +99,8 @@ def is_vibrating(*layers: LayerSet) -> bool:
     for one in layers:
         if one.renew:
             return True
-        for command in one.commands:
-            if command.is_driven:
+        for command in one.commands:  # as `Command.is_driven`, without a call
+            if command.level > 0 or command.onset is not None:
                 return True
     return False
 

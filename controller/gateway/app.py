@@ -242,7 +242,7 @@ class Gateway:
                 return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
             line = await kept.request(
-                self._daemon, name, method, params, may_open=partial(self._may_connect, request)
+                self._daemon, name, method, params, may_open=partial(self.may_connect, request)
             )
             return result_of(read_line(line))
         except Unreachable as error:
@@ -262,7 +262,7 @@ class Gateway:
         if SUBPROTOCOL not in socket.scope["subprotocols"]:
             await socket.close(1002, f"the subprotocol must be {SUBPROTOCOL}")
             return
-        if self._session_count >= MAX_SESSIONS or not self._may_connect(socket):
+        if self._session_count >= MAX_SESSIONS or not self.may_connect(socket):
             await socket.close(TRY_AGAIN_LATER, "too many clients")
             return
         self._session_count += 1  # before the first await, so that the limit holds
@@ -272,7 +272,7 @@ class Gateway:
         finally:
             self._session_count -= 1
 
-    def _may_connect(self, client: HTTPConnection) -> bool:
+    def may_connect(self, client: HTTPConnection) -> bool:
         """Whether a client's host may open a connection to the daemon; counts it."""
         host = "" if client.client is None else client.client.host
         return self._rates.of(host).take() and self._rate.take()

@@ -57,6 +57,8 @@ class Playback:
     """Before this time [s] advancing changes nothing."""
     tokens: Mapping[int, int] = field(default_factory=dict, init=False)
     """Token of each layer that plays."""
+    waiting: Sequence[LayerSet] = field(default_factory=list, init=False)
+    """Sets of layers that start when onsets have ended."""
 
     def __post_init__(self) -> None:
         """Start silent."""
@@ -129,10 +131,13 @@ class Playback:
 
     def _note_changes(self) -> None:
         """Note what plays, and when a voice has faded, or a layer ends or starts, next."""
-        first = math.inf
+        first, waiting = math.inf, []
         for layer in self._layers.values():
-            first = min(first, layer.ends, math.inf if layer.waiting is None else layer.waiting[0])
-        self.next_due, tokens = first, {}
+            first = min(first, layer.ends)
+            if layer.waiting is not None:
+                first = min(first, layer.waiting[0])
+                waiting.append(layer.waiting[1])
+        self.next_due, self.waiting, tokens = first, waiting, {}
         for voices in self.all_voices:
             for voice in voices:
                 if not voice.transition.last and voice.transition.end < first:
@@ -212,11 +217,6 @@ class Playback:
     def settled(self, channel: int) -> float:
         """Return the sum of the amplitudes to which the voices of a channel lead."""
         return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
-
-    @property
-    def waiting(self) -> tuple[LayerSet, ...]:
-        """Sets of layers that start when onsets have ended."""
-        return tuple([layer.waiting[1] for layer in self._layers.values() if layer.waiting])
 
     def next_tokens(self, layer: int) -> set[int]:
         """Return the tokens that a layer may have now, or once what is due of it has happened."""

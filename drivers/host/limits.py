@@ -135,55 +135,53 @@ class Rounding:
             raise CommandRefused("renew must be without tones and after")
         if layer.after and not layer.tones:
             raise CommandRefused("after must be with tones")
-        commands: list[Command] = []
-        channels: set[int] = set()
-        for tone in layer.tones:
-            command = self._command(tone)
-            if command.channel in channels:
-                raise _refused(tone.channel, "must occur once in a layer")
-            channels.add(command.channel)
-            commands.append(command)
+        commands = self._commands(layer.tones)
         self._check_envelopes(layer.tones)
         return LayerSet(
             number,
             min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
             max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
-            tuple(commands),
+            tuple(commands.values()),
             bool(layer.after),
             bool(layer.renew),
         )
 
-    def _command(self, tone: Tone) -> Command:
-        """Return the command of a tone; few calls, since every set has some."""
-        limits, channel, level, onset = self._limits, index(tone.channel), tone.level, tone.onset
-        if not 0 <= channel < self._channels:
-            text = f"channel must be 0 to {self._channels - 1}, got {channel!r}"
-            raise CommandRefused(text, channel=channel)
-        if not 0 <= level <= self._level_max * TOLERANCE:  # nor NaN
-            raise self._level_refused(channel, "level", level)
-        if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
-            values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
-            raise _refused(channel, f"frequency and phase must be finite numbers, got {values}")
-        frequency = round(tone.frequency * _FREQUENCY.per_unit)
-        if level == 0 and onset is None:
-            frequency = limits.frequency_min
-        if not limits.frequency_min <= frequency <= limits.frequency_max:
-            low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
-            text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
-            raise _refused(channel, text)
-        phase = round(tone.phase * _PHASE.per_unit)
-        if not _PHASE.minimum <= phase <= _PHASE.maximum:
-            phase = _PHASE.to_wire(float(tone.phase))
-        return Command(
-            channel,
-            self.achieved.get((channel, frequency), frequency),
-            min(round(level * _LEVEL.per_unit), limits.level),
-            phase,
-            bool(tone.keep_phase),
-            bool(tone.skip_ending),
-            onset,
-            tone.ending,
-        )
+    def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
+        """Return the commands of tones by channel; few calls, since every set has some."""
+        limits, commands = self._limits, dict[int, Command]()
+        for tone in tones:
+            channel, level, onset = index(tone.channel), tone.level, tone.onset
+            if not 0 <= channel < self._channels:
+                text = f"channel must be 0 to {self._channels - 1}, got {channel!r}"
+                raise CommandRefused(text, channel=channel)
+            if channel in commands:
+                raise _refused(channel, "must occur once in a layer")
+            if not 0 <= level <= self._level_max * TOLERANCE:  # nor NaN
+                raise self._level_refused(channel, "level", level)
+            if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
+                values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
+                raise _refused(channel, f"frequency and phase must be finite numbers, got {values}")
+            frequency = round(tone.frequency * _FREQUENCY.per_unit)
+            if level == 0 and onset is None:
+                frequency = limits.frequency_min
+            if not limits.frequency_min <= frequency <= limits.frequency_max:
+                low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
+                text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
+                raise _refused(channel, text)
+            phase = round(tone.phase * _PHASE.per_unit)
+            if not _PHASE.minimum <= phase <= _PHASE.maximum:
+                phase = _PHASE.to_wire(float(tone.phase))
+            commands[channel] = Command(
+                channel,
+                self.achieved.get((channel, frequency), frequency),
+                min(round(level * _LEVEL.per_unit), limits.level),
+                phase,
+                bool(tone.keep_phase),
+                bool(tone.skip_ending),
+                onset,
+                tone.ending,
+            )
+        return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
         return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")

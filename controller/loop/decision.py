@@ -97,6 +97,7 @@ class Decider:
         self._arrived = arrived
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
         self._played_until = -math.inf  # s; as far as known
+        self._fades_until = -math.inf  # s; what was ended or replaced
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
@@ -196,12 +197,13 @@ class Decider:
         """Return the last decision along its plain ramps, since a ledger has refused it by now [s].
 
         Without its newest content where it has no other shapes, and silence where none is left;
-        what is left out is decided again when a pulse or a layer beside it has ended.
+        what is left out is decided again when a pulse or a layer beside it has ended, or what it
+        replaces has faded.
         """
         if any(each.is_shaped for each in decision.sets.values()):
             _logger.info("loop: plain ramps instead of envelopes: %s", error)
             return self._without_shapes(decision)
-        self._retry_at = _ended_by(decision, now) if error.until is None else error.until
+        self._retry_at = self._faded_by(decision, now) if error.until is None else error.until
         newest = max(decision.started, key=self._requested_at, default=None)
         if newest is not None:
             ends = self.playing.beside(newest)
@@ -211,6 +213,15 @@ class Decider:
         return replace(
             decision, sets={}, started=frozenset(), silence=FADE_RAMP, refusal=str(error)
         )
+
+    def _faded_by(self, decision: Decision, now: float) -> float:
+        """Return when [s] what ends beside what a decision starts has faded; infinite for none."""
+        pulses = [target.pulse for one in decision.selection.contents for _, target in one.targets]
+        started = [each for each in pulses if each is not None and each.started_at is not None]
+        ends = [each.end for each in started if each.end > now]
+        if now < self._fades_until:
+            ends.append(now)
+        return max(ends, default=math.inf) + FADED_AFTER
 
     def _requested_at(self, number: int) -> float:
         """Return when [s] what plays in a layer was requested, by its pulse or its contact."""
@@ -349,6 +360,8 @@ class Decider:
             sets[number] = self._builder.build_end(number, has_endings=has_endings)
         if not sets:
             return None
+        if sets.keys() - started or any(before[n].drive for n in started & before.keys()):
+            self._fades_until = now + FADED_AFTER
         playing.start(contents, started)
         return replace(draft, sets=sets, started=started)
 
@@ -359,6 +372,7 @@ class Decider:
             return draft
         numbers = sorted(playing.may_play)
         is_shaped = bool(numbers) and not has_failed and bool(draft.contacts)
+        self._fades_until = now + FADED_AFTER
         if is_shaped and all(playing.may_end_shaped(number, now) for number in numbers):
             playing.end(is_silent=False)
             ends = {n: self._builder.build_end(n, has_endings=True) for n in numbers}
@@ -380,16 +394,6 @@ def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -
         reason=selection.reason if left else reason,
         not_served=(*selection.not_served, *skipped),
     )
-
-
-def _ended_by(decision: Decision, now: float) -> float:
-    """Return when [s] what ends beside what a decision starts has faded; infinite for none."""
-    pulses = [target.pulse for one in decision.selection.contents for _, target in one.targets]
-    started = [each for each in pulses if each is not None and each.started_at is not None]
-    ends = [each.end for each in started if each.end > now]
-    if decision.sets.keys() - decision.started:
-        ends.append(now)
-    return max(ends, default=math.inf) + FADED_AFTER
 
 
 def _why_not(decision: Decision | None) -> dict[ContactKey, str | None]:

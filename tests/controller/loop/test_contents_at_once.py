@@ -164,13 +164,18 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
 async def test_a_refused_content_is_left_out_and_the_other_plays_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Two contents are refused together: the newer finger is told why, the other is not silent."""
+    """Two contents are refused together: the newer finger is told why, the other is not silent.
+
+    The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
+    """
     async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
         apply, count = fingers.controller.group.apply, len(fingers.committed)
+        (own,), refused, loop = fingers.applied[-1].contents, [], asyncio.get_running_loop()
 
         async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
-            playing = [any(tone.level for tone in each.tones) for each in layers["main"]]
-            if sum(playing) > 1:
+            others = [each for each in layers["main"] if each.number != own]
+            if any(tone.level for each in others for tone in each.tones):
+                refused.append(loop.time())
                 raise CommandRefused("too much power")
             return await apply(layers)
 
@@ -179,6 +184,7 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
         await fingers.hold(0.3)
         felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
         assert felt == {1: None, 2: "too much power"}
+        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
         assert [_id(one) for one in fingers.applied[-1].contents.values()] == [1]
         assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
 
@@ -237,6 +243,24 @@ async def test_what_is_refused_beside_a_click_is_felt_after_it(
         assert refused
         assert [each.held_back for each in fingers.applied[-1].targets] == [None]
         assert fingers.applied[-1].time - clicked <= 0.15
+
+
+@in_virtual_time
+async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it() -> None:
+    """Both need 1.1 strokes: it is refused once the click has ended by itself, and once only."""
+    effects = {**LAYOUT.effects, "low": Buzz(level=36.0), "click": Click(level=50.0)}
+    layout = replace(LAYOUT, effects=effects)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
+        player, (contact,) = fingers.controller._intent_source, fingers.applied[-1].contacts
+        assert isinstance(player, EffectPlayer)
+        begin = asyncio.get_running_loop().time()
+        player.play("click", contact, begin, level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(1.0)
+        assert len(fingers.refused) == 1
+        (target,) = fingers.applied[-1].targets
+        assert (target.content, target.held_back) == ("low", None)
+        assert fingers.applied[-1].time - begin <= 0.15
 
 
 @in_virtual_time

@@ -99,6 +99,11 @@ class ExpectedOutputs:
             self._unclear("a request came as a layer ended by itself, or its onset")
         return begins
 
+    def _may_end(self, layer: int, start: float, end: float) -> bool:
+        """Whether a layer may end by itself between two times."""
+        half = self._plays.half[layer]
+        return start - half <= self.playback.end_of(layer) <= end + half
+
     def play(
         self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
     ) -> None:
@@ -107,14 +112,14 @@ class ExpectedOutputs:
         channels = range(self.playback.channels)
         self._before = [*map(self.playback.settled, channels)]
         for one in layers:
-            number, ends = one.layer, self.playback.end_of(one.layer)
+            number = one.layer
             lasting = self.lasting.setdefault(number, set())
             if not (one.renew or one.after):
                 lasting.clear()
             lasting.add(one.valid_for)
-            half = self._plays.half[number]
-            is_ending = start - half <= ends <= end + half
-            if is_ending and (one.renew or any(each.keep_phase for each in one.commands)):
+            if self._may_end(number, start, end) and (
+                one.renew or any(each.keep_phase for each in one.commands)
+            ):
                 self._unknown[number] = math.inf
             elif not one.renew and not one.after:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
@@ -129,6 +134,8 @@ class ExpectedOutputs:
     ) -> Interval:
         """Silence all along a ramp [s] from some time between two on; return when it is silent."""
         start, end = self._begins(when, None, ramp)
+        for layer in filter(lambda each: self._may_end(each, start, end), _ALL_LAYERS):
+            self._unknown[layer] = math.inf  # it fades, or has fallen silent by its ending
         self._plays.silence((start, end), ramp)
         is_known = max(self._unknown) < start
         self._unknown = [min(until, end + ramp) for until in self._unknown]

@@ -4,6 +4,7 @@ import random
 
 import pytest
 
+from drivers.expected.outputs import ExpectedOutputs
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.uncertain_playback import UncertainPlayback
@@ -112,6 +113,25 @@ def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
     bounds.commit([other], 2, (0.131, 0.133))  # for whoever cannot wait for another moment
     assert bounds.bounds(0, 0.134, 0.136) == pytest.approx((0.0, 0.5))
     assert bounds.bounds(0, 0.161, 0.162) == (0.0, 0.0)
+
+
+def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
+    """By hand: it ends at once within 100 to 112 ms, and all fades for 50 ms from 110 ms on."""
+    found: list[str] = []
+
+    def report(rule: str, *_: object, **__: object) -> None:
+        found.append(rule)
+
+    began = 0.0, 0.0
+    outputs = ExpectedOutputs({}, report=report, unclear=None, slack=0.0, cause="", began=began)
+    ended = Command(0, 2200, 5000, 0, ending=Envelope(10, ()))
+    outputs.play([LayerSet(0, 0, 100, (ended,))], 1, (0.0, 0.01), is_exact=True)
+    outputs.silence((0.11, 0.112), 0.05, "Disarm")
+    for level in (0.0, 0.5):
+        outputs.check_sensors([level], {}, 0.113, report_low=report)
+    assert not found
+    outputs.check_sensors([0.1], {}, 0.17, report_low=report)
+    assert found == ["silent"]
 
 
 def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:

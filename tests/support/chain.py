@@ -22,7 +22,7 @@ from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
-from plate_judge import STEP, PlateJudge
+from plate_judge import STEP, WATCHDOG, PlateJudge
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.contract import Amplifier
@@ -138,8 +138,9 @@ class Chain:
             for amplifier in far.bench.amplifiers.values():
                 amplifier.capabilities.update(capabilities)
             witness = LoopWitness(far.urls, **(judged or {}))
-            plate_judge = PlateJudge(far, witness, step=sensed_every)
-            given = {"timing": SetTiming(), **options}
+            given = {"timing": SetTiming(), "watchdog": WATCHDOG, **options}
+            watchdog = given["watchdog"]
+            plate_judge = PlateJudge(far, witness, step=sensed_every, watchdog=watchdog)
 
             def make(**more: Any) -> Controller:
                 own = {"intent_source": BuzzNewestContact(), **given, **more}
@@ -175,7 +176,9 @@ class Chain:
         is but the plate may play.
         """
         found = self.witness.finish(clock.now())
-        assert {one.invariant for one in found} == {*(breaks or "").split()} - {"plate"}, found[:1]
+        assert {one.invariant for one in found} == {*(breaks or "").split()} - {"plate"}, [
+            *map(str, found[:1])
+        ]
         assert breaks or not self.plate_judge.violations, self.plate_judge.violations
         assert self.witness.frames
 

@@ -16,46 +16,48 @@ import random
 import sys
 import types
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager, suppress
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import drivers
+import plate_judge
+import rig_on_wire
 import sim
 from drivers.by_hand import actions
 from drivers.errors import DriverError
-from drivers.host.amplifier import WATCHDOG
-from drivers.host.amplifier import Amplifier as Host
 from drivers.host.dialogue import SILENCING
 from drivers.host.stop import Stopped
-from drivers.protocol.records import Values
 from random_group import RandomGroup
-from virtual_loop import Stuck, run_virtual
-from words_line import Alter, MemoryLine, unaltered
+from rig_on_wire import after_each
+from sim.far_ends.wires import Wire
+from sim.faults.fault_window import FaultKind, FaultWindow, Toward
+from virtual_loop import Stuck, VirtualLoop, run_virtual
 
-LINES: Mapping[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
-    "serial": ("serial", (("a",),)),
-    "serial, two lines": ("serial", (("a",), ("b",))),
-    "serial, shared": ("serial", (("a", "b"),)),
-    "modbus-rtu, shared": ("rtu", (("a", "b"),)),
-    "modbus-tcp": ("tcp", (("a",),)),
-    "can, shared": ("can", (("a", "b"),)),
+_SHARED = ("a", "b")
+LINES: Mapping[str, Mapping[str, Wire]] = {
+    "serial": {"a": Wire("serial", 921_600)},
+    "serial, two lines": {name: Wire("serial", 921_600, line=name) for name in _SHARED},
+    "serial, shared": dict.fromkeys(_SHARED, Wire("serial", 921_600, shared=True)),
+    "modbus-rtu, shared": dict.fromkeys(_SHARED, Wire("modbus-rtu", 115_200)),
+    "modbus-tcp": {"a": Wire("modbus-tcp")},
+    "can, shared": dict.fromkeys(_SHARED, Wire("slcan", 500_000)),
 }
-"""Kinds of wires, and the amplifiers on each line."""
+"""Wires of the amplifiers."""
 
 PER_CHAIN = 12  # stops of one chain, with faults of frames
 LONGEST = 5.0  # s; a stop that takes longer hangs
 _MAX_DELAY = 0.2  # s; of a late frame
 _LATE = 2 * _MAX_DELAY + 0.05  # s; until every late frame and its late copy have arrived
-_HEARTBEAT = 0.05  # s
 _MOMENTS = 20  # at which what plays is looked at
 _MOST_LINES = 1500  # of a stop without faults; the place of an exception is drawn among them
-_WATCHED, _FAR = (str(Path(package.__path__[0])) for package in (drivers, sim))
+_WATCHED, _SIMULATED = (str(Path(package.__path__[0])) for package in (drivers, sim))
+_FAR = (_SIMULATED, str(plate_judge.__file__), str(rig_on_wire.__file__))
 _GRANTING = ("Arm", "Set", "Commit")
+_FRAME_FAULTS: tuple[FaultKind, ...] = ("drop", "duplicate", "delay")
 
 
 class Planted(Exception):
@@ -83,36 +85,26 @@ class Tally:
         return "\n".join(rows)
 
 
-class Chain(RandomGroup):
-    """A group on its lines, beaten as by a control loop; found: what was wrong."""
+@dataclass
+class Stopping(RandomGroup):
+    """A chain whose group is stopped; found: what was wrong."""
 
-    def __init__(self, wire: str, rng: random.Random) -> None:
-        kind, lines = LINES[wire]
-        super().__init__([MemoryLine(kind, *names) for names in lines], rng)
-        self.found: list[str] = []
-        self._granted: list[str] = []
-        for end in self.lines:
-            for name, far in end.far.items():
-                far.handle = self._noting(name, far.handle)  # type: ignore[method-assign]
-        self._background = asyncio.create_task(self.keep_beating())
+    found: list[str] = field(default_factory=list)
+    _granted: list[str] = field(default_factory=list)
 
-    def _noting(
-        self, name: str, handle: Callable[[str, Values, float], Values]
-    ) -> Callable[[str, Values, float], Values]:
-        def noting(request: str, values: Values, now: float) -> Values:
-            reply = handle(request, values, now)
-            if request in _GRANTING:
-                self._granted.append(f"{name} took {request}")
-            return reply
+    def __post_init__(self) -> None:
+        """Note what lets an amplifier play."""
+        super().__post_init__()
+        for name, device in self.far.devices.items():
+            after_each(device, partial(self._note, name))
 
-        return noting
+    def _note(self, name: str, request: str, *_: object) -> None:
+        if request in _GRANTING:
+            self._granted.append(f"{name} took {request}")
 
-    def disturb(self, *, is_on: bool = True) -> None:
-        """Lose, delay and double frames from now on, in one direction or both, or no longer."""
-        for end in self.lines:
-            end.inward, end.outward = (
-                _faulty(self.rng) if is_on else unaltered for _ in ("inward", "outward")
-            )
+    def lose_some(self) -> None:
+        """Lose, delay and double frames from now on, in one direction or both."""
+        self.disturb(*_drawn(self.rng, "amplifier"), *_drawn(self.rng, "host"))
 
     async def apply(self) -> None:
         """Play some layers on all amplifiers."""
@@ -122,31 +114,24 @@ class Chain(RandomGroup):
     async def play(self) -> None:
         """Clear and arm if need be, and play; gives up after a DriverError."""
         with suppress(DriverError):
-            await self.group.clear()
+            await self.operate("clear")
         with suppress(DriverError):
-            await self.group.arm()
+            await self.arm()
         await self.apply()
         await asyncio.sleep(self.rng.uniform(0.0, 0.08))
 
     def _loud(self, name: str) -> str:
         """Describe what an amplifier plays, or will without a request; empty if nothing."""
-        now = asyncio.get_running_loop().time()
-        far = next(end.far[name] for end in self.lines if name in end.far)
-        far.tick(now)
-        channels = range(far.playback.channels)
-        level = max(
-            far.playback.level(channel, now + LONGEST * number / _MOMENTS)
-            for number in range(_MOMENTS)
-            for channel in channels
-        )
-        if level > 1e-3 or far.state == "OPERATION_ENABLED":
-            return f"{name} in {far.state} plays {level:.4f}"
+        level = self.plate_judge.loudest(name, LONGEST, _MOMENTS)
+        state = self.far.summary(name).state
+        if level > 1e-3 or state == "OPERATION_ENABLED":
+            return f"{name} in {state} plays {level:.4f}"
         return ""
 
     def _check(self, names: Iterable[str], what: str) -> None:
         self.found += [f"{what} {loud}" for name in names if (loud := self._loud(name))]
 
-    async def judge(self, outcomes: Mapping[str, Stopped], scene: str) -> None:
+    async def compare(self, outcomes: Mapping[str, Stopped], scene: str) -> None:
         """Compare the outcomes of a stop with the amplifiers, now and until all is silent."""
         certain = [name for name, outcome in outcomes.items() if outcome.is_confirmed]
         self._check(certain, f"{scene}: confirmed silent, but")
@@ -164,60 +149,58 @@ class Chain(RandomGroup):
                 await asyncio.sleep(min(max(0.0, left), 3 * LONGEST))
                 self._check([name], f"{scene}: {outcome}, but afterwards")
 
-    def close(self) -> None:
-        """End the heartbeats."""
-        self._background.cancel()
+    def end(self) -> None:
+        """End the control loop."""
+        assert self.running is not None
+        self.running.cancel()
 
 
-def _faulty(rng: random.Random) -> Alter:
+def _drawn(rng: random.Random, toward: Toward) -> list[FaultWindow]:
     """Return what loses, delays and doubles; sometimes nothing passes, or all does."""
     drawn = rng.random()
     if drawn < 0.1:
-        return lambda name, data: []
+        return [FaultWindow("drop", toward=toward)]
     if drawn < 0.25:
-        return unaltered
-    lost, late, doubled = (rng.choice((0.0, 0.1, 0.3, 0.6)) for _ in range(3))
+        return []
     delay = rng.choice((0.005, 0.04, _MAX_DELAY))
-
-    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        copies = 0 if rng.random() < lost else 2 if rng.random() < doubled else 1
-        return [(delay if rng.random() < late else 0.0002, data) for _ in range(copies)]
-
-    return alter
+    return [
+        FaultWindow(fault, share=rng.choice((0.0, 0.1, 0.3, 0.6)), toward=toward, delay=delay)
+        for fault in _FRAME_FAULTS
+    ]
 
 
-async def _playing(chain: Chain) -> None:
+async def _playing(chain: Stopping) -> None:
     await chain.play()
 
 
-async def _applying(chain: Chain) -> None:
+async def _applying(chain: Stopping) -> None:
     await chain.play()
     await _begun(chain, chain.apply(), longest=0.01)
 
 
-async def _arming(chain: Chain) -> None:
-    await _begun(chain, chain.group.arm(), longest=0.03)
+async def _arming(chain: Stopping) -> None:
+    await _begun(chain, chain.operate("arm"), longest=0.03)
 
 
-async def _clearing(chain: Chain) -> None:
-    await _begun(chain, chain.group.clear(), longest=0.005)
+async def _clearing(chain: Stopping) -> None:
+    await _begun(chain, chain.operate("clear"), longest=0.005)
 
 
-async def _disarmed(chain: Chain) -> None:
+async def _disarmed(chain: Stopping) -> None:
     await chain.play()
     with suppress(DriverError):
-        await chain.group.disarm()
+        await chain.operate("disarm")
 
 
-async def _stopping(chain: Chain) -> None:
+async def _stopping(chain: Stopping) -> None:
     await chain.play()
-    stopping = await _begun(chain, chain.group.stop(), longest=0.01)
+    stopping = await _begun(chain, chain.operate("stop"), longest=0.01)
     if chain.rng.random() < 0.5:
         stopping.cancel()
 
 
 async def _begun(
-    chain: Chain, work: Awaitable[object], *, longest: float
+    chain: Stopping, work: Awaitable[object], *, longest: float
 ) -> "asyncio.Future[object]":
     """Begin what goes on while all is stopped."""
     task = asyncio.ensure_future(work)
@@ -226,7 +209,7 @@ async def _begun(
     return task
 
 
-SCENES: Mapping[str, Callable[[Chain], Awaitable[None]]] = {
+SCENES: Mapping[str, Callable[[Stopping], Awaitable[None]]] = {
     "playing": _playing,
     "applying": _applying,
     "arming": _arming,
@@ -236,11 +219,11 @@ SCENES: Mapping[str, Callable[[Chain], Awaitable[None]]] = {
 }
 
 
-async def _stop(chain: Chain, wire: str, scene: str, tally: Tally) -> None:
+async def _stop(chain: Stopping, wire: str, scene: str, tally: Tally) -> None:
     """Stop all, and judge the outcome."""
     tally.counts[wire, "stops"] += 1
     try:
-        stopping = asyncio.ensure_future(chain.group.stop())
+        stopping = asyncio.ensure_future(chain.controller.stop())
     except Planted:  # no success
         tally.counts[wire, "raised"] += 1
         return
@@ -255,67 +238,61 @@ async def _stop(chain: Chain, wire: str, scene: str, tally: Tally) -> None:
             chain.found.append(f"{scene}: outcomes of {sorted(outcomes)} only")
         for outcome in outcomes.values():
             tally.counts[wire, "confirmed" if outcome.is_confirmed else "may play"] += 1
-        await chain.judge(outcomes, scene)
+        await chain.compare(outcomes, scene)
 
 
-async def _disturbed_stops(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
+async def _disturbed_stops(chain: Stopping, wire: str, tally: Tally, seed: int) -> None:
     """Stops of one chain while frames are lost, late and doubled."""
     rng = chain.rng
     for _ in range(PER_CHAIN):
         scene = rng.choice(tuple(SCENES))
         is_early = rng.random() < 0.5
         if is_early:
-            chain.disturb()
+            chain.lose_some()
         await SCENES[scene](chain)
         if not is_early:
-            chain.disturb()
+            chain.lose_some()
         await asyncio.sleep(rng.choice((0.0, 0.07, 0.12, 0.5)) * rng.random())
         await _stop(chain, wire, scene, tally)
-        chain.disturb(is_on=False)
+        chain.recover()
         await asyncio.sleep(0.3)
 
 
-async def _stop_with_exception(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
+async def _stop_with_exception(chain: Stopping, wire: str, tally: Tally, seed: int) -> None:
     """One stop, on the way of which an exception is raised at a line whose number is drawn."""
     at = random.Random(-seed).randint(1, random.Random(seed).choice((100, 500, _MOST_LINES)))
     scene = chain.rng.choice(("playing", "applying", "stopping"))
     await SCENES[scene](chain)
     if chain.rng.random() < 0.5:
-        chain.disturb()
+        chain.lose_some()
     with _exception_at(at) as planted:
         await _stop(chain, wire, f"{scene}, exception at line {at} {planted}", tally)
     chain.found = [f"{one} {planted}" for one in chain.found]
 
 
-async def _stop_by_command(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
+async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) -> None:
     """Stop one amplifier of a killed host by `era amp stop`."""
     rng = chain.rng
     scene = rng.choice(tuple(SCENES))
     await SCENES[scene](chain)
     if is_early := rng.random() < 0.5:
-        chain.disturb()
+        chain.lose_some()
     await asyncio.sleep(rng.uniform(0.0, 0.02))
-    chain.close()
-    for end in chain.lines:
-        end.kill_host()
-    silent_from = asyncio.get_running_loop().time() + WATCHDOG + SILENCING
+    chain.end()
+    chain.operation.kill_host()
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.kill_hosts()
+    silent_from = loop.time() + chain.controller.watchdog + SILENCING
     if not is_early:
-        chain.disturb()
-    end = rng.choice(chain.lines)
-    name = rng.choice(tuple(end.hosts))
-
-    @asynccontextmanager
-    async def reached(url: str) -> AsyncIterator[Host]:
-        yield end.hosts[url]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(actions, "reached", reached)
-        async with asyncio.timeout(LONGEST):
-            rows = await actions.stop(name)
+        chain.lose_some()
+    name = rng.choice([*chain.far.urls])
+    async with asyncio.timeout(LONGEST):
+        rows = await actions.stop(chain.far.urls[name])
     is_confirmed = rows["silence"] == "confirmed_silent"
     tally.counts[wire, "stops"] += 1
     tally.counts[wire, "confirmed" if is_confirmed else "may play"] += 1
-    await chain.judge({name: Stopped(is_confirmed, silent_from)}, f"{scene}, killed")
+    await chain.compare({name: Stopped(is_confirmed, silent_from)}, f"{scene}, killed")
 
 
 @contextmanager
@@ -350,13 +327,13 @@ def _exception_at(number: int) -> Iterator[list[str]]:
 
 def _is_of_far_end(frame: types.FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_code.co_filename.startswith(_FAR) or frame.f_code is Chain._loud.__code__:
+        if frame.f_code.co_filename.startswith(_FAR):
             return True
         frame = frame.f_back
     return False
 
 
-PROGRAMMES: Mapping[str, Callable[[Chain, str, Tally, int], Awaitable[None]]] = {
+PROGRAMMES: Mapping[str, Callable[[Stopping, str, Tally, int], Awaitable[None]]] = {
     "frames lost, late and doubled": _disturbed_stops,
     "one exception each": _stop_with_exception,
     "by era amp stop, of a killed host": _stop_by_command,
@@ -368,10 +345,10 @@ def play(programme: str, seed: int, tally: Tally) -> None:
     wire, rng = tuple(LINES)[seed % len(LINES)], random.Random(seed)
 
     async def run() -> list[str]:
-        chain = Chain(wire, rng)
-        await chain.group.open()
-        await PROGRAMMES[programme](chain, wire, tally, seed)
-        chain.close()
+        async with Stopping.of(LINES[wire], rng) as chain:
+            await chain.open()
+            await PROGRAMMES[programme](chain, wire, tally, seed)
+            chain.end()
         return chain.found
 
     try:

@@ -69,9 +69,10 @@ class SourceContacts:
 
 _ENDED = 1e-6  # s; after contacts have ended
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended
-WATCHDOG = 0.25 + 0.005  # s; then every channel is silent
+WATCHDOG = 0.25  # s; of armed amplifiers
+_SILENCING = 0.005  # s; then every channel is silent
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
-RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
+RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + _SILENCING + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
@@ -83,16 +84,25 @@ _FAULTED = (STATES["FAULT"], STATES["FAULT_REACTION_ACTIVE"])
 class PlateJudge:
     """Judges what plays at the far ends, and lets the witness sense it and know of the contacts.
 
-    step [s]: between two looks while a channel vibrates; violations: those found, each with its
+    step [s]: between two looks while a channel vibrates; watchdog [s]: of armed amplifiers; what
+    plays without fingers is judged once there has been one. violations: those found, each with its
     time; contacts: all that are on the plate.
     """
 
-    def __init__(self, far: FarSide, witness: LoopWitness, *, step: float = STEP) -> None:
+    def __init__(
+        self,
+        far: FarSide,
+        witness: LoopWitness,
+        *,
+        step: float = STEP,
+        watchdog: float = WATCHDOG,
+    ) -> None:
         self.violations: list[str] = []
         self.contacts = SourceContacts()
         self._bench = far.bench
         self._witness = witness
         self._step = step
+        self._watchdog = watchdog
         self._fed = dict.fromkeys(far.devices, -math.inf)
         self._faulted: dict[str, float] = {}
         self._loop = asyncio.get_running_loop()
@@ -132,6 +142,16 @@ class PlateJudge:
             if not level <= AUDIBLE:
                 self._check_loud(name, level, now)
             sense(self._witness, now, name, amplifier)
+
+    def loudest(self, name: str, within: float, looks: int) -> float:
+        """Highest level that an amplifier plays within a time [s] without a request, in looks."""
+        now, playback = self._loop.time(), self._bench.amplifiers[name].playback
+        self._bench.advance(now)
+        return max(
+            playback.level(channel, now + within * number / looks)
+            for number in range(looks)
+            for channel in range(playback.channels)
+        )
 
     def close(self) -> None:
         """Stop checking."""
@@ -174,8 +194,9 @@ class PlateJudge:
             self._faulted.pop(name, None)
 
     def _check_loud(self, name: str, level: float, now: float) -> None:
-        bounds = {"it was fed": (self._fed[name], WATCHDOG)}
-        bounds["the last finger"] = (self.contacts.last, RELEASE_WITH_FAULTS)
+        bounds = {"it was fed": (self._fed[name], self._watchdog + _SILENCING)}
+        if self.contacts.last > -math.inf:
+            bounds["the last finger"] = (self.contacts.last, RELEASE_WITH_FAULTS)
         for other in self._faulted.keys() - {name}:
             bounds[f"the fault of {other}"] = (self._faulted[other], TOGETHER)
         for what, (since, bound) in bounds.items():

@@ -1,84 +1,122 @@
-"""Random days of a group of amplifiers of protocol 3: layers, stops, faults, lost frames."""
+"""Random days of amplifiers on the chain: layers, stops, faults, lost frames."""
 
 import asyncio
 import contextlib
 import random
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from typing import Any, Self
 
+from chain import Chain
+from drivers import clock
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
-from drivers.host.members import GroupState
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import STATES
-from words_line import unaltered
+from registry.limits import GuardLimits
+from set_table import SetTable, make_rig
+from sim.far_ends.wires import Wire
+from sim.faults.fault_window import FaultWindow
+from virtual_loop import VirtualLoop
 
 _CHANNELS, _LAYERS = 2, 4
-_BEAT = 0.05  # s
+_PASSING = 50e-6, 350e-6  # s; through driver and adapter, that sets may be read back at any time
+_LOST, _DOUBLED = 0.03, 0.03  # share of frames
 _FAILURES = (CommandRefused, LinkError, Preempted)
 
 
-class RandomGroup:
-    """A group on lines, and a random generator of what is done with it."""
+@dataclass
+class RandomGroup(Chain):
+    """A chain whose amplifiers play what is drawn: no finger touches, and its loop only beats."""
 
-    def __init__(self, lines: Sequence[Any], rng: random.Random) -> None:
-        self.rng = rng
-        self.lines = lines
-        hosts = {name: host for line in lines for name, host in line.hosts.items()}
-        self.group = Group(hosts, watchdog=self.rng.choice((0.25, 0.5)), draw=self.rng.randint)
-        self._beating = asyncio.Lock()  # no beat is under way while the loop stalls
+    rng: random.Random = field(init=False)
+    _turned: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def disturb(self, *, is_on: bool) -> None:
-        """Lose and double frames on their way from now on, or no longer; the witness is told."""
-        for line in self.lines:
-            line.witness.faults(line.loop.time(), line.name, are_on=is_on)
-            line.inward = line.outward = self._alter if is_on else unaltered
+    def __post_init__(self) -> None:
+        """Draw as the wires do."""
+        super().__post_init__()
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        self.rng = loop.rng
 
-    async def run(self, steps: int, *, lossy_steps: int = 0) -> None:
-        """Open and arm the group, take so many steps, the first lossy, and disarm."""
-        background = [asyncio.ensure_future(line.keep_sensing()) for line in self.lines]
-        background.append(asyncio.ensure_future(self.keep_beating()))
+    @classmethod
+    def of(
+        cls, wires: Mapping[str, Wire], rng: random.Random, **options: Any
+    ) -> AbstractAsyncContextManager[Self]:
+        """A chain of amplifiers on wires, not open yet; options: as for `Chain.on`."""
+        rig = make_rig([*wires], GuardLimits(20.0, 1000.0, 1.0))
+        options |= {
+            "passing": _PASSING,
+            "capabilities": {"layers": _LAYERS},
+            "watchdog": rng.choice((0.25, 0.5)),
+        }
+        judged = {"frequency_hz": [20, 1000]}
+        table = SetTable({}, rig.plate)
+        return cls.on(wires, rig, table, judged=judged, sensed_every=0.002, **options)
+
+    async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
         try:
-            await self._opened()
-            for step in range(steps):
-                if step == 0 and lossy_steps:
-                    self.disturb(is_on=True)
-                elif step == lossy_steps and lossy_steps:
-                    self.disturb(is_on=False)
-                    await asyncio.sleep(0.6)
-                with contextlib.suppress(*_FAILURES):
-                    await self._step()
-                await asyncio.sleep(self.rng.choice((0.0, 0.001, 0.01, 0.04, 0.2)))
-            with contextlib.suppress(*_FAILURES):
-                await self.group.disarm()
-            await asyncio.sleep(0.1)
+            await super()._turn(step)
         finally:
-            for each in background:
-                each.cancel()
-            await asyncio.gather(*background, return_exceptions=True)
+            self._turned.set()
 
-    async def _opened(self) -> None:
-        for _ in range(20):
+    async def arm(self) -> None:
+        """Arm, and await the turn of the loop that silences what it does not know."""
+        await self.operate("arm")
+        self._turned.clear()
+        await self._turned.wait()
+
+    @property
+    def group(self) -> Group:
+        """All amplifiers."""
+        return self.controller.group
+
+    def disturb(self, *windows: FaultWindow) -> None:
+        """Have faults of frames on all wires from now on, until `recover`."""
+        self.witness.disturb()
+        for far_end in self.far_ends:
+            for window in windows:
+                far_end.device.inject_fault(window)
+
+    def recover(self) -> None:
+        """End the faults of frames."""
+        for far_end in self.far_ends:
+            far_end.recover()
+        self.witness.disturb(-1)
+
+    async def live(self, steps: int, *, lossy_steps: int = 0) -> None:
+        """Open and arm the group, take so many steps, the first lossy, and disarm."""
+        await self.open()
+        for step in range(steps):
+            if step == 0 and lossy_steps:
+                lost = FaultWindow("drop", share=_LOST)
+                self.disturb(lost, FaultWindow("duplicate", share=_DOUBLED))
+            elif step == lossy_steps and lossy_steps:
+                self.recover()
+                await asyncio.sleep(0.6)
             with contextlib.suppress(*_FAILURES):
-                await self.group.open()
-                return
-        raise AssertionError("the group must open")
+                await self._step()
+            await asyncio.sleep(self.rng.choice((0.0, 0.001, 0.01, 0.04, 0.2)))
+        with contextlib.suppress(*_FAILURES):
+            await self.operate("disarm")
+        await asyncio.sleep(0.1)
 
     async def _step(self) -> None:
-        if self.group.state is GroupState.LOST:
-            await self.group.open()
+        if not self.group.is_open:
+            await self.controller.release()
+            await self.controller.open()
         if not self.group.is_armed and self.rng.random() < 0.8:
-            await self.group.clear()
-            await self.group.arm()
+            await self.operate("clear")
+            await self.arm()
             return
         chosen = self.rng.random()
         names = [*self.group.amplifiers]
         host = self.group.amplifiers[self.rng.choice(names)]
         if chosen < 0.6:
-            layers = {name: self.layers() for name in names}
-            await self.group.apply(layers)
+            await self.group.apply({name: self.layers() for name in names})
         elif chosen < 0.7:
             await host.request("GetAchieved", {"layer": self._number()}, Priority.OTHER)
         elif chosen < 0.75:
@@ -86,27 +124,21 @@ class RandomGroup:
         elif chosen < 0.8:
             await self.group.silence(self._ramp())
         elif chosen < 0.84:
-            await self.group.disarm()
+            await self.operate("disarm")
         elif chosen < 0.9:
-            await self.group.stop()
+            await self.operate("stop")
         elif chosen < 0.93:
-            async with self._beating:
-                self._stall(is_stalled=True)
-                await asyncio.sleep(0.6)
-                self._stall(is_stalled=False)
+            self.turning.clear()
+            await asyncio.sleep(0.6)
+            self.turning.set()
         elif chosen < 0.96:
-            line = self.rng.choice(self.lines)
-            far = self.rng.choice([*line.far.values()])
-            far.tick(line.loop.time())
-            far.trip(self.rng.choice(("ARC", "CHANNEL")), line.loop.time(), channel=1)
+            self.far.bench.advance(clock.now())
+            amplifier = self.rng.choice(self.far_ends).amplifier
+            amplifier.trip(self.rng.choice(("ARC", "CHANNEL")), clock.now(), channel=1)
         else:
             status = await host.read_status()
             if self.group.is_armed and status["state"] != STATES["OPERATION_ENABLED"]:
-                await self.group.stop()
-
-    def _stall(self, *, is_stalled: bool) -> None:
-        for line in self.lines:
-            line.witness.set_stalled(line.loop.time(), is_stalled)
+                await self.operate("stop")
 
     def _number(self) -> int:
         return self.rng.randrange(_LAYERS)
@@ -146,19 +178,3 @@ class RandomGroup:
         count = self.rng.choice((0, 1, 4))
         step = self.rng.choice((10, 40, 200))
         return Envelope(step, tuple((self.rng.randrange(2000), 0) for _ in range(count)))
-
-    async def keep_beating(self) -> None:
-        """Beat as a control loop does while it is armed."""
-        while True:
-            await asyncio.sleep(_BEAT)
-            async with self._beating:
-                if self.group.is_armed:
-                    with contextlib.suppress(*_FAILURES):
-                        await self.group.beat()
-
-    def _alter(self, name: str, data: bytes) -> list[tuple[float, bytes]]:
-        chosen = self.rng.random()
-        if chosen < 0.03:
-            return []
-        delays = [0.0002, 0.0015] if chosen < 0.06 else [0.0002]
-        return [(delay, data) for delay in delays]

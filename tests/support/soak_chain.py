@@ -167,6 +167,7 @@ class Soak(Chain):
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.seen = self._seen
+        self.witness.contacts(loop.time(), ())
         loop.set_exception_handler(self._unhandled)
         for name, device in self.far.devices.items():
             after_each(device, self._count_request)

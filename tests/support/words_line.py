@@ -120,20 +120,11 @@ class MemoryLine:
         self._sending = self._handling = ""
         self._due: dict[str, float] = {}  # s; of what was handed over last, by who takes it
         self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
-        self.start_host()
-
-    def start_host(self) -> None:
-        """Have a host with a new line."""
         self.line = Line(self.kind.wire(), self, "line")
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)
             for address, each in enumerate(self.far, 1)
         }
-
-    def kill_host(self) -> None:
-        """Have another host in place of this one, which sends nothing any more."""
-        self.line.lose("its host was killed")
-        self.start_host()
 
     @property
     def retries(self) -> int:

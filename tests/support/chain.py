@@ -248,6 +248,7 @@ class Chain:
         """Disarm and close all; raises what ended the control loop."""
         self.witness.commanded("disarm")
         await self.controller.close()
+        self.turning.set()  # one that stalls has nothing to end it
         if self.running is not None:
             await self.running
 

@@ -79,32 +79,36 @@ class EffectPlayer:
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        felt: list[tuple[_Play, Contact, Sensation]] = []
+        felt: list[tuple[int, _Play, Contact, Sensation]] = []
         ends: list[float] = []
         for contact in contacts:
             play, sensation = self._current_sensation(contact, now, ends)
             if play is not None and sensation is not None:
-                felt.append((play, contact, sensation))
-        felt.sort(key=lambda one: one[0].number)
-        newest = max((play.number for play, _, _ in felt if play.is_elsewhere), default=0)
+                felt.append((play.number, play, contact, sensation))
+        felt.sort()
+        elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
         targets = [
             sensation.target(
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
-            for play, contact, sensation in felt
-            if not play.is_elsewhere or play.number == newest
+            for number, play, contact, sensation in felt
+            if number not in elsewhere[:-1]  # the newest
         ]
-        clicking = {target.key for target in targets if target.is_short}
-        self._waiting = {key: self._waiting[key] for key in self._waiting if key in clicking}
+        waiting, self._waiting = self._waiting, {}
+        for target in targets:
+            if target.key in waiting and target.is_short:
+                self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
         return HapticIntent(
             now_felt,
             "" if now_felt else self._reason,
             until=min(ends, default=None),
             protected=frozenset(
-                key
-                for key, finger in self._fingers.items()
-                if finger.region is not None and finger.region.is_protected
+                [
+                    key
+                    for key, finger in self._fingers.items()
+                    if finger.region is not None and finger.region.is_protected
+                ]
             ),
         )
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -115,6 +115,20 @@ class Selection:
         """Whether every target feels its own, so that who leaves changes nothing for others."""
         is_each_alone = all(len(content.targets) == 1 for content in self.contents)
         return bool(self.contents) and is_each_alone and not self.not_served
+
+    def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
+        """Return it without some contents, whose targets feel nothing for a reason."""
+        held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
+        left = tuple(each for each in self.contents if each not in contents)
+        return replace(
+            self,
+            contents=left,
+            reason=self.reason if left else reason,
+            not_served=(
+                *self.not_served,
+                *[not_served(contact, reason) for contact in held_back],
+            ),
+        )
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:

@@ -6,12 +6,12 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.choice import Chooser
-from controller.loop.content import Content, Selection, no_layer_free, not_served
+from controller.loop.content import Selection, no_layer_free
 from controller.loop.intent import FADED_AFTER, IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.playing import PlayedContent, Playing, all_left
@@ -235,7 +235,7 @@ class Decider:
         ends = {number: self._builder.build_end(number, has_endings=False) for number in numbers}
         return replace(
             decision,
-            selection=_held_back(decision.selection, contents, reason),
+            selection=decision.selection.without(contents, reason),
             sets={**decision.sets, **ends},
             started=decision.started - numbers,
             refusal=reason,
@@ -260,7 +260,7 @@ class Decider:
             return None
         self._decided = replace(
             self._decided,
-            selection=_held_back(self._decided.selection, contents, ENDED),
+            selection=self._decided.selection.without(contents, ENDED),
             sets={},
             started=frozenset(),
             refusal=ENDED,
@@ -281,7 +281,12 @@ class Decider:
         from_rest = now - self._played_until >= _RING_DOWN
         before, decision, has_failed = self._decided, None, False
         try:
-            requested = self._select(contacts, now, triggered_at)
+            self._intent_due = math.inf
+            intent = self._intent_source.intent(contacts, now)
+            self._intent_due = intent.due(now)
+            requested = self._selector.select(
+                contacts, intent, self.capabilities, triggered_at=triggered_at
+            )
             if before is not None and requested == before.requested and not is_retry:
                 return None
             triggered_at = min(triggered_at, self._selector.triggered_at)
@@ -311,17 +316,10 @@ class Decider:
         self._is_new = True
         self._arrived()
 
-    def _select(self, contacts: tuple[Contact, ...], now: float, triggered_at: float) -> Selection:
-        """Query the intent, and the table for it."""
-        self._intent_due = math.inf
-        intent = self._intent_source.intent(contacts, now)
-        self._intent_due = intent.due(now)
-        return self._selector.select(contacts, intent, self.capabilities, triggered_at=triggered_at)
-
     def _playable(self, selection: Selection) -> Selection:
         """Return a selection without what has ended by itself, and what has no layer."""
         if over := self.playing.over_of(selection.contents):
-            selection = _held_back(selection, over, ENDED)
+            selection = selection.without(over, ENDED)
         if len(selection.contents) > self.capabilities.layers:
             selection = self._within_layers(selection)
         return selection
@@ -331,7 +329,7 @@ class Decider:
         served = [*self.playing.numbered(selection.contents).values()]
         keys = {each.key[0] for each in selection.contents if each not in served}
         left = [each for each in selection.contents if each.key[0] in keys]
-        return _held_back(selection, left, no_layer_free(self.capabilities.layers))
+        return selection.without(left, no_layer_free(self.capabilities.layers))
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""
@@ -381,19 +379,6 @@ class Decider:
         if not draft.contacts:
             return replace(draft, silence=RELEASE_RAMP)
         return replace(draft, silence=FADE_RAMP)
-
-
-def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -> Selection:
-    """Return a selection without some of its contents, whose targets feel nothing for a reason."""
-    held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
-    skipped = [not_served(contact, reason) for contact in held_back]
-    left = tuple(each for each in selection.contents if each not in contents)
-    return replace(
-        selection,
-        contents=left,
-        reason=selection.reason if left else reason,
-        not_served=(*selection.not_served, *skipped),
-    )
 
 
 def _why_not(decision: Decision | None) -> dict[ContactKey, str | None]:

@@ -259,8 +259,13 @@ class Controller:
         decision = decider.decide(now)
         try:
             async with self._sending:
-                if self.group.is_armed:
-                    await self._send(decider, decision, now)
+                is_armed, is_degraded = self.group.is_armed, self.group.degraded
+                if is_armed and decision is not None and decision.started and is_degraded:
+                    await self._end_only(decider, decision)
+                elif is_armed and decision is not None:
+                    await self._execute(decider, decision)
+                elif is_armed and now >= decider.playing.due:
+                    await self._go_on(decider, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     began = clock.now()
@@ -278,7 +283,7 @@ class Controller:
             self._report(lambda each: each.refused(reason))
         finally:
             if expired.up:
-                self._report_change(expired)
+                self._report(lambda each: each.contacts_changed(self._tracker.contacts, expired))
             if not self._wake.is_set():
                 self._changed_at = -math.inf
 
@@ -330,7 +335,7 @@ class Controller:
             self._changed_at = clock.now()
         if decider is not None and decider.is_silence_pending:
             self.group.abort_exchange()
-        self._report_change(change)
+        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.
@@ -353,28 +358,22 @@ class Controller:
             self._follow(change, now)
         self._schedule_expiry()
 
-    async def _send(self, decider: Decider, decision: Decision | None, now: float) -> None:
-        """Send what was decided, or prolong what plays; raises DriverError."""
-        if decision is None:
-            if now >= decider.playing.due:
-                await self._go_on(decider, now)
-        elif decision.started and self.group.degraded:
-            ends = decider.only_ends(decision)
-            if ends.sets:  # unreported
-                played = await self._play(decider, ends.sets)
-                if isinstance(played, CommandRefused):
-                    raise played
-                decider.confirm(ends, played, now=clock.now())
-        else:
-            await self._execute(decider, decision)
-
     async def _go_on(self, decider: Decider, now: float) -> None:
-        """Prolong the layers that are due, and report those that have ended by themselves."""
+        """Prolong the layers that are due, and report those that have ended; raises DriverError."""
         due = {} if self.group.degraded else decider.renewal(now)
         if due:
             decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
         if (ended := decider.ended(now)) is not None:
             self._report_playing(decider, ended, sent_at=None)
+
+    async def _end_only(self, decider: Decider, decision: Decision) -> None:
+        """End what a decision ends, unreported, and start nothing; raises DriverError."""
+        ends = decider.only_ends(decision)
+        if ends.sets:
+            played = await self._play(decider, ends.sets)
+            if isinstance(played, CommandRefused):
+                raise played
+            decider.confirm(ends, played, now=clock.now())
 
     async def _execute(self, decider: Decider, decision: Decision) -> None:
         """Send the sets of a decision and report the outcome; raises DriverError."""
@@ -458,9 +457,6 @@ class Controller:
             await self._wake.wait()
         finally:
             timer.cancel()
-
-    def _report_change(self, change: Change) -> None:
-        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
 
     def _report(self, event: Callable[[Observer], None]) -> None:
         """Report an event to all observers; their exceptions are only logged."""

@@ -220,7 +220,9 @@ class Playing:
             voices = [n for n, one in numbers.items() if one.targets == content.targets]
             if len(voices) > 1 and restarted_by(content.pattern.excitation, self.drive_of(number)):
                 restarting.update(voices)
-        return [n for n in numbers if n in changed or n in restarting], restarting
+        if restarting:
+            changed = [n for n in numbers if n in changed or n in restarting]
+        return changed, restarting
 
     def drive_of(self, number: int) -> Drive:
         """Return what plays in a layer, at the frequencies that were asked for."""

@@ -106,11 +106,12 @@ def _contents(table: "LocalizationTable", question: Question) -> Contents:
             "Hz; build a table with others: era table build --frequencies"
         )
     count, band = len(question.targets), (int(playable[0]), int(playable[-1]) + 1)
+    places = question.contacts
     return Contents(
-        question.contacts,
+        places,
         question.loads,
         (Stream(tuple(range(count)), question.level_db_sl, (band,)),),
-        tuple(range(count, len(question.contacts))),
+        tuple(range(count, len(places))),
         background=None if question.quiet else table.background(question.targets),
     )
 
@@ -216,7 +217,7 @@ def _pattern(
     tones: Tones,
 ) -> Pattern:
     """The pattern of the only content's tones; its level is that of the weakest target."""
-    nominal = min(tones.level_db_sl[target][0] for target in contents.streams[0].targets)
+    nominal = min([tones.level_db_sl[target][0] for target in contents.streams[0].targets])
     if nominal < question.level_db_sl - _SHORT_OF:
         raise UnreachableLevel(question, drive_mode, nominal)
     drive = [*zip(tones.rows, tones.weights, strict=True)]

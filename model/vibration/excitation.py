@@ -54,12 +54,11 @@ def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatA
     if not excitation:
         raise InputError("excitation: must drive at least one ERA")
     names = [era.name for era in eras]
-    unknown = [name for name in excitation if name not in names]
-    if unknown:
-        raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
     frequencies = sorted({tone.frequency for tone in excitation.values()})
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
     for name, tone in excitation.items():
+        if name not in names:
+            raise InputError(f"the rig has no ERA {name!r}; it has {', '.join(names)}")
         phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
         amplitudes[frequencies.index(tone.frequency), names.index(name)] = phasor
     return np.array(frequencies), amplitudes

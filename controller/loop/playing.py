@@ -190,10 +190,13 @@ class Playing:
         return frozenset(n for n, one in self.contents.items() if one.content.targets == targets)
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: a finger's in the layer that it has, new ones in those that end."""
-        numbers = {}
+        """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
+        numbers = {n: one.content for n, one in self.contents.items() if one.content in contents}
+        kept = [*numbers.values()]
         new = []
         for content in contents:
+            if content in kept:
+                continue
             number = self._layer_of.get(content.key)
             if number is None or number in numbers:  # a pulse beside what others share
                 new.append(content)

@@ -174,3 +174,22 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
     playing.start(contents, frozenset(contents))
     every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
     assert playing.starting(every) == ([3], set())
+
+
+def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:
+    """The click has begun first: what is decided next restarts neither of the two."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
+    click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
+    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 14.0, None, None)
+    lasting = Content(shared, Question((LEFT,)), pattern)
+    clicking = Content(((contacts[0], click),), Question((LEFT,)), pattern)
+    playing = Playing(smooth_rig(), 4, lambda key: 0.0)
+    contents = {
+        number: PlayedContent(one, PlateSet({}, 0.0), pattern, drive={})
+        for number, one in ((1, clicking), (0, lasting))
+    }
+    playing.start(contents, frozenset({0}))
+    numbers = playing.numbered([lasting, clicking])
+    assert numbers == {0: lasting, 1: clicking}
+    assert playing.starting(numbers) == ([], set())

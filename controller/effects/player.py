@@ -92,7 +92,7 @@ class EffectPlayer:
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
             for number, play, contact, sensation in felt
-            if number not in elsewhere[:-1]  # the newest
+            if number not in elsewhere[:-1]  # of these only the newest is felt
         ]
         waiting, self._waiting = self._waiting, {}
         for target in targets:

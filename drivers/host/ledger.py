@@ -273,7 +273,7 @@ class Ledger:
             for command in one.commands:
                 peak = command.level
                 for shape in (command.onset, command.ending):
-                    if shape is not None and shape.knots:
+                    if shape is not None and shape.knots:  # as `Envelope.peak`, without a call
                         peak = max(peak, max(shape.knots)[0])
                 levels[command.channel] += peak / full
                 if is_at_once and command.onset is None and command.ending is None:

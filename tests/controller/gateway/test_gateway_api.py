@@ -17,7 +17,6 @@ from controller.api.methods import METHODS, RequestedBy
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from controller.gateway import app
-from controller.gateway.app import OPENING_BURST
 from controller.gateway.settings import Settings
 from gateway_bench import (
     TOKEN,
@@ -137,7 +136,9 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
         for each in (first, *kept, first):
             assert each.post("api/v1/status").status_code == 200
         assert len({id(each) for each in daemon.callers}) == 8
-        refused = [ninth.post("api/v1/status").status_code for _ in range(2 * round(OPENING_BURST))]
+        refused = [
+            ninth.post("api/v1/status").status_code for _ in range(2 * round(app.OPENING_BURST))
+        ]
         assert {*refused} == {429}
         with RawWebSocket(gateway):
             pass

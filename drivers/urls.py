@@ -63,8 +63,8 @@ class AmplifierUrl:
         except ValueError as error:
             raise self.refused(f"URL must be valid: {error}") from None
         self.place, self.number = parts.netloc, parts.fragment
-        self.path = unquote(parts.path)
-        pairs = parse_qsl(parts.query, keep_blank_values=True)
+        self.path = unquote(parts.path, errors="surrogateescape")  # names of files are bytes
+        pairs = parse_qsl(parts.query, keep_blank_values=True, errors="surrogateescape")
         self.options = dict(pairs)
         if unknown := sorted(self.options.keys() - set(known)):
             raise self.refused(

@@ -42,7 +42,8 @@ class SimulationUrl:
 
     def __init__(self, url: str) -> None:
         self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "seed", "exact"))
-        options, file = self._url.options, unquote(self._url.place) + self._url.path
+        options = self._url.options
+        file = unquote(self._url.place, errors="surrogateescape") + self._url.path
         if not file:
             raise self._url.refused("rig file must be named")
         if {"seed", "exact"} <= options.keys():

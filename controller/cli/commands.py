@@ -110,7 +110,8 @@ def report(
     for path in configs or ():
         if not path.exists():
             raise InputError(f"{path}: no such file; check its name and folder")
-    collected = collect(configs or [], socket=socket, home=Path.home())
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
+    collected = collect(configs or [], socket=socket, home=home)
     write_zip(output, collected)
     for name, text in collected.files.items():
         print(f"  {name}: {len(text)} characters")

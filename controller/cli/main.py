@@ -5,6 +5,7 @@ A package provides commands by a module with `app`, a typer application whose co
 """
 
 import errno
+import io
 import os
 import signal
 import sys
@@ -52,6 +53,9 @@ def main() -> int:
     """Run the command line of the process; return the exit status."""
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
+    for stream in (sys.stdout, sys.stderr):  # of any encoding, and file names are any bytes
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))

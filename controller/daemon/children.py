@@ -85,7 +85,8 @@ _NICE = 10  # above that of the daemon, whose loop comes first
 def read_in_child(file: Path) -> DaemonConfig:
     """Read a configuration in a child process; blocks, InputError with all problems.
 
-    Raises OSError if the process cannot be started or fails.
+    A plug-in that this process cannot load since it started is a problem, too. Raises OSError if
+    the child cannot be started or fails.
     """
     try:
         done = subprocess.run(  # noqa: S603  our own module
@@ -100,7 +101,13 @@ def read_in_child(file: Path) -> DaemonConfig:
         raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s") from error
     if done.returncode != 0:
         raise OSError(f"reading {file} failed with status {done.returncode}")
-    read = pickle.loads(done.stdout)  # noqa: S301  of our own process
+    try:
+        read = pickle.loads(done.stdout)  # noqa: S301  of our own process
+    except (ImportError, AttributeError, TypeError) as error:
+        raise InputError(
+            f"{file} uses a plug-in that was installed or changed after the daemon started "
+            f"({error}); restart the daemon"
+        ) from error
     if isinstance(read, DaemonConfig):
         return read
     raise InputError(str(read))

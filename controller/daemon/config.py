@@ -1,5 +1,6 @@
 """Loads and validates a daemon's configuration and the files that it names; what may change."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -171,7 +172,7 @@ def _file(document: Document, *keys: str) -> Path | None:
         value = value.get(key) if isinstance(value, dict) else None
     if not isinstance(value, str) or "\0" in value:
         return None
-    return Path(document.source).parent / Path(value).expanduser()
+    return document.beside(value)
 
 
 def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig | None, str]:
@@ -216,7 +217,7 @@ def _urls(
     """The URL of each amplifier; `sim://` becomes a simulated one under this rig's plate."""
     if rig is None or rig_file is None:
         return {}
-    here = quote(str(rig_file.resolve()))
+    here = quote(os.fsencode(rig_file.resolve()))
     urls = {
         name: f"sim://{here}?amplifier={quote(name)}" if url == "sim://" else url
         for name, url in rig.amplifiers.items()

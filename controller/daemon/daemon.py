@@ -189,7 +189,7 @@ class Daemon:
         try:
             new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
             self._apply(new, changed, differs=differs)
-        except InputError as error:
+        except (InputError, OSError) as error:
             _logger.error("config: reload rejected, keeping previous: %s", error)
         except Exception:  # systemd waits for the end of the reload
             _logger.exception("config: reload failed")

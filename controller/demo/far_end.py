@@ -7,6 +7,7 @@ reads their vibration.
 import asyncio
 import contextlib
 import json
+import os
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
@@ -136,7 +137,7 @@ async def simulated_plate(
         async with contextlib.AsyncExitStack() as stack:
             if wire == "sim":
                 plate = "exact" if seed is None else f"seed={seed}"
-                base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&{plate}&amplifier="
+                base = f"sim://{quote(os.fsencode(rig_file))}?control={quote(os.fsencode(path))}&{plate}&amplifier="
                 urls = {name: base + quote(name) for name in amplifiers}
             else:
                 process = await _start(rig_file, wire=wire, control=path, seed=seed)

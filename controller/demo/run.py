@@ -112,6 +112,7 @@ RECOVERY = 30.0
 """Time [s] within which the daemon must be armed, also anew after a fault."""
 
 _LAYOUT_FILE = "layout.yaml"
+_RIG_FILE = "rig.yaml"
 _HOST = "127.0.0.1"
 _ARMED = DaemonState.OPERATION_ENABLED
 _TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
@@ -216,12 +217,8 @@ async def _on_simulated_plate(
     """
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
-        file = folder / "daemon.yaml"
-        file.write_text(
-            json.dumps({"rig": str(rig_file), "layout": _LAYOUT_FILE, **more}), encoding="utf-8"
-        )
         _write_layout(folder, layout)
-        config = load_daemon_config(file)
+        config = load_daemon_config(_daemon_file(folder, rig_file, more))
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
         rig = config.rig
@@ -229,6 +226,15 @@ async def _on_simulated_plate(
             simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold)
         )
         yield replace(config, urls=plate.urls), lock, plate
+
+
+def _daemon_file(folder: Path, rig_file: Path, more: Mapping[str, object]) -> Path:
+    """Write the daemon's file; it names the rig by a link, since a path may be any bytes."""
+    (folder / _RIG_FILE).symlink_to(rig_file.resolve())
+    file = folder / "daemon.yaml"
+    content = {"rig": _RIG_FILE, "layout": _LAYOUT_FILE, **more}
+    file.write_text(json.dumps(content), encoding="utf-8")
+    return file
 
 
 def _free_port() -> int:

@@ -149,11 +149,11 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
     for key in _NAMED:
         value = document.data.get(key)
         if isinstance(value, str):
-            yield path.parent / Path(value).expanduser()
+            yield document.beside(value)
     dumps = document.data.get("dumps")
     folder = dumps.get("folder") if isinstance(dumps, dict) else None
     if isinstance(folder, str):
-        found = (path.parent / Path(folder).expanduser()).glob(DUMP_PATTERN)
+        found = document.beside(folder).glob(DUMP_PATTERN)
         yield from sorted(found, key=lambda file: file.name)[-MAX_DUMPS:]
 
 

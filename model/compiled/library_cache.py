@@ -19,8 +19,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import platformdirs
-
+from model.cache_folder import cache_folder
 from model.errors import InputError
 
 _COMPILERS = ("cc", "gcc", "clang")
@@ -96,7 +95,7 @@ def kept_library(
     sources = list(sources)
     file = f"{name}-{_libc()}-{_digest([*sources, *headers], flags)}.so"
     try:
-        folder = _own_folder(platformdirs.user_cache_path("era-haptics", appauthor=False))
+        folder = _own_folder(cache_folder())
     except OSError as error:
         _logger.warning("%s: compiled at every start: %s", what, error)
     else:

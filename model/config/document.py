@@ -6,6 +6,7 @@ checked before a value is made. No key is given twice. Words are text unless the
 numbers, true, false or null (core schema of YAML 1.2).
 """
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -94,6 +95,11 @@ class Document:
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1)
+
+    def beside(self, name: str) -> Path:
+        """The path of a file that this one names, relative to its folder; `~` is the home."""
+        # Path.expanduser raises where there is no such home; this leaves the name as it is.
+        return Path(self.source).parent / os.path.expanduser(name)  # noqa: PTH111
 
     def problem(self, path: KeyPath, message: str) -> Problem:
         """A problem at a key."""

@@ -6,6 +6,7 @@ leaves out.
 
 import cmath
 import math
+import os
 from collections import Counter
 from itertools import pairwise
 from pkgutil import resolve_name
@@ -188,6 +189,6 @@ def _urls(document: Document) -> dict[str, str]:
     for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():
         url = amplifier.get("url") if isinstance(amplifier, dict) else None
         if isinstance(url, str):
-            here = f"sim://{quote(document.source)}?amplifier={quote(str(name))}"
+            here = f"sim://{quote(os.fsencode(document.source))}?amplifier={quote(str(name))}"
             urls[name] = here if url == "sim://" else url
     return urls

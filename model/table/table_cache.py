@@ -5,9 +5,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-import platformdirs
-
 from model.arrays import FloatArray
+from model.cache_folder import cache_folder
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.rig.rig import Rig
@@ -38,7 +37,11 @@ def cached_table(
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
     problem = TableProblem(rig, frequencies, grid)
-    folder = platformdirs.user_cache_path("era-haptics", appauthor=False)
+    try:
+        folder = cache_folder()
+    except OSError as error:
+        _logger.warning("table cache: table not kept for the next run: %s", error)
+        return solve_table(problem, drive_mode=drive_mode), None
     path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
     try:
         table = load_table(path, fingerprint=rig.fingerprint)

@@ -56,6 +56,11 @@ COMMANDS = """
         for line in range(100_000):
             print("line", line)
 
+    @app.command()
+    def letters() -> None:
+        "Print letters that are not ASCII, and a byte that is no letter."
+        print("m/s" + chr(0xB2), "p" + chr(0xDCFC))
+
     parts = typer.Typer(help="Some parts.", no_args_is_help=True)
     app.add_typer(parts, name="parts")
 
@@ -182,6 +187,14 @@ def test_main_ends_quietly_when_its_reader_closes(tmp_path: Path) -> None:
         flood.stdout.close()
         assert flood.stderr.read() == ""
         assert flood.wait() == 141
+
+
+def test_main_prints_what_its_output_cannot_encode(tmp_path: Path) -> None:
+    """Escaped: a unit in an output of ASCII, and the name of a file that is not UTF-8."""
+    (tmp_path / "era_test_commands.py").write_text(dedent(COMMANDS), encoding="utf-8")
+    with process(tmp_path, "letters", PYTHONIOENCODING="ascii") as letters:
+        assert letters.communicate()[0] == "m/s\\xb2 p\\udcfc\n"
+        assert letters.returncode == 0
 
 
 @pytest.mark.parametrize(("given", "seen"), [({}, "1"), ({"OMP_NUM_THREADS": "7"}, "7")])

@@ -1,6 +1,7 @@
 """The daemon's configuration file: defaults, paths, calibrations, and problems by line and key."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,9 @@ from controller.daemon.config_sections import DaemonSection
 from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
-from model.rig.file import example_rig_path
+from model.rig.file import example_rig_path, load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.memory_line import SimulationUrl
 
 RUNNER = CliRunner()
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -51,6 +53,16 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert (config.table, config.layout, config.dump_folder, config.log_file) == (None,) * 4
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
+
+
+def test_config_of_a_folder_that_is_not_utf8(folder: Path) -> None:
+    """Names of files are bytes: the simulated amplifier finds its rig; `~` may have no home."""
+    strange = folder / os.fsdecode(b"pr\xfcf stand #1")
+    strange.mkdir()
+    (folder / "rig.yaml").rename(strange / "rig.yaml")
+    url = load_daemon_config(written(strange)).urls["main"]
+    assert load_rig(SimulationUrl(url).rig).eras[0].name == "SW"
+    assert problems(written(strange, rig="~no-such-user/rig.yaml")) == [(1, "rig")]
 
 
 def test_config_paths_are_relative_to_its_folder(

@@ -177,6 +177,25 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
         read_in_child(tmp_path / "daemon.yaml")
 
 
+def test_plugin_installed_meanwhile_needs_a_restart(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the child reads by a plug-in that this process cannot load is bad input."""
+    package = tmp_path / "installed"
+    info = package / "late_effect-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late-effect\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[era_haptics.effects]\nlate = late_effect:Late\n")
+    (package / "late_effect.py").write_text(
+        "from controller.effects.click import Click\nclass Late(Click):\n    kind = 'late'\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(package))  # of children started from now on
+    (folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")
+    (folder / "daemon.yaml").write_text("rig: rig.yaml\nlayout: layout.yaml\n")
+    with pytest.raises(InputError, match="restart the daemon"):
+        read_in_child(folder / "daemon.yaml")
+
+
 def test_child_ends_by_none_of_the_daemons_own_signals() -> None:
     """A signal to the whole service reopens the log or does nothing; SIGTERM ends a child."""
     command = child_command("http.server", "0")

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model import cache_folder
 from model.finger.grid import Grid
 from model.table import build, table_cache
 from model.table.table_cache import cached_table
@@ -27,7 +28,7 @@ STIFFER = replace(RIG, eras=(replace(RIG.eras[0], stiffness=18000.0), *RIG.eras[
 def cache(tmp_path, monkeypatch):
     """A cache folder of the test's own."""
     folder = tmp_path / "cache"
-    monkeypatch.setattr(table_cache.platformdirs, "user_cache_path", lambda *_, **__: folder)
+    monkeypatch.setattr(cache_folder.platformdirs, "user_cache_path", lambda *_, **__: folder)
     return folder
 
 
@@ -111,9 +112,15 @@ def test_cached_table_least_recently_used_is_removed(monkeypatch, cache):
     assert set(cache.iterdir()) == {paths[0], newest}
 
 
-def test_cached_table_is_built_without_a_folder_to_keep_it(cache):
-    """A cache folder that cannot be made is no reason to fail."""
+@pytest.mark.parametrize("has_home", [True, False])
+def test_cached_table_is_built_without_a_folder_to_keep_it(cache, monkeypatch, has_home):
+    """A cache folder that cannot be made is no reason to fail, nor a user without a home."""
     cache.write_text("a file where the folder should be")
+    if not has_home:  # neither HOME nor an entry in passwd, as in a container
+        monkeypatch.undo()
+        for name in ("HOME", "XDG_CACHE_HOME"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr("os.path.expanduser", lambda path: path)
     table, path = cached_table(RIG)
     assert path is None
     assert table.frequencies.tolist() == [60.0, 70.0, 80.0, 90.0, 100.0]

@@ -37,7 +37,7 @@ def show(
     if as_json:
         print(json.dumps(summary | {"map": cells.as_json()}))
         return
-    _show_summary(summary)
+    _show_summary(summary, mapped=str(cells.grid))
     print()
     _show_map(cells, listed=weak)
     print(f"computed in {elapsed:.1f} s")
@@ -147,7 +147,9 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
     return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
 
 
-def _show_summary(summary: dict[str, Any]) -> None:
+def _show_summary(summary: dict[str, Any], *, mapped: str) -> None:
+    """Print the summary of a table; mapped: cells of the map that the shares are of."""
+
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
 
@@ -180,9 +182,9 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ("cells", f"{summary['cells']} ({summary['grid']})"),
         (
             "feasible cells",
-            f"{percent('feasible_share')} (12 dB or more to the median finger)",
+            f"{percent('feasible_share')} of {mapped} (12 dB or more to the median finger)",
         ),
-        ("weak cells", f"{percent('weak_share')} (below 12 dB to one finger in ten)"),
+        ("weak cells", f"{percent('weak_share')} of {mapped} (below 12 dB to one finger in ten)"),
         ("dead zones", f"{percent('dead_zone_share')} (below 12 dB SL at full stroke)"),
         ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
         *contrast,

@@ -1,0 +1,61 @@
+"""What pages state and something else decides: constants, figures of other pages, files."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import model
+from controller.sources.contacts import CONTACT_TIMEOUT
+from drivers.protocol.table import REACTION
+from model.table.request import MIN_CONTRAST_DB
+from model.table.verify import MIN_KEPT_SHARE
+
+ROOT = Path(model.__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+
+
+def text_of(page: str) -> str:
+    """A page's text; its name is relative to the root."""
+    return (ROOT / page).read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("page", "stated", "constant"),
+    [
+        ("docs/reference/table-file.md", r"must be (\d+) % or more", 100 * MIN_KEPT_SHARE),
+        ("docs/architecture.md", r"no frame confirms \((\d+) ms", 1000 * CONTACT_TIMEOUT),
+        ("docs/reference/touch.md", r"after (\d+) ms without a frame", 1000 * CONTACT_TIMEOUT),
+        ("docs/reference/protocol.md", r"of its request \| – \| (\d+) ms", 1000 * REACTION),
+        ("docs/reference/effects.md", r"below (\d+) dB at any finger", MIN_CONTRAST_DB),
+    ],
+)
+def test_page_states_the_constant(page: str, stated: str, constant: float) -> None:
+    """The number beside these words is that of the code."""
+    (found,) = re.findall(stated, text_of(page))
+    assert float(found) == pytest.approx(constant)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/concepts/localization.md"])
+def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
+    """The share and number of fingers that the benchmark's own page has in its last rows."""
+    rows = re.findall(r"(\d+) % of (\d+) \|", text_of("docs/measured/promise.md"))
+    counts = [int(count) for _, count in rows]
+    kept = sum(int(share) * int(count) for share, count in rows) / sum(counts)
+    ((share, count),) = re.findall(r"(\d+) % of\s+(\d+) fingers", text_of(page))
+    assert int(count) == sum(counts)
+    assert float(share) == pytest.approx(kept, abs=1)
+
+
+def test_files_that_pages_name_are_there() -> None:
+    """In any folder of the project; decisions name what was there when they were made."""
+    folders = "|".join(path.name for path in ROOT.iterdir() if path.is_dir())
+    named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
+    gone = {
+        name
+        for page in PAGES
+        if "decisions" not in page.parts
+        for name in named.findall(page.read_text("utf-8"))
+        if not (ROOT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
+    }
+    assert gone == set()

@@ -28,6 +28,7 @@ _HEADER_LINES = 12  # of dataset 58, its number first
 _ID_LINES = 5  # of these, free text
 _FORM = 7  # of these, that of the data: kind, count, abscissa
 _SI = 1  # units code of dataset 164
+_NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetres, inches
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
@@ -121,7 +122,7 @@ def read_universal(path: Path) -> Universal:
                 if block.kind == 58:
                     functions.append(_function(path, block, found))
                 elif block.kind == 164:
-                    length = float(found["length"])
+                    length = _lengths_in_si(place, found)
                 else:
                     xyz = zip(found["x"], found["y"], found["z"], strict=True)
                     nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
@@ -131,8 +132,6 @@ def read_universal(path: Path) -> Universal:
                 raise InputError(
                     f"{place}: dataset {block.kind} cannot be read; export it again"
                 ) from error
-    if not (math.isfinite(length) and length > 0):
-        raise InputError(f"{path}: factor of lengths (dataset 164) must be positive, got {length}")
     return Universal(
         {n: (x / length, y / length, z / length) for n, (x, y, z) in nodes.items()}, functions
     )
@@ -303,6 +302,17 @@ def _too_few(path: Path, line: int, count: int, got: int) -> InputError:
         f"{path}:{line}: record must have {count} numbers, as its header says, got {got}; the file "
         "is damaged, export it again"
     )
+
+
+def _lengths_in_si(place: str, found: Mapping[str, Any]) -> float:
+    """By what lengths of the file are divided to have metres."""
+    length, code = float(found["length"]), int(found["units_code"])
+    if not 0 < length < math.inf or (length == 1 and code in _NOT_METRES):
+        raise InputError(
+            f"{place}: factor of lengths (dataset 164) must be positive and that of units code "
+            f"{code} {found['units_description']!r}, got {length:g}; export it in SI"
+        )
+    return length
 
 
 def _name(text: str) -> str:

@@ -1,6 +1,5 @@
 """Checks of arguments of the Python API, whose callers may not use a type checker."""
 
-import math
 import os
 from numbers import Integral, Real
 from pathlib import Path
@@ -18,6 +17,10 @@ def expect(value: object, cls: type, *, what: str, made_by: str) -> None:
         )
 
 
+MAX_VALUE = 1e18
+"""Of a physical quantity in SI units: a million times diamond's modulus of elasticity."""
+
+
 def expect_number(value: object, *, what: str, unit: str) -> None:
     """Raise InputError for anything but a real number."""
     if not isinstance(value, Real):
@@ -26,22 +29,22 @@ def expect_number(value: object, *, what: str, unit: str) -> None:
 
 def expect_at_least(value: float, least: float, *, what: str) -> None:
     """Raise InputError for a value that is not finite or below the least."""
-    if not (math.isfinite(value) and value >= least):
-        raise InputError(f"{what} must be finite and at least {least:g}, got {value}")
+    if not least <= value <= MAX_VALUE:
+        raise InputError(f"{what} must be from {least:g} to {MAX_VALUE:g}, got {value}")
 
 
 def expect_values(
     of: object, what: str, *, above: str = "", at_least: str = "", finite: str = ""
 ) -> None:
-    """Raise InputError for attributes that are not finite, negative ones, or 0 where above it.
+    """Raise InputError for attributes beyond MAX_VALUE, negative ones, or 0 where above it.
 
     above, at_least, finite: names of attributes with spaces between.
     """
     for name in f"{above} {at_least} {finite}".split():
         value, is_above = getattr(of, name), name in above.split()
-        if not math.isfinite(value) or (name not in finite.split() and value < 0):
-            raise InputError(f"{what}: {name} must be finite and not negative, got {value}")
-        if is_above and value == 0:
+        least = -MAX_VALUE if name in finite.split() else 0.0
+        expect_at_least(value, least, what=f"{what}: {name}")
+        if is_above and value < 1 / MAX_VALUE:
             raise InputError(f"{what}: {name} must be above zero, got {value}")
 
 

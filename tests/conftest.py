@@ -6,11 +6,9 @@ import os
 import random
 import signal
 from collections.abc import Generator, Iterator
-from copy import deepcopy
 from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads: two threads are slower here, and erratic
@@ -23,7 +21,6 @@ import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 from drivers import garbage_collection  # noqa: E402
-from model.config import document  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
@@ -70,26 +67,6 @@ settings.load_profile("short")
 
 free_plate.FiniteElementModes = lru_cache(12)(free_plate.FiniteElementModes)
 """Free plates are solved once in a process: hundreds of tests are of the same ones."""
-
-_plain_yaml = document.plain_yaml
-
-
-@lru_cache(256)
-def _yaml_of(text: str) -> tuple[Any, Any]:
-    yaml = _plain_yaml("safe")
-    return yaml.load(text), yaml.composer
-
-
-class _KeptYaml:
-    """Reads each text once in a process: hundreds of tests are of the same files."""
-
-    def load(self, text: str) -> Any:
-        """The data of a text, a copy of its own."""
-        data, self.composer = _yaml_of(text)
-        return deepcopy(data)
-
-
-document.plain_yaml = lambda kind: _KeptYaml() if kind == "safe" else _plain_yaml(kind)  # type: ignore[assignment,return-value]
 
 garbage_collection.gc = SimpleNamespace(**vars(gc) | {"collect": partial(gc.collect, 1)})  # type: ignore[attr-defined]
 """A daemon in a test starts without visiting all objects of the suite: a fifth of a second each."""

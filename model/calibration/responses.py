@@ -1,5 +1,6 @@
 """Measured responses: value by value, as an array over a rig's ERAs, and what a fit can use."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from model.rig.rig import Rig
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3
 _EDGE_TOLERANCE = 1e-3
+_logger = logging.getLogger(__name__)
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
 LEAST_SENSORS = 3
 
@@ -42,7 +44,7 @@ class Responses:
 
     sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
     has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
-    known, and no polarity.
+    known, and no polarity; left_out: number of values beyond the rig's limits of frequency.
     """
 
     sensors: tuple[str, ...]
@@ -50,6 +52,7 @@ class Responses:
     frequencies: FloatArray
     values: ComplexArray
     has_phases: bool = True
+    left_out: int = 0
 
     @property
     def count(self) -> int:
@@ -75,14 +78,26 @@ class Responses:
 def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     """Join values into responses of a rig's plate.
 
-    Raises InputError, with file and line, for points off the plate, unknown ERAs or positions,
-    frequencies beyond the rig's limits, a response given twice and a sensor at two positions.
+    What is beyond the rig's limits of frequency, as a spectrum's line of 0 Hz, is left out. Raises
+    InputError, with file and line, for points off the plate, unknown ERAs or positions, a response
+    given twice, a sensor at two positions, and where nothing is left.
     """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    within = [each for each in measured if low <= each.frequency <= high]
+    left_out = len(measured) - len(within)
+    limits = f"the rig's limits.frequency of {low:g} to {high:g} Hz"
+    if measured and not within:
+        raise InputError(
+            f"{measured[0].place}: a frequency must be within {limits}, got "
+            f"{measured[0].frequency:g} Hz; measure others or widen the limits"
+        )
+    if left_out:
+        _logger.warning("%d of %d values beyond %s are left out", left_out, len(measured), limits)
     sensors: dict[str, tuple[float, float]] = {}
     first: dict[str, str] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
     found: dict[tuple[float, int, str], complex] = {}
-    for each in measured:
+    for each in within:
         if each.sensor not in sensors:
             _check_point(each, rig)
         known = sensors.setdefault(each.sensor, each.point)
@@ -92,7 +107,6 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
                 f"{each.place}: sensor {each.sensor} must have one position, got {_shown(known)} "
                 f"({place}) and {_shown(each.point)} m; name sensors differently"
             )
-        _check_frequency(each, rig)
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
         number = eras[each.era, each.era_point]
@@ -102,14 +116,14 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
                 f"at {each.frequency:g} Hz must be given once, got two"
             )
         found[each.frequency, number, each.sensor] = each.value
-    frequencies = np.unique([each.frequency for each in measured])
+    frequencies = np.unique([each.frequency for each in within])
     values = np.full((len(frequencies), len(rig.eras), len(sensors)), np.nan, dtype=complex)
     column = {name: number for number, name in enumerate(sensors)}
     for (frequency, number, sensor), value in found.items():
         values[np.searchsorted(frequencies, frequency), number, column[sensor]] = value
     # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    return Responses(tuple(sensors), points, frequencies, values)
+    return Responses(tuple(sensors), points, frequencies, values, left_out=left_out)
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:
@@ -120,16 +134,6 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
             f"{measured.place}: sensor {measured.sensor} must be on the rig's plate, from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(measured.point)} m; "
             "check the plate and the unit"
-        )
-
-
-def _check_frequency(measured: MeasuredValue, rig: Rig) -> None:
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    if not low <= measured.frequency <= high:
-        raise InputError(
-            f"{measured.place}: frequency must be within the rig's limits.frequency of "
-            f"{low:g} to {high:g} Hz, got {measured.frequency:g} Hz; leave it out or "
-            "widen the limits"
         )
 
 

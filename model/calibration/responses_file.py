@@ -6,6 +6,7 @@ positions in dataset 15 or 2411; the reference node is the ERA, by its name or p
 """
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,20 @@ from model.rig.rig import Rig
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
 _UP = 3  # +z
-# Labels of m/s² and m without punctuation.
-_ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
-_DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
+# SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
+_ACCELERATION_UNITS = {
+    **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
+    **dict.fromkeys(("mm/s2", "mm/s/s"), 1e-3),
+    **dict.fromkeys(("g", "gs", "gn", "g0"), 9.80665),
+    **dict.fromkeys(("in/s2", "in/s/s", "inch/s2"), 0.0254),
+}
+_DISPLACEMENT_UNITS = {
+    **dict.fromkeys(("", "m", "meter", "metre"), 1.0),
+    **dict.fromkeys(("mm",), 1e-3),
+    **dict.fromkeys(("um", "micron"), 1e-6),
+    **dict.fromkeys(("in", "inch"), 0.0254),
+}
+_SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
 
 
 def read_measured(path: Path) -> list[MeasuredValue]:
@@ -100,8 +112,8 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
         era, sensor = line.cells["era"], line.cells["sensor"]
         if not (era and sensor):
             raise InputError(f"{line.place}: era and sensor must have names")
-        if frequency <= 0:
-            raise InputError(f"{line.place}: frequency_hz must be positive, got {frequency:g}")
+        if frequency < 0:
+            raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
         era_point = (at_era[0], at_era[1]) if at_era else None
         value = complex(real, imaginary)
         found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, line.place))
@@ -132,23 +144,14 @@ def _uff_values(
             f"({DISPLACEMENT}) of an ERA's base, got {function.data_types[1]} over "
             f"{function.data_types[2]}"
         )
-    for label, known, wanted in (
-        (function.units[0], _ACCELERATION_UNITS, "m/s²"),
-        (function.units[1], _DISPLACEMENT_UNITS, "m"),
-    ):
-        plain = label.lower().translate({ord("²"): "2", ord("^"): None, ord("*"): None})
-        if plain.replace(" ", "") not in known:
-            raise InputError(f"{place}: unit must be {wanted}, got {label!r}; export it so")
+    scale = _unit(place, function.units[0], _ACCELERATION_UNITS)
+    scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
     if not np.iscomplexobj(function.data):
         raise InputError(f"{place}: response must be complex, got real; export it with phases")
     if any(abs(direction) not in (0, _UP) for direction in function.directions):
         raise InputError(
             f"{place}: directions must be across the plate (3 or -3, z), got "
             f"{function.directions[0]} and {function.directions[1]}"
-        )
-    if function.x[0] <= 0:
-        raise InputError(
-            f"{place}: frequencies must be positive, got {function.x[0]:g} Hz; leave it out"
         )
     if function.response not in content.nodes:
         raise InputError(
@@ -158,12 +161,27 @@ def _uff_values(
     name, reference = function.names[0], content.nodes.get(function.reference)
     if not name or len(named[name]) > 1:
         name = f"{name or 'node'}:{function.response}"
-    sign = math.prod(-1 if direction < 0 else 1 for direction in function.directions)
+    scale *= math.prod(-1 if direction < 0 else 1 for direction in function.directions)
     x, y, _ = content.nodes[function.response]
     era_point = None if reference is None else (float(reference[0]), float(reference[1]))
     return [
         MeasuredValue(
-            function.names[1], name, (float(x), float(y)), era_point, frequency, sign * value, place
+            function.names[1],
+            name,
+            (float(x), float(y)),
+            era_point,
+            frequency,
+            scale * value,
+            place,
         )
         for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
     ]
+
+
+def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
+    """The value of a unit by its label in SI units; raises InputError."""
+    plain = label.lower().translate(_SPELLED).replace("sec", "s")
+    if plain not in known:
+        spelled = ", ".join(filter(None, known))
+        raise InputError(f"{place}: unit must be one of {spelled}, got {label!r}; export it so")
+    return known[plain]

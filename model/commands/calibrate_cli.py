@@ -82,7 +82,9 @@ def calibrate(
     )
     finish(
         [heading, "", *rows, *calibration_report.gain_rows(calibration), "", *notes],
-        calibration_report.as_json(calibration, rig) if as_json else None,
+        calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.left_out}
+        if as_json
+        else None,
         files=files,
         elapsed=elapsed,
         refusal=None if calibration.is_good else _NO_FIT,

@@ -12,15 +12,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
-from ruamel.yaml import YAML
-from ruamel.yaml.composer import Composer
-from ruamel.yaml.error import MarkedYAMLError
-from ruamel.yaml.events import Event, MappingStartEvent, ScalarEvent
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
-from ruamel.yaml.reader import ReaderError
-from ruamel.yaml.resolver import BaseResolver, VersionedResolver
+import yaml
 
 from model.errors import InputError
 from model.files.regular_file import regular_file
@@ -154,23 +148,18 @@ def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
 
 def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
-    yaml = plain_yaml("safe")
+    if found := _NOT_ALLOWED.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        message = f"character U+{ord(found[0]):04X} is not allowed in YAML; remove it"
+        raise ConfigError(source, [Problem(line, "", message)])
     with _errors_at(source, text):
-        data = yaml.load(text)
-    if yaml.composer.repeated:
-        raise ConfigError(source, yaml.composer.repeated)
+        reader = _PlainReader(text)
+        data = reader.document()
+    if reader.repeated:
+        raise ConfigError(source, reader.repeated)
     if data is None:
         raise _whole(source, f"is empty; {if_empty}")
-    return Document(source, text, data, yaml.composer.lines)
-
-
-def plain_yaml(kind: Literal["safe", "rt"]) -> YAML:
-    """A YAML parser that accepts plain data only; "rt" keeps comments, and is far less robust."""
-    yaml = YAML(typ=kind, pure=True)
-    yaml.Composer = _PlainComposer
-    yaml.Resolver = _PlainResolver
-    yaml.allow_duplicate_keys = True  # the composer reports all of them
-    return yaml
+    return Document(source, text, data, reader.lines)
 
 
 def _whole(source: str, message: str) -> ConfigError:
@@ -184,17 +173,27 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
         yield
     except _Refused as error:
         raise ConfigError(source, error.problems) from None
-    except MarkedYAMLError as error:
+    except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = None if mark is None else mark.line + 1
         said = " ".join(part for part in (error.context, error.problem) if part)
-        remedy = "; indent by spaces, not by tabs" if r"'\t'" in said else ""
+        remedy = "" if line is None else _remedy(text, line)
         problem = Problem(line, "", f"is not valid YAML: {said}{remedy}")
         raise ConfigError(source, [problem]) from error
-    except ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        message = f"character U+{error.character:04X} is not allowed in YAML; remove it"
-        raise ConfigError(source, [Problem(line, "", message)]) from error
+
+
+_BLANKS = re.compile(r"(?<!^)\ufeff|[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000]")
+
+
+def _remedy(text: str, line: int) -> str:
+    """What to do about a line that looks right: a directive, or a blank that is no space."""
+    wrong = text.splitlines()[line - 1] if line <= len(text.splitlines()) else ""
+    if wrong.startswith("%"):
+        return "; remove this line"
+    if found := _BLANKS.search(wrong):
+        what = "tab" if found[0] == "\t" else f"character U+{ord(found[0]):04X}"
+        return f"; write a space in place of the {what} in column {found.start() + 1}"
+    return ""
 
 
 class _Refused(Exception):
@@ -204,87 +203,102 @@ class _Refused(Exception):
         self.problems = problems
 
 
-class _PlainComposer(Composer):
-    """Composes nodes of plain data; anything else is refused before it becomes a node.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml where it is there
+_NOT_ALLOWED = yaml.reader.Reader.NON_PRINTABLE  # libyaml counts bytes, and knows other characters
+
+
+class _PlainReader:
+    """Makes values of events, which are checked before: nothing expands or gets constructed.
 
     lines: of every key and list entry by its path; repeated: keys that are given twice.
     """
 
-    def __init__(self, loader: Any = None) -> None:
-        super().__init__(loader)
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         self.lines: dict[KeyPath, int] = {}
         self.repeated: list[Problem] = []
-        self._path: KeyPath = ()
         self._count = 0
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose the next node: a list entry by its number, a value by the node of its key."""
-        above = self._path
-        is_key = parent is not None and index is None
-        event = self.parser.peek_event()
-        if isinstance(index, ScalarNode):
-            self._path = (*above, index.value)
-            self.lines.setdefault(self._path, _line(index))
-        elif index is not None:
-            self._path = (*above, index)
-            self.lines[self._path] = _line(event)
-        self._check(event, is_key=is_key, is_root=parent is None)
-        node = super().compose_node(parent, index)
-        if is_key:
-            node.ctag = BaseResolver.DEFAULT_SCALAR_TAG  # NO is a word
-        elif isinstance(node, MappingNode):
-            self._note_repeated(node)
-        self._path = above
-        return node
+    def document(self) -> Any:
+        """The content of the only document; None for an empty one."""
+        next(self._events)
+        if isinstance(next(self._events), yaml.StreamEndEvent):
+            return None
+        event = next(self._events)
+        is_empty = isinstance(event, yaml.ScalarEvent) and event.value == "" and not event.style
+        if not (is_empty or isinstance(event, yaml.MappingStartEvent | yaml.AliasEvent)):
+            message = "expected `key: value` lines, as `era config init` writes them"
+            raise self._refused((), event, message + _remedy(self._text, _line(event)))
+        data = self._value((), event)
+        next(self._events)
+        if isinstance(more := next(self._events), yaml.DocumentStartEvent):
+            raise self._refused((), more, "must be one document, got another; remove it")
+        return data
 
-    def _check(self, event: Event, *, is_key: bool, is_root: bool) -> None:
-        if getattr(event, "anchor", None) is not None:  # an alias names its anchor too
-            raise self._refused(event, "anchors and aliases are not used; write the value out")
-        if getattr(event, "ctag", None) is not None:
-            raise self._refused(event, "tags are not used; remove what begins with !")
-        if len(self._path) > _MAX_DEPTH:
-            self._path = self._path[:3]
-            raise self._refused(event, f"is nested more than {_MAX_DEPTH} levels deep")
-        self._count += 1
-        if self._count > _MAX_VALUES:
-            self._path = ()
-            raise self._refused(event, f"has more than {_MAX_VALUES} values")
-        if is_key and not isinstance(event, ScalarEvent):
-            raise self._refused(event, "a key must be a word")
-        if is_root and not isinstance(event, MappingStartEvent) and not _is_empty(event):
-            raise self._refused(
-                event, "expected `key: value` lines, as `era config init` writes them"
-            )
-
-    def _refused(self, event: Event, message: str) -> _Refused:
-        return _Refused(Problem(_line(event), key_name(self._path), message))
-
-    def _note_repeated(self, mapping: MappingNode) -> None:
-        seen: set[str] = set()
-        for key, _ in mapping.value:
-            if key.value in seen:
-                path = (*self._path, key.value)
-                message = f"is given twice, first on line {self.lines[path]}; remove one"
-                self.repeated.append(Problem(_line(key), key_name(path), message))
+    def _value(self, path: KeyPath, event: Any) -> Any:
+        self._check(path, event)
+        if isinstance(event, yaml.ScalarEvent):
+            return str(event.value) if event.style else plain_value(event.value)
+        if isinstance(event, yaml.SequenceStartEvent):
+            entries: list[Any] = []
+            while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+                inner = (*path, len(entries))
+                self.lines[inner] = _line(event)
+                entries.append(self._value(inner, event))
+            return entries
+        mapping: dict[str, Any] = {}
+        while not isinstance(key := next(self._events), yaml.MappingEndEvent):
+            self._check(path, key)
+            if not isinstance(key, yaml.ScalarEvent):
+                raise self._refused(path, key, "a key must be a word")
+            inner, is_repeated = (*path, key.value), key.value in mapping
+            self.lines.setdefault(inner, _line(key))
+            value = self._value(inner, next(self._events))
+            if is_repeated:
+                message = f"is given twice, first on line {self.lines[inner]}; remove one"
+                self.repeated.append(Problem(_line(key), key_name(inner), message))
                 if len(self.repeated) > MAX_PROBLEMS:
                     raise _Refused(*self.repeated)
-            seen.add(key.value)
+            else:
+                mapping[key.value] = value
+        return mapping
+
+    def _check(self, path: KeyPath, event: Any) -> None:
+        if getattr(event, "anchor", None) is not None:  # an alias names its anchor too
+            raise self._refused(
+                path, event, "anchors and aliases are not used; write the value out"
+            )
+        if getattr(event, "tag", None) is not None:
+            raise self._refused(path, event, "tags are not used; remove what begins with !")
+        if len(path) > _MAX_DEPTH:
+            raise self._refused(path[:3], event, f"is nested more than {_MAX_DEPTH} levels deep")
+        self._count += 1
+        if self._count > _MAX_VALUES:
+            raise self._refused((), event, f"has more than {_MAX_VALUES} values")
+
+    def _refused(self, path: KeyPath, event: Any, message: str) -> _Refused:
+        return _Refused(Problem(_line(event), key_name(path), message))
 
 
-class _PlainResolver(VersionedResolver):
-    """Resolves words to text unless they are decimal numbers, true, false or null."""
-
-    processing_version = (1, 2)  # ignores %YAML directives
-
-    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
-        """The tag of a node by its kind and text."""
-        tag = super().resolve(kind, value, implicit)
-        name = str(tag).rpartition(":")[2]
-        is_number = name in ("int", "float") and _NUMBER.fullmatch(value)
-        return tag if is_number or name in _PLAIN else BaseResolver.DEFAULT_SCALAR_TAG
+_WORDS: dict[str, Scalar] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
 
 
-_PLAIN = ("str", "map", "seq", "bool", "null")
+def plain_value(text: str) -> Scalar:
+    """The value of unquoted text by the core schema of YAML 1.2, decimal numbers alone."""
+    text = text.strip()  # of blanks that are no spaces, too
+    if text in _WORDS:
+        return _WORDS[text]
+    if not _NUMBER.fullmatch(text):
+        return text
+    is_whole = re.fullmatch("[-+]?[0-9]+", text)
+    return int(text) if is_whole else float(re.sub(r"\.(?=[inIN])", "", text))
+
+
 # Longer numbers stay text, and are refused as such.
 _NUMBER = re.compile(
     r"[-+]?(?:[0-9]{1,18}|(?:\.[0-9]{1,30}|[0-9]{1,30}(?:\.[0-9]{0,30})?)(?:[eE][-+]?[0-9]{1,3})?)"
@@ -292,9 +306,5 @@ _NUMBER = re.compile(
 )
 
 
-def _is_empty(event: Event) -> bool:
-    return isinstance(event, ScalarEvent) and event.value == "" and event.style is None
-
-
-def _line(at: Event | Node) -> int:
+def _line(at: Any) -> int:
     return at.start_mark.line + 1 if at.start_mark else 1

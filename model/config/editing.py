@@ -4,10 +4,13 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import StringIO
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.resolver import BaseResolver, VersionedResolver
 
 from model.config.document import (
     ConfigError,
@@ -15,7 +18,7 @@ from model.config.document import (
     Problem,
     Value,
     parse_document,
-    plain_yaml,
+    plain_value,
 )
 
 
@@ -26,20 +29,34 @@ def edited_text(document: Document, change: Callable[[CommentedMap], None]) -> s
     and numbers as they are written stay, spaces within a line do not. Raises ConfigError if there
     are comments that cannot be kept.
     """
-    yaml = plain_yaml("rt")
+    yaml = YAML(typ="rt", pure=True)
+    yaml.Resolver = _PlainResolver
     yaml.preserve_quotes = True
     # Room for new keys on the longest line, which would break elsewhere otherwise.
     yaml.width = max(map(len, document.text.splitlines())) + 100
     yaml.indent(**_indentation(document.text))
     stream = StringIO()
     with _refused_if_lossy(document):
-        data = yaml.load(document.text.replace("\r\n", "\n"))  # or comments alone keep their CR
+        # Comments alone would keep their CR, and tabs between value and comment are refused.
+        data = yaml.load(document.text.replace("\r\n", "\n").replace("\t", " "))
     change(data)
     with _refused_if_lossy(document):
         yaml.dump(data, stream)
         if parse_document(document.source, stream.getvalue()).data != data:
             raise AssertionError
     return stream.getvalue()
+
+
+class _PlainResolver(VersionedResolver):
+    """Takes for numbers and words what reading takes for them."""
+
+    processing_version = (1, 2)  # ignores %YAML directives
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        """The tag of a node by its kind and text."""
+        if kind is ScalarNode and isinstance(plain_value(value), str):
+            return BaseResolver.DEFAULT_SCALAR_TAG
+        return super().resolve(kind, value, implicit)
 
 
 _BLOCK_MAPPING = re.compile(r"^( +)[^\s#-]", re.MULTILINE)

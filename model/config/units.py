@@ -68,7 +68,8 @@ def quantity(value: object, dimension: Dimension) -> float:
     but a number, and NaN or infinity.
     """
     if isinstance(value, str):
-        result = _parse(value, dimension)
+        # Word processors write other blanks, and a minus sign of their own.
+        result = _parse(" ".join(value.split()).replace("\N{MINUS SIGN}", "-"), dimension)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         result = _to_float(value, dimension)
     else:

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +17,13 @@ from numpy.typing import NDArray
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.uff import read_bytes
+from registry.suggestions import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
+_SEPARATORS = (",", ";", "\t")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+
+_logger = logging.getLogger(__name__)
 
 Column: TypeAlias = Sequence[object] | NDArray[np.generic]
 
@@ -55,10 +61,14 @@ def as_frame(columns: Columns) -> Any:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a file: its file and number, for errors, and the text of each column."""
+    """A line of a file: its file and number, for errors, and the text of each column.
+
+    has_decimal_comma: whether a number may have a comma in place of a point.
+    """
 
     place: str
     cells: Mapping[str, str]
+    has_decimal_comma: bool = False
 
     def number(self, column: str, default: float | None = None) -> float:
         """The number in a column, or what stands for a column that the file does not have.
@@ -69,7 +79,7 @@ class Line:
             return default
         text = self.cells[column]
         try:
-            value = float(text)
+            value = float(text.replace(",", ".") if self.has_decimal_comma else text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
@@ -78,29 +88,40 @@ class Line:
 
 
 def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()) -> list[Line]:
-    """Read a file whose first line names its columns, in any order; empty lines are skipped.
+    """Read a file whose first line names its columns, in any order.
 
-    Raises InputError with file and line for missing, unknown and repeated columns, lines of
-    another length, and a file without any.
+    Columns are separated by commas, semicolons or tabs; with the latter two a decimal comma is read
+    as well. Empty lines, empty cells behind the last column and further columns are skipped. Raises
+    InputError with file and line for missing and repeated columns, names that may be misspelt,
+    lines of another length, and a file without any.
     """
+    content = read_bytes(path)
     try:
-        text = read_bytes(path).decode("utf-8-sig")
+        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
-    rows = csv.reader(io.StringIO(text), strict=True, skipinitialspace=True)
+    first = text.partition("\n")[0]
+    if first.startswith("sep="):  # of a spreadsheet program
+        text = "\n" + text[len(first) + 1 :]
+    separator = max(_SEPARATORS, key=text.lstrip("\n").partition("\n")[0].count)
+    rows = csv.reader(io.StringIO(text), strict=True, skipinitialspace=True, delimiter=separator)
     lines = []
     try:
-        header = [name.strip() for name in next(rows, ())]
+        header = [name.strip() for name in next(filter(None, rows), ())]
+        while header and not header[-1]:
+            del header[-1]
         _check_header(path, header, columns, optional)
-        for row in filter(None, rows):
+        for row in filter(any, rows):
             place = f"{path}:{rows.line_num}"
+            while len(row) > len(header) and not row[-1].strip():
+                del row[-1]
             if len(row) != len(header):
                 raise InputError(
                     f"{place}: line must have {len(header)} values as the first line has, got "
                     f"{len(row)}; the file is damaged"
                 )
             cells = map(str.strip, row)
-            lines.append(Line(place, dict(zip(header, cells, strict=True))))
+            lines.append(Line(place, dict(zip(header, cells, strict=True)), separator != ","))
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
@@ -113,15 +134,19 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
 def _check_header(
     path: Path, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
 ) -> None:
+    absent = [name for name in (*columns, *optional) if name not in header]
     missing = [name for name in columns if name not in header]
     unknown = [name for name in header if name not in (*columns, *optional)]
-    if missing or unknown or len(set(header)) < len(header):
+    more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
+    named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED]) + more
+    is_misspelt = any(did_you_mean(name, absent) for name in unknown)
+    if missing or is_misspelt or len(set(header)) < len(header):
         problems = [f"{', '.join(missing)} missing"] if missing else []
-        more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
-        named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED])
-        problems += [f"{named}{more} unknown"] if unknown else []
+        problems += [f"{named} unknown"] if unknown else []
         problems += ["a column is repeated"] if not problems else []
         raise InputError(
             f"{path}:1: columns must be {', '.join(columns)}, optionally {', '.join(optional)}, "
             f"got {'; '.join(problems)}"
         )
+    if unknown:
+        _logger.warning("%s:1: columns not read: %s", path, named)

@@ -1,11 +1,13 @@
 """Universal files (UFF): functions at nodes (dataset 58), nodes (15, 2411) and units (164).
 
 The format of modal analysis since the 1970s, ASCII or binary, with fields as in pyuff. pyuff skips
-over damage, so datasets and numbers are checked here first. Files must be in SI units.
+over damage and knows one spelling of numbers, so datasets are cut and numbers read here.
 """
 
+import math
 import re
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,22 @@ TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
 
 _MAX_BYTES = 512 << 20
-_HEADER_LINES = 13  # of dataset 58, from its opening mark on
+_READ = (15, 58, 164, 2411)
+_HEADER_LINES = 12  # of dataset 58, its number first
+_ID_LINES = 5  # of these, free text
+_FORM = 7  # of these, that of the data: kind, count, abscissa
 _SI = 1  # units code of dataset 164
-# The mark between datasets: for pyuff, wherever a line ends in it. Only binary data may contain it;
-# any other that is not a line of its own would shift all datasets after it.
-_MARK = re.compile(rb"    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL)
-_DELIMITER = re.compile(rb"^    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL | re.MULTILINE)
+_NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetres, inches
+_MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
+_BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
+_HEADER = re.compile(
+    rb"[ \t]*(?P<kind>\d+)(?:(?P<binary>[bB])(?:\s*\d+){3}[ \t]+(?P<bytes>\d+))?[^\r\n]*"
+)
+# As Fortran writes them: they may touch, with D for E, or without a letter.
+_NUMBER = re.compile(
+    rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+|[-+]\d{2,3}(?![\d.]))?|[-+]?\b(?:[nN]a[nN]|[iI]nf\w*)\b"
+)
+_NO_LETTER = re.compile(rb"(?<=[\d.])(?=[-+])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,35 +101,40 @@ def write_universal(path: Path, content: Universal) -> None:
 
 
 def read_universal(path: Path) -> Universal:
-    """Read a file; raises InputError with file and line if it is damaged or of another format."""
+    """Read a file; raises InputError with file and line if it is damaged or of another format.
+
+    Of each record the numbers that its header counts. pyuff reads the headers, nodes and units, of
+    a copy in which nothing else can be taken for them.
+    """
     import pyuff
 
-    content = read_bytes(path)
-    blocks = _blocks(path, content)
-    file = pyuff.UFF(str(path))
-    kinds = [int(kind) for kind in file.get_set_types()]
+    blocks = [each for each in _blocks(path, read_bytes(path)) if each.kind in _READ]
     nodes: dict[int, tuple[float, float, float]] = {}
-    functions = []
-    for number, (kind, (line, block)) in enumerate(zip(kinds, blocks, strict=True)):
-        place = f"{path}:{line}"
-        if kind not in (15, 58, 164, 2411):
-            continue
-        if kind == 58 and not _is_binary(block):
-            _check_numbers(path, line, block)
-        try:
-            found = file.read_sets(number)
-            if kind == 58:
-                functions.append(_function(place, found))
-            elif kind == 164:
-                _check_si(place, found)
-            else:
-                xyz = zip(found["x"], found["y"], found["z"], strict=True)
-                nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
-        except InputError:
-            raise
-        except Exception as error:  # pyuff raises nothing narrower
-            raise InputError(f"{place}: dataset {kind} cannot be read; export it again") from error
-    return Universal(nodes, functions)
+    functions, length = [], 1.0
+    with tempfile.TemporaryDirectory(prefix="era-") as folder:
+        copy = Path(folder) / "copy.uff"
+        copy.write_bytes(b"".join(each.plain for each in blocks))
+        file = pyuff.UFF(str(copy))
+        for number, block in enumerate(blocks):
+            place = f"{path}:{block.line}"
+            try:
+                found = file.read_sets(number, header_only=True)
+                if block.kind == 58:
+                    functions.append(_function(path, block, found))
+                elif block.kind == 164:
+                    length = _lengths_in_si(place, found)
+                else:
+                    xyz = zip(found["x"], found["y"], found["z"], strict=True)
+                    nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
+            except InputError:
+                raise
+            except Exception as error:  # pyuff raises nothing narrower
+                raise InputError(
+                    f"{place}: dataset {block.kind} cannot be read; export it again"
+                ) from error
+    return Universal(
+        {n: (x / length, y / length, z / length) for n, (x, y, z) in nodes.items()}, functions
+    )
 
 
 def read_bytes(path: Path) -> bytes:
@@ -134,38 +151,66 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
-def _blocks(path: Path, content: bytes) -> list[tuple[int, bytes]]:
-    """Line and content of each dataset, with its opening mark and without its closing one."""
-    blocks, marks, end = [], set(), 0
-    while start := _DELIMITER.search(content, end):
-        line = content.count(b"\n", 0, start.start()) + 1
-        mark = _MARK if _is_binary(content[start.start() : start.start() + 200]) else _DELIMITER
-        stop = mark.search(content, start.end())
-        if stop is None:
-            raise InputError(
-                f"{path}:{line}: dataset has no end; the file was cut off, export it again"
-            )
-        blocks.append((line, content[start.start() : stop.start()]))
-        marks |= {start.start(), stop.start()}
-        end = stop.end()
-    if not blocks:
+@dataclass(frozen=True)
+class _Block:
+    """One dataset: the line of its opening mark, its number, the content between its marks."""
+
+    line: int
+    kind: int
+    is_binary: bool
+    content: bytes
+
+    @property
+    def rows(self) -> list[bytes]:
+        """Lines of text, with the number of the dataset first."""
+        return self.content.splitlines()
+
+    @property
+    def plain(self) -> bytes:
+        """The dataset as pyuff reads it, without free text and the numbers of a record."""
+        rows = self.rows
+        if self.kind == 58:
+            rows[_FORM] = rows[_FORM].upper().replace(b"D", b"E")
+            rows = [rows[0], *[b"NONE"] * _ID_LINES, *rows[1 + _ID_LINES : _HEADER_LINES]]
+        elif self.kind != 164:  # a node's number must not be taken for a mark
+            rows = [rows[0], *(b" " + b" ".join(row.split()) for row in rows[1:])]
+        text = b"\n".join(rows)
+        try:
+            text.decode()
+        except UnicodeDecodeError:
+            text = text.decode("latin-1").encode()
+        return b"    -1\n" + text + b"\n    -1\n"
+
+
+def _blocks(path: Path, content: bytes) -> Iterator[_Block]:
+    """Datasets of a file, between lines of `    -1` alone."""
+    start = _MARK.search(content)
+    if start is None:
         raise InputError(
             f"{path}: a universal file must have lines of `    -1` alone, got none; export the "
             "measurement as UFF, datasets 58 with 15 or 2411"
         )
-    for stray in _MARK.finditer(content):
-        if stray.start() not in marks:
-            line = content.count(b"\n", 0, stray.start()) + 1
+    while start is not None:
+        line = content.count(b"\n", 0, start.start()) + 1
+        begin = start.end()
+        head = _HEADER.match(content, begin)
+        if head is None:
             raise InputError(
-                f"{path}:{line}: only lines between datasets may end in `    -1`; export it again "
-                "with another number there, or binary data as ASCII"
+                f"{path}:{line}: dataset must begin with its number, got none; export it again"
             )
-    return blocks
-
-
-def _is_binary(block: bytes) -> bool:
-    rows = block.split(b"\n", 2)
-    return len(rows) > 1 and rows[1][6:7].lower() == b"b"
+        data = begin
+        if head["binary"]:  # its numbers are any bytes
+            for _ in range(_HEADER_LINES):
+                data = content.find(b"\n", data) + 1 or len(content)
+            data += int(head["bytes"] or 0)
+        end = (_BINARY_END if head["binary"] else _MARK).search(content, data)
+        if end is None:
+            raise InputError(
+                f"{path}:{line}: dataset has no end; the file was cut off, export it again"
+            )
+        kind = int(head["kind"])
+        yield _Block(line, kind, bool(head["binary"]), content[begin : end.start()])
+        start = _MARK.search(content, end.end())
 
 
 def _as_58(function: Function) -> dict[str, Any]:
@@ -193,17 +238,22 @@ def _as_58(function: Function) -> dict[str, Any]:
     }
 
 
-def _function(place: str, found: Mapping[str, Any]) -> Function:
-    x, data = np.asarray(found["x"], dtype=float), np.asarray(found["data"])
-    if not len(data) == len(x) == found["num_pts"]:
-        raise InputError(
-            f"{place}: record must have {found['num_pts']} values, as its header says, got "
-            f"{len(data)}; the file is damaged, export it again"
-        )
-    if not (np.isfinite(x).all() and np.isfinite(data).all()):
+def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
+    place, count = f"{path}:{block.line}", int(found["num_pts"])
+    is_complex, is_even = found["ord_data_type"] in (5, 6), found["abscissa_spacing"] == 1
+    shape = (count, 1 + is_complex + (not is_even))
+    read = _bytes_of if block.is_binary else _numbers_of
+    values = read(path, block, found, math.prod(shape)).reshape(shape)
+    if not np.isfinite(values).all():
         raise InputError(f"{place}: values of the record must be finite; measure it again")
-    if len(x) == 0 or (np.diff(x) <= 0).any():
+    x = (
+        found["abscissa_min"] + np.arange(count) * found["abscissa_inc"]
+        if is_even
+        else values[:, 0]
+    )
+    if count == 0 or (np.diff(x) <= 0).any():
         raise InputError(f"{place}: abscissa of the record must ascend; export it again")
+    data = values[:, -2] + 1j * values[:, -1] if is_complex else values[:, -1]
     names = (_name(found["rsp_ent_name"]), _name(found["ref_ent_name"]))
     return Function(
         place,
@@ -219,30 +269,52 @@ def _function(place: str, found: Mapping[str, Any]) -> Function:
     )
 
 
+def _bytes_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
+    """So many numbers of a binary record."""
+    data = block.content.split(b"\n", _HEADER_LINES)[-1]
+    order = "<" if found["byte_ordering"] == 1 else ">"
+    size = 8 if found["ord_data_type"] in (4, 6) else 4
+    if len(data) < count * size:
+        raise _too_few(path, block.line, count, len(data) // size)
+    return np.frombuffer(data[: count * size], dtype=f"{order}f{size}").astype(float)
+
+
+def _numbers_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
+    """So many numbers of a record in ASCII; what fills their last line is left out."""
+    numbers: list[float] = []
+    for line, row in enumerate(block.rows[_HEADER_LINES:], start=block.line + 1 + _HEADER_LINES):
+        if _NUMBER.sub(b"", row).strip() or (len(numbers) >= count and row.strip()):
+            shown = row.decode("ascii", "backslashreplace").strip()[:40]
+            raise InputError(
+                f"{path}:{line}: data must be numbers, {count} in all, got {shown!r}; export the "
+                "damaged file again"
+            )
+        for word in _NUMBER.findall(row):
+            plain = word.upper().replace(b"D", b"E")
+            numbers.append(float(_NO_LETTER.sub(b"E", plain)))
+    if len(numbers) < count:
+        raise _too_few(path, block.line, count, len(numbers))
+    return np.array(numbers[:count])
+
+
+def _too_few(path: Path, line: int, count: int, got: int) -> InputError:
+    return InputError(
+        f"{path}:{line}: record must have {count} numbers, as its header says, got {got}; the file "
+        "is damaged, export it again"
+    )
+
+
+def _lengths_in_si(place: str, found: Mapping[str, Any]) -> float:
+    """By what lengths of the file are divided to have metres."""
+    length, code = float(found["length"]), int(found["units_code"])
+    if not 0 < length < math.inf or (length == 1 and code in _NOT_METRES):
+        raise InputError(
+            f"{place}: factor of lengths (dataset 164) must be positive and that of units code "
+            f"{code} {found['units_description']!r}, got {length:g}; export it in SI"
+        )
+    return length
+
+
 def _name(text: str) -> str:
     plain = text.strip()
     return "" if plain.upper() == "NONE" else plain
-
-
-def _check_si(place: str, found: Mapping[str, Any]) -> None:
-    if found["units_code"] != _SI:
-        raise InputError(
-            f"{place}: units code (dataset 164) must be 1 (SI), got {found['units_code']} "
-            f"{found['units_description']!r}; export it in SI"
-        )
-
-
-def _check_numbers(path: Path, line: int, block: bytes) -> None:
-    """Raise InputError, with its line, for ASCII data that is not numbers."""
-    rows = block.split(b"\n")
-    for number, row in enumerate(rows[_HEADER_LINES:], start=line + _HEADER_LINES):
-        try:
-            # Numbers may touch: 1.00000e+00-1.00000e+00.
-            for word in re.sub(rb"([eEdD][+-]?\d+)(?=[-+\d.])", rb"\1 ", row).split():
-                float(word)
-        except ValueError:
-            shown = row.decode("ascii", "backslashreplace").strip()[:40]
-            raise InputError(
-                f"{path}:{number}: data must be numbers, got {shown!r}; export the "
-                "damaged file again"
-            ) from None

@@ -37,7 +37,7 @@ from model.config.units import (
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.structure.materials import material, material_names
-from model.structure.plate import Bond
+from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 from registry.suggestions import did_you_mean
 
 
@@ -189,7 +189,9 @@ class PlateSection(Section):
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
     air_gap: AirGapSection | None = None
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
-    loss_exponent: Annotated[float, Quantity(RATIO, at_least=-2, at_most=2)] = 0.0
+    loss_exponent: Annotated[
+        float, Quantity(RATIO, at_least=-MAX_LOSS_EXPONENT, at_most=MAX_LOSS_EXPONENT)
+    ] = 0.0
     modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), _MODES]
 
 

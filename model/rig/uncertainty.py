@@ -4,6 +4,10 @@ import math
 from dataclasses import asdict, dataclass, fields
 
 from model.arguments import expect_at_least
+from model.errors import InputError
+
+MAX_UNCERTAINTY = 1000.0
+"""Of any of them; what a rig file may state is less."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,8 @@ class Uncertainty:
         for key in (each.name for each in fields(self)):
             least = 1.0 if key == "damping" else 0.0
             expect_at_least(getattr(self, key), least, what=f"uncertainty: {key}")
+            if getattr(self, key) > MAX_UNCERTAINTY:
+                raise InputError(f"uncertainty: {key} must be up to {MAX_UNCERTAINTY}")
 
     @classmethod
     def none(cls) -> "Uncertainty":

@@ -254,6 +254,11 @@ class Plate(Sheet):
             raise InputError(
                 f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
             )
+        if not abs(self.loss_exponent) <= MAX_LOSS_EXPONENT:
+            raise InputError(
+                f"plate: loss_exponent must be from -{MAX_LOSS_EXPONENT:g} to {MAX_LOSS_EXPONENT:g}, "
+                f"got {self.loss_exponent}"
+            )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)
         object.__setattr__(self, "mode_deviations", deviations)

@@ -243,8 +243,13 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(
                 f"{path}: {name} must be up to {MAX_VALUE:g}, got {np.abs(values).max():.3g}"
             )
-    if not table.shapes.any():
-        raise InputError(f"{path}: shapes must not be zero everywhere")
+    for name in ("shapes", "attachment_shapes", "omega"):
+        if np.abs(getattr(table, name)).max(initial=0) < 1 / MAX_VALUE:
+            raise InputError(f"{path}: {name} must not be zero everywhere")
+    places = [(each.x, each.y) for each in table.eras] + [(m.x, m.y) for m in table.masses]
+    for x, y in places:
+        if not (0 <= x <= table.plate.length and 0 <= y <= table.plate.width):
+            raise InputError(f"{path}: ERAs and masses must be on the plate, got ({x:g}, {y:g}) m")
     try:
         check_has_threshold(table.frequencies, table.threshold)
     except InputError as error:

@@ -1,5 +1,6 @@
 """Files of measured frequency responses, and what is refused in them."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,13 +147,11 @@ def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, befo
 @pytest.mark.parametrize(
     ("before", "after", "named"),
     [
-        ("m/s^2", "g    ", r":\d+: .*'g'"),
-        ("         1                  SI", "         5                  SI", r":1: .*5"),
+        ("m/s^2", "cm/s2", r":\d+: .*'cm/s2'"),
         ("        12    0", "        11    0", r":\d+: .*11 over 8"),
         ("         8    0", "        13    0", r":\d+: .*12 over 13"),
-        ("         6         3", "         6         4", r":\d+: .*4"),
+        ("         6         3", "         6         4", r":\d+: .*12"),
         ("  5.00000e+01", "  x.00000e+01", r":\d+: .*'x.00000e"),
-        ("  5.00000e+01", "  0.00000e+00", r":\d+: .*0 Hz"),
         ("         1   3 ", "         1   1 ", r":\d+: .*1 and 3"),
         ("    4         0", "    9         0", ""),
         ("\n    -1\n", "\n    -3\n", r":\d+: "),
@@ -168,6 +167,62 @@ def test_read_measured_refuses_damaged_uff(responses, coarse_rig, tmp_path, befo
         return
     with pytest.raises(InputError, match=rf"measured\.uff{named}"):
         read_measured(path)
+
+
+SPREADSHEETS = {
+    "semicolons": lambda text: text.replace(",", ";").encode(),
+    "decimal commas": lambda text: text.replace(",", ";").replace(".", ",").encode(),
+    "tabs": lambda text: text.replace(",", "\t").encode("utf-16"),
+    "sep": lambda text: f"sep=;\r\n{text.replace(',', ';')}".encode(),
+    "empty rows": lambda text: f"\n{text}{9 * ','}\n".encode(),
+    "coherence": lambda text: "\n".join(
+        f"{line},{'0.99' if row else 'coherence'}" for row, line in enumerate(text.split())
+    ).encode(),
+}
+
+
+@pytest.mark.parametrize("write", SPREADSHEETS.values(), ids=SPREADSHEETS)
+def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path, write, caplog):
+    """Separators, decimal commas, UTF-16, a coherence, and what lies beyond the last value."""
+    path = tmp_path / "measured.csv"
+    write_responses_csv(path, responses, coarse_rig)
+    path.write_bytes(write(path.read_text("utf-8")))
+    back = responses_of(read_measured(path), coarse_rig)
+    np.testing.assert_array_equal(back.values, responses.values)
+    assert ("coherence" in caplog.text) == ("coherence" in path.read_text("utf-8", "replace"))
+
+
+@pytest.mark.parametrize(
+    ("label", "factor"),
+    [("m/s²", 1.0), ("(m/s^2)", 1.0), ("m s-2", 1.0), ("g", 9.80665), ("mm/s2", 1e-3)],
+)
+def test_read_measured_reads_uff_of_analysers(responses, coarse_rig, tmp_path, label, factor):
+    """By dataset 58's definition: any label of a unit, numbers of Fortran, the counted values."""
+    path = tmp_path / "measured.uff"
+    write_responses_uff(path, responses, coarse_rig)
+    text = path.read_text("ascii").replace("m/s^2".ljust(20), label.ljust(20))
+    lines = text.splitlines()
+    for number, line in enumerate(lines):
+        if re.fullmatch(r"( +-?\d\.\d+e[+-]\d+){3}", line):
+            lines[number] = line.replace("e", "D" if number % 2 else "E")
+            last = number
+    lines[last] += "  0.00000e+00  0.00000e+00"  # fills the last line
+    first = next(number for number, line in enumerate(lines) if line.strip() == "58")
+    lines[first + 1] = "an offset of    -1"
+    path.write_bytes("\r\n".join(lines).encode("latin-1"))
+    back = responses_of(read_measured(path), coarse_rig)
+    order = [back.sensors.index(name) for name in responses.sensors]
+    np.testing.assert_allclose(back.values[:, :, order], factor * responses.values, rtol=1e-11)
+
+
+def test_values_beyond_the_limits_are_left_out(responses, coarse_rig, tmp_path, caplog):
+    """An analyser's line of 0 Hz, and all beyond its rig's highest frequency, are counted."""
+    path = tmp_path / "measured.csv"
+    write_responses_csv(path, responses, coarse_rig)
+    path.write_text(path.read_text("utf-8").replace(",50.0,", ",0.0,"), "utf-8")
+    back = responses_of(read_measured(path), coarse_rig)
+    assert (back.left_out, back.count, back.frequencies.tolist()) == (6, 11, [110.25, 320.0])
+    assert "6 of 17" in caplog.text
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -203,13 +258,13 @@ def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, end
     inside = tuple(replace(era, x=min(era.x, 0.25), y=min(era.y, 0.2)) for era in eras)
     moved = tuple(replace(era, x=0.9 * era.x) for era in eras)
     others = tuple(replace(era, name=f"X{era.name}", x=0.1 + era.x / 3) for era in eras)
-    limits = replace(coarse_rig.limits, frequency_max=300.0)
+    limits = replace(coarse_rig.limits, frequency_max=45.0)
     elsewhere = replace(measured[0], point=(0.2, 0.2), era="NE", era_point=None)
     for rig, given, named in (
         (replace(coarse_rig, plate=small, eras=inside), measured, "sensor rim"),
         (replace(coarse_rig, eras=moved), measured, "ERA SE"),
         (replace(coarse_rig, eras=others), measured, "ERA.* SW"),
-        (replace(coarse_rig, limits=limits), measured, "320 Hz"),
+        (replace(coarse_rig, limits=limits), measured, "50 Hz"),
         (coarse_rig, [*measured, measured[0]], "50 Hz"),
         (coarse_rig, [*measured, elsewhere], "sensor P1"),
     ):

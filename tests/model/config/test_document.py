@@ -1,10 +1,14 @@
+import re
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from model.config import document as reading
 from model.config.document import ConfigError, read_document
+from model.config.units import LENGTH, quantity
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -14,8 +18,12 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def test_document_keeps_the_line_of_every_key(tmp_path: Path) -> None:
-    """Lines count from one; a missing key has that of the nearest key above it."""
+@pytest.mark.parametrize("loader", [yaml.SafeLoader, yaml.CSafeLoader])
+def test_document_keeps_the_line_of_every_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loader: object
+) -> None:
+    """Lines count from one; a missing key has that of the nearest above it; with libyaml or not."""
+    monkeypatch.setattr(reading, "_LOADER", loader)
     document = read_document(write(tmp_path, "# note\na: 1\n\nb:\n  c: [1,\n    2]\n  d: x\n"))
     assert document.data == {"a": 1, "b": {"c": [1, 2], "d": "x"}}
     expected = {("a",): 2, ("b",): 4, ("b", "c"): 5, ("b", "c", 0): 5, ("b", "c", 1): 6}
@@ -42,6 +50,20 @@ def test_keys_are_text(tmp_path: Path, directive: str) -> None:
     """A key such as NO stays that word, also with a directive of YAML 1.1."""
     document = read_document(write(tmp_path, f"{directive}NO: NO\n5: 2\ntrue: 3\n<<: 4\n"))
     assert document.data == {"NO": "NO", "5": 2, "true": 3, "<<": 4}
+
+
+def test_blanks_that_look_right_are_read_or_named(tmp_path: Path) -> None:
+    """Tabs where YAML 1.2 lets white space stand, blanks of word processors behind a value."""
+    content = "a: 1\t# first\nb:\t[1,\t2]\t\nc: 3\N{NO-BREAK SPACE}\nd: 12\N{NO-BREAK SPACE}in\n"
+    data = read_document(write(tmp_path, content)).data
+    assert (data["a"], data["b"], data["c"]) == (1, [1, 2], 3)
+    assert quantity(data["d"], LENGTH) == 0.3048
+    for wrong, name in (
+        ("a:\N{NO-BREAK SPACE}1\n", "U+00A0 in column 3"),
+        ("\ta: 1\n", "tab in col"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(name)):
+            read_document(write(tmp_path, wrong))
 
 
 def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
@@ -71,7 +93,9 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         (b"a: !!int '3'\n", 1, "a"),
         (b"a: ! 3\n", 1, "a"),
         (b"? [1, 2]\n: 3\n", 1, ""),
-        (b"a: " + b"[" * 20_000, 1, "a[0][0]"),
+        (b"a: " + b"[" * 900, 1, "a[0][0]"),
+        (b"a: " + b"[" * 20_000, 1, ""),  # by libyaml
+        (b"%YAML 2.0\n---\na: 1\n", 1, ""),
         (b"a: " + b"{a: " * 20_000, 1, "a.a.a"),
         (b"a: 1\n" + b"#" * (1 << 20), None, ""),
         (b"PK\x03\x04" + bytes(1 << 20), None, ""),

@@ -87,6 +87,12 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)
     yield rejected
+    inputs = GaugeMetricFamily(
+        "era_touch_input_open", "Whether touches can come from an input.", labels=["input"]
+    )
+    for each in status.inputs:
+        inputs.add_metric([each.name], float(each.state == "open"))
+    yield inputs
     yield _histogram(
         "era_touch_to_wire_seconds",
         "From a touch to the last byte of the command.",

@@ -19,6 +19,8 @@ class RejectCounter:
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.counts: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}
+        """The newest detail of each reason, printable."""
         self._logger = logger
         self._clock = clock
         self._unlogged = 0
@@ -27,6 +29,7 @@ class RejectCounter:
     def count(self, reason: str, detail: str) -> None:
         """Count one rejection; log its detail unless the last log line is too recent."""
         self.counts[reason] += 1
+        self.examples[reason] = detail if detail.isprintable() else ascii(detail)
         self._unlogged += 1
         now = self._clock()
         if self._logged_at is not None and now - self._logged_at < LOG_INTERVAL:
@@ -34,7 +37,7 @@ class RejectCounter:
         self._logger.warning(
             "%s: %s (new=%d, total: %s)",
             reason.replace("_", " "),
-            detail,
+            self.examples[reason],
             self._unlogged,
             ", ".join(f"{key} {count}" for key, count in sorted(self.counts.items())),
         )

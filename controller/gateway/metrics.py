@@ -82,7 +82,9 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
         if value is not None:
             yield _gauge(f"era_{name}", text, float(value))
     rejected = CounterMetricFamily(
-        "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
+        "era_rejected_touches",
+        "Rejected touches and messages of touch sources.",
+        labels=["reason"],
     )
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)

@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import Datagram, Peer, listen
@@ -30,6 +31,7 @@ _PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
 _IDLE_ADDRESSES = ("/tuio2/frm", "/tuio2/alv")  # without a position
 
 _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
+_MAX_MESSAGES = 256  # of a datagram: some 4 ms, and ten times as many cursors as there are contacts
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
@@ -218,7 +220,10 @@ class TuioReader:
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the messages of a datagram."""
     bundle = _Bundle()
-    for message in osc_messages(datagram):
+    messages = list(islice(osc_messages(datagram), _MAX_MESSAGES + 1))
+    if len(messages) > _MAX_MESSAGES:
+        bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
+    for message in messages[:_MAX_MESSAGES]:
         try:
             address, arguments = read_message(message)
             if address == ADDRESS:

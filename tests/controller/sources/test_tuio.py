@@ -200,8 +200,15 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
             (0, PEER, of(HERE), []),
         ],
     ),
-    # As much as UDP carries.
-    "big bundles": ({}, [(0, PEER, frame(*((id, 0.5, 0.5) for id in range(900))), ...)]),
+    # As much as UDP carries, but no more messages than ten times as many contacts need.
+    "big bundles": (
+        {"malformed": 1},
+        [
+            (0, PEER, of(message("alive", 1), HERE, message("set", 2, *[0.5] * 12_000)), HALF),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(250))), ...),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(300))), ...),
+        ],
+    ),
 }
 
 

@@ -45,7 +45,7 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
         match = _LINE.fullmatch(line)
         if match is None:
             raise InputError(
-                f"{path}, line {number}: must be seconds, a space and the datagram in lower-case "
+                f"{path}, line {number}: must be seconds, a space and the datagram in "
                 f"hexadecimal, got {line[:60]!r}"
             )
         datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
@@ -71,7 +71,7 @@ def _lines(path: Path) -> list[str]:
             raise InputError(
                 f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
             )
-        return content.decode("utf-8").replace("\r\n", "\n").removesuffix("\n").split("\n")
+        return content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "

@@ -108,7 +108,7 @@ class TuioReader:
         self._count(bundle, f"{peer[0]}:{peer[1]}")
         if bundle.alive is None and not bundle.positions:
             return None
-        name = self._name(bundle.source, peer)
+        name = self._name(bundle, peer, now)
         sender = self._sender(name, peer, now)
         if sender is None or not self._accept_sequence(bundle.sequence, sender, name, now=now):
             return None
@@ -148,20 +148,26 @@ class TuioReader:
         for problem in bundle.malformed:
             self.rejects.count("malformed", f"message from {place}: {problem}")
 
-    def _name(self, source: str | None, peer: Peer) -> str:
+    def _name(self, bundle: _Bundle, peer: Peer, now: float) -> str:
         """Return the name of a sender: of host and source, with the port where that is not unique.
 
         A name that comes from another port is that of a program that was restarted, or that takes
-        another port for each datagram; unless the former port is heard again.
+        another port for each datagram and goes on counting its frames. It is that of a second
+        program if its frames do not follow those that came just before, or the former port is
+        heard again.
         """
         own = f"tuio:{peer[0]}:{peer[1]}"
-        if source is None:
+        if bundle.source is None:
             return own
-        shared, own = f"tuio:{peer[0]}/{source}", f"{own}/{source}"
+        shared, own = f"tuio:{peer[0]}/{bundle.source}", f"{own}/{bundle.source}"
         if own in self._senders:
             return own
         known = self._senders.get(shared)
-        if known is None or known.former != peer:
+        if known is None or known.peer == peer:
+            return shared
+        sequence = -1 if bundle.sequence is None else bundle.sequence
+        follows = sequence < 0 or 0 < sequence - known.sequence <= _LATE_FRAMES
+        if known.former != peer and (follows or now - known.last_heard >= _LATE_SECONDS):
             return shared
         ports = f"ports {known.peer[1]} and {peer[1]}"
         self.rejects.count("same_name", f"{shared} comes from {ports}; rename one of the programs")

@@ -300,17 +300,30 @@ def test_reader_is_liberal(reader: TuioReader, datagram: bytes) -> None:
     assert not counts(reader)
 
 
-def test_reader_tells_programs_of_one_name_apart(reader: TuioReader) -> None:
-    """One that takes another port replaces its fingers; two that alternate keep theirs."""
-    sent = [(1, QUARTER), (2, HALF), (3, HALF), (2, QUARTER), (3, HALF), (2, QUARTER)]
-    results = [
-        reader.read(frame(*cursors, source="a"), ("192.0.2.7", port), now=0)
-        for port, cursors in sent
-    ]
-    assert [touches(each) for each in results] == [cursors for _, cursors in sent]
-    shared, own = "tuio:192.0.2.7/a", "tuio:192.0.2.7:2/a"
-    assert [each and each.source for each in results] == [*[shared] * 3, own, shared, own]
-    assert counts(reader) == {"same_name": 1}
+@pytest.mark.parametrize(
+    ("sent", "seconds"),
+    [
+        # by port: one that takes another port for each datagram, another one a moment after
+        ([(1, 5, 0.0), (2, 6, 0.0), (3, 7, 0.0), (4, 5, 0.1), (3, 8, 0.1)], {4}),
+        # a program that is restarted, from another port
+        ([(1, 900, 0.0), (2, 1, 0.6), (2, 2, 0.7)], set()),
+        # two that are not numbered, or number alike, each with the next number
+        ([(1, -1, 0.0), (2, -1, 0.0), (1, -1, 0.1), (2, -1, 0.1)], {1}),
+        ([(1, 1, 0.0), (2, 2, 0.0), (1, 3, 0.1), (2, 4, 0.1)], {1}),
+    ],
+)
+def test_reader_tells_programs_of_one_name_apart(
+    reader: TuioReader, sent: list[tuple[int, int, float]], seconds: set[int]
+) -> None:
+    """By port, frame number and time [s]: those of a second program, counted once, and others."""
+    for number, (port, fseq, now) in enumerate(sent):
+        datagram = frame((port, 0.5, 0.5), fseq=fseq, source="a")
+        result = reader.read(datagram, ("192.0.2.7", port), now=now)
+        assert [id for id, _, _ in touches(result)] == [port]
+        is_second = port in seconds and number > 0
+        assert result is not None
+        assert result.source == f"tuio:192.0.2.7{f':{port}' if is_second else ''}/a"
+    assert counts(reader) == ({"same_name": 1} if seconds else {})
 
 
 def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:

@@ -156,8 +156,8 @@ class TouchInputStatus(Message):
     name: str
     url: str
     state: Literal["open", "mute", "missing", "ended"] = Field(
-        description="open; open, but nothing comes although it should; cannot be opened, or was "
-        "unplugged, and is tried again; a recording at its end"
+        description="mute: open, but nothing comes although it should; missing: not opened, or "
+        "lost, and tried again; ended: a recording at its end"
     )
     problem: str | None = Field(
         None, description="why it is mute or missing, and what to do; null if it is neither"

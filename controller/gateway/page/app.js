@@ -137,7 +137,7 @@ function showUnknown(cause) {
   overlay.show({ contacts: [], layers: {} });
   showLayers();
   fieldView.clear();
-  at("summary").textContent = "";
+  at("summary").textContent = at("inputs").textContent = "";
   showAmplifiers(at("amplifiers"), null, []);
   linkLoss = null;
 }

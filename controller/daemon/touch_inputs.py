@@ -127,7 +127,10 @@ class TouchInputs:
 
 def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
     """Describe an input by its source, or by why there is none."""
-    problem = source.problem if isinstance(source, TouchSource) else source
+    try:
+        problem = source.problem if isinstance(source, TouchSource) else source
+    except Exception as error:  # of a plug-in
+        problem = failure_text(error)
     lacking: Literal["mute", "missing"] = "missing" if isinstance(source, str) else "mute"
     return TouchInputStatus(
         name=touch_input.name,

@@ -83,6 +83,11 @@ class Panel(TouchSource):
     error: Exception | None = None
     ended: list[str] = field(default_factory=list)
 
+    @property
+    def problem(self) -> str | None:
+        """Fail, for one of the panels."""
+        return None if self.name != "z" else str(1 / 0)
+
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame, of a touch that is and one that is none."""
         deliver(TouchFrame(self.name, 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
@@ -115,6 +120,7 @@ async def test_inputs_run_beside_each_other(
         "c:": Panel("z"),
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
+    monkeypatch.setattr("controller.daemon.touch_inputs._WATCH_INTERVAL", 0.01)
     frames: list[TouchFrame] = []
     lifted: list[str] = []
     inputs = touch_inputs(frames.append, lifted.append)
@@ -131,6 +137,8 @@ async def test_inputs_run_beside_each_other(
         assert (frame.touches[1].id, math.isnan(frame.touches[1].x)) == (5, True)
     assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
     assert lifted == ["right:"]
+    states = ["open", "missing", "mute"]
+    await until(lambda: [each.state for each in inputs.event.inputs] == states)
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
     assert sorted(lifted[1:]) == ["left:", "table:"]

@@ -47,7 +47,7 @@ class TouchInputs:
         self._rejects = rejects
         self._changed = changed
         self._sources: dict[TouchInput, TouchSource | str | None] = {}
-        """Source of each input; a text why there is none; None at its end."""
+        """Source of each input; the reason in words while it has no source; None at its end."""
         self._running: list[asyncio.Task[None]] = []
         self.event = InputsEvent(inputs=[], rejected_touches={})
         """State of all inputs and rejected touches, at most a second old."""
@@ -126,7 +126,7 @@ class TouchInputs:
 
 
 def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
-    """Describe an input by its source, or by why there is none."""
+    """Describe an input by its source, or by the reason for having no source."""
     try:
         problem = source.problem if isinstance(source, TouchSource) else source
     except Exception as error:  # of a plug-in

@@ -271,7 +271,7 @@ class EvdevSource(TouchSource):
         touches: tuple[Touch, ...],
         happened: float = -math.inf,
     ) -> None:
-        """Deliver a frame of what happened at a time [s], now if that is none of this clock."""
+        """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
         now = asyncio.get_running_loop().time()
         time = happened if now - _MAX_AGE <= happened <= now else now
         deliver(TouchFrame(self._name, time, touches))

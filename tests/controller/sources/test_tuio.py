@@ -246,7 +246,7 @@ MALFORMED = {
     "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
     "unknown command": bytes(message("wave", 1).dgram),
     "an id that is not whole": bytes(message("alive", 1.5).dgram),
-    "a number that is none": bytes(message("fseq", math.inf).dgram),
+    "a number that is infinite": bytes(message("fseq", math.inf).dgram),
     "too few arguments": bytes(message("set", 1, 0.5).dgram),
 }
 
@@ -327,9 +327,9 @@ def test_reader_tells_programs_of_one_name_apart(
 
 
 def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
-    """After 10 s without anything, but not of a panel at rest, which nobody may touch for long.
+    """After 10 s without anything, but not of a panel at rest.
 
-    A sender that repeats itself at rest and falls silent is told from that.
+    A sender that repeats itself at rest and falls silent is mute, too.
     """
     assert [reader.is_mute(since=0, now=now) for now in (9.9, 10.1)] == [False, True]
     for now in range(11, 14):
@@ -347,7 +347,7 @@ def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
     )
 )
 def test_reader_reads_cursors_among_noise(parts: list[int | bytes]) -> None:
-    """Every cursor is read, and every element that is none is counted."""
+    """Every cursor is read, and every other element is counted."""
     raw = [each if isinstance(each, bytes) else cursor(each, 0.5, 0.5).dgram for each in parts]
     reader = TuioReader(RejectCounter(logging.getLogger("test")))
     result = reader.read(_raw(*((len(each), each) for each in raw)), PEER, now=0)

@@ -57,8 +57,10 @@ class AmplifierUrl:
         self._url, self._form = url, form
         scheme, _, rest = url.partition("://")
         self.scheme = scheme.lower()
+        # In the path of a device # is a letter as any other, unless an address follows.
+        letter = r"#(?!\d+$)" if self.scheme == "serial" else r"#(?=.*#)"
         try:
-            parts = urlsplit(f"//{rest}")
+            parts = urlsplit(f"//{re.sub(letter, '%23', rest)}")
             self.host, self.port = parts.hostname or "", parts.port or 0
         except ValueError as error:
             raise self.refused(f"URL must be valid: {error}") from None
@@ -116,5 +118,5 @@ def with_address(url: str, address: int) -> str:
         host = "/".join(place.split("/")[:3])
         return f"{host}/{address}" + (f"?{options}" if options else "")
     if scheme == "modbus+rtu" or scheme.startswith("can"):
-        return f"{url.partition('#')[0]}#{address}"
+        return f"{url.rpartition('#')[0] or url}#{address}"
     raise CommandError(f"amplifiers at {url} have no address that can be set")

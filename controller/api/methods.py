@@ -29,6 +29,7 @@ from controller.api.schema import (
     RigSummary,
     TableSummary,
     Topic,
+    TouchInputStatus,
     TouchPoint,
 )
 
@@ -76,7 +77,13 @@ class StatusResult(Playing, Explained):
     silence_reason: str | None = Field(None, description="why nothing plays although armed")
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
-    rejected_touches: dict[str, Count] = Field(description="number by reason")
+    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
+    rejected_examples: dict[str, str] = Field(
+        default_factory=dict, description="the newest of each reason: what came, and from where"
+    )
+    inputs: list[TouchInputStatus] = Field(
+        default_factory=list, description="touch inputs of the configuration"
+    )
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"
     )

@@ -64,6 +64,7 @@ Topic: TypeAlias = Literal[
     "link",
     "layout",
     "plate",
+    "inputs",
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
@@ -147,6 +148,20 @@ class TouchPoint(Message):
     )
     x_m: float = Field(description="from the plate's south-west corner")
     y_m: float = Field(description="from the plate's south-west corner, upwards")
+
+
+class TouchInputStatus(Message):
+    """A touch input of the configuration: whether touches can come from it."""
+
+    name: str
+    url: str
+    state: Literal["open", "mute", "missing", "ended"] = Field(
+        description="mute: open, but nothing comes although it should; missing: not opened, or "
+        "lost, and tried again; ended: a recording at its end"
+    )
+    problem: str | None = Field(
+        None, description="why it is mute or missing, and what to do; null if it is neither"
+    )
 
 
 class ContactStatus(Message):

@@ -26,6 +26,7 @@ from controller.api.schema import (
     PlateEvent,
     Playing,
     Topic,
+    TouchInputStatus,
 )
 
 
@@ -103,6 +104,13 @@ class LayoutEvent(Message):
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
+class InputsEvent(Message):
+    """A touch input was opened, fell silent or was lost, or touches were rejected."""
+
+    inputs: list[TouchInputStatus] = Field(description="all of the configuration")
+    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
+
+
 class TopicData(NamedTuple):
     """A topic: its data, its summary, and when it is sent.
 
@@ -128,6 +136,9 @@ TOPICS: dict[Topic, TopicData] = {
     "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "the surface layout was replaced"),
     "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
+    "inputs": TopicData(
+        InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
+    ),
 }
 """Every topic, by name."""
 

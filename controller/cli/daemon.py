@@ -32,7 +32,7 @@ Socket = Annotated[
 DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
 
-_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate"]
+_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate", "inputs"]
 """Topics of `era watch`: all but amplifiers and latency, which are published without end."""
 
 _LEASE_CHECK_INTERVAL = 0.5  # s

@@ -24,6 +24,11 @@ def show_status(status: StatusResult) -> str:
     left = status.lease_left_s
     armed = None if left is None else f"{status.armed_by}, {left:.1f} s left"
     lines = [
+        *(
+            f"touch {each.name}: {each.state}: {each.problem}"
+            for each in status.inputs
+            if each.problem
+        ),
         headline(status.state, status.cause),
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
         *_given(("  armed by {}", armed)),
@@ -44,7 +49,9 @@ def show_status(status: StatusResult) -> str:
             f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
         )
     for reason, count in status.rejected_touches.items():
-        lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
+        example = status.rejected_examples.get(reason)
+        newest = f" ({example})" if example else ""
+        lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}{newest}")
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
 
 

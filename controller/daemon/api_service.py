@@ -131,7 +131,9 @@ class ApiService:
             **playing_of(view.applied if operation.state is _ENABLED else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
-            rejected_touches=dict(self._controller.rejected_touches),
+            rejected_touches=dict(self._controller.rejects.counts),
+            rejected_examples=dict(self._controller.rejects.examples),
+            inputs=self._publisher.inputs().inputs,
             learning=self._publisher.learning_summary(),
             uptime_s=now - self._started,
         )

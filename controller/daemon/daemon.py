@@ -92,6 +92,7 @@ class Daemon:
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,
+            inputs=lambda: self._inputs.event,
             learning=lambda: None if self.learning is None else self.learning.status,
         )
         self.learning: Learning | None = None
@@ -123,7 +124,12 @@ class Daemon:
             )
             self._controller.observers.append(self.learning.observer)
         self._controller.observers.append(observer)
-        self._inputs = TouchInputs(self._controller.deliver, self._controller.lift)
+        self._inputs = TouchInputs(
+            self._controller.deliver,
+            self._controller.lift,
+            rejects=self._controller.rejects,
+            changed=lambda: self._publisher.hub.publish("inputs", self._publisher.inputs),
+        )
         self._api = ApiService(
             config,
             table,

@@ -12,6 +12,7 @@ from controller.api.schema import AmplifierStatus, LatencySummary, LearningSumma
 from controller.api.topics import (
     AmplifiersEvent,
     Hub,
+    InputsEvent,
     LatencyEvent,
     LayoutEvent,
     LinkEvent,
@@ -37,7 +38,7 @@ class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
     operation: of the plate; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; layout: the surface layout;
+    plays for a contact; layout: the surface layout; inputs: state of the touch inputs;
     learning: what is learned of the plate, None where nothing is to be.
     """
 
@@ -48,6 +49,7 @@ class EventPublisher:
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
         layout: SurfaceLayout | None,
+        inputs: Callable[[], InputsEvent],
         learning: Callable[[], LearningStatus | None],
     ) -> None:
         self.view = PlateView(effect_of)
@@ -55,6 +57,7 @@ class EventPublisher:
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
         self.amplifiers = amplifiers
+        self.inputs = inputs
         self._operation = operation
         self._layout = layout
         self._last_link_message = ""
@@ -69,6 +72,7 @@ class EventPublisher:
                 "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
                 "layout": self.layout_event,
                 "plate": self._plate_event,
+                "inputs": inputs,
             },
             clock=clock.now,
         )

@@ -2,12 +2,16 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Literal
 
+from controller.api.schema import TouchInputStatus
+from controller.api.topics import InputsEvent
 from controller.daemon.config import TouchInput
-from controller.sources.touch import ALIGNED, TouchFrame
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from drivers import clock
 from drivers.pauses import Backoff
 from drivers.threads import in_thread
@@ -16,6 +20,7 @@ from registry.plugins import failure_text
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
+_WATCH_INTERVAL = 1.0  # s; in which the state of all inputs is looked at
 
 _logger = logging.getLogger(__name__)
 
@@ -25,19 +30,35 @@ class TouchInputs:
 
     deliver receives their frames in coordinates of the plate, each source name prefixed with the
     configured name; lift, that prefix: of a source that ends, fails or is cancelled. One that fails
-    is restarted after a growing pause.
+    is restarted after a growing pause. rejects: counter of all sources. changed: called when
+    `event` has changed.
     """
 
-    def __init__(self, deliver: Callable[[TouchFrame], None], lift: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        deliver: Callable[[TouchFrame], None],
+        lift: Callable[[str], None],
+        *,
+        rejects: RejectCounter,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
         self._deliver = deliver
         self._lift = lift
+        self._rejects = rejects
+        self._changed = changed
+        self._sources: dict[TouchInput, TouchSource | str | None] = {}
+        """Source of each input; the reason in words while it has no source; None at its end."""
         self._running: list[asyncio.Task[None]] = []
+        self.event = InputsEvent(inputs=[], rejected_touches={})
+        """State of all inputs and rejected touches, at most a second old."""
 
-    def start(self, inputs: Iterable[TouchInput]) -> None:
+    def start(self, inputs: Sequence[TouchInput]) -> None:
         """Run these sources until `close`."""
+        self._sources = dict.fromkeys(inputs, "being opened")
         self._running += [
             asyncio.create_task(self._run(each), name=f"touch {each.name}") for each in inputs
         ]
+        self._running.append(asyncio.create_task(self._watch(), name="touch inputs"))
 
     async def close(self) -> None:
         """Stop all sources; one of a plug-in that goes on is ended where it waits."""
@@ -71,15 +92,49 @@ class TouchInputs:
             try:
                 # A plug-in may block.
                 source = await in_thread(touch_input.make, name="touch source")
+                source.rejects = self._rejects
+                self._sources[touch_input] = source
                 await source.run(deliver)
             except Exception as error:
                 is_expected = isinstance(error, InputError | OSError)
                 text = str(error) if is_expected else failure_text(error)
                 _logger.error("touch source %s: failed, restarting: %s", touch_input.name, text)
+                self._look((touch_input, text))
             else:
                 _logger.info("touch source %s: finished", touch_input.name)
+                self._look((touch_input, None))
                 return
             finally:
                 self._lift(prefix)
             # A panel may be plugged in later, a port be released.
             await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
+
+    def _look(self, *changed: tuple[TouchInput, TouchSource | str | None]) -> None:
+        """Look at all inputs, of which some have changed."""
+        self._sources.update(changed)
+        statuses = [_status(*each) for each in self._sources.items()]
+        event = InputsEvent(inputs=statuses, rejected_touches=dict(self._rejects.counts))
+        if event != self.event:
+            self.event = event
+            self._changed()
+
+    async def _watch(self) -> None:
+        """Look at all inputs from time to time."""
+        while True:
+            await asyncio.sleep(_WATCH_INTERVAL)
+            self._look()
+
+
+def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
+    """Describe an input by its source, or by the reason for having no source."""
+    try:
+        problem = source.problem if isinstance(source, TouchSource) else source
+    except Exception as error:  # of a plug-in
+        problem = failure_text(error)
+    lacking: Literal["mute", "missing"] = "missing" if isinstance(source, str) else "mute"
+    return TouchInputStatus(
+        name=touch_input.name,
+        url=touch_input.url,
+        state="ended" if source is None else "open" if problem is None else lacking,
+        problem=problem,
+    )

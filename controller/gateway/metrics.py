@@ -82,11 +82,19 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
         if value is not None:
             yield _gauge(f"era_{name}", text, float(value))
     rejected = CounterMetricFamily(
-        "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
+        "era_rejected_touches",
+        "Rejected touches and messages of touch sources.",
+        labels=["reason"],
     )
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)
     yield rejected
+    inputs = GaugeMetricFamily(
+        "era_touch_input_open", "Whether touches can come from an input.", labels=["input"]
+    )
+    for each in status.inputs:
+        inputs.add_metric([each.name], float(each.state == "open"))
+    yield inputs
     yield _histogram(
         "era_touch_to_wire_seconds",
         "From a touch to the last byte of the command.",

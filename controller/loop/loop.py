@@ -96,7 +96,8 @@ class Controller:
         self._timing = timing
         self._drive_mode = drive_mode
         self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
-        self._rejects = RejectCounter(_logger)
+        self.rejects = RejectCounter(_logger)
+        """What of touches was rejected, at the sources and as contacts: the only such counter."""
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._changed_at = -math.inf  # s; of the last change, until all are decided
@@ -124,11 +125,6 @@ class Controller:
         if self._decider_if_open is not None:
             return self._decider_if_open.capabilities.drive_mode
         return self._drive_mode or DRIVE_MODES[-1]
-
-    @property
-    def rejected_touches(self) -> Mapping[str, int]:
-        """Number of touches that could not be contacts, by reason."""
-        return self._rejects.counts
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer touches by another table of this plate from now on, in one step.
@@ -296,7 +292,7 @@ class Controller:
             self._follow(change, frame.time)
         self._schedule_expiry()
         for reason in change.rejected:
-            self._rejects.count(reason, f"touch of {frame.source}")
+            self.rejects.count(reason, f"touch of {frame.source}")
 
     def lift(self, prefix: str) -> None:
         """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""

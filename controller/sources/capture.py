@@ -19,7 +19,7 @@ from model.errors import InputError
 from model.files.regular_file import regular_file
 
 HEADER = "# era-haptics TUIO capture 1"
-_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII)
+_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
 MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
 _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
@@ -40,12 +40,12 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[RecordedDatagram] = []
     for number, line in enumerate(lines[1:], start=2):
-        if line.startswith("#"):
+        if line.startswith("#") or not line.strip():
             continue
         match = _LINE.fullmatch(line)
         if match is None:
             raise InputError(
-                f"{path}, line {number}: must be seconds, a space and the datagram in lower-case "
+                f"{path}, line {number}: must be seconds, a space and the datagram in "
                 f"hexadecimal, got {line[:60]!r}"
             )
         datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
@@ -71,7 +71,7 @@ def _lines(path: Path) -> list[str]:
             raise InputError(
                 f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
             )
-        return content.decode("utf-8").replace("\r\n", "\n").removesuffix("\n").split("\n")
+        return content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "

@@ -73,6 +73,12 @@ def followed(known: float, reported: float | None) -> float:
     return bounded if change >= MIN_CHANGE else known
 
 
+RIM = 0.0065
+"""How far beyond the plate's edge [m] a finger counts as on it: a fingertip's radius.
+
+Where cameras and frames report a finger on the edge depends on noise and calibration.
+"""
+
 # s; most sources repeat their frames at least every 100 ms, others state their own timeout. A
 # contact that is not confirmed must not be driven.
 CONTACT_TIMEOUT = 0.150
@@ -146,9 +152,10 @@ class _Source:
 class ContactTracker:
     """The contacts on one plate. Deterministic: times are arguments.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejects touches that are off
-    the plate (outside 0..1), have non-finite coordinates or repeat an id within a frame (the last
-    one counts); a contact whose touch is rejected is lifted. Where the maximum number of contacts
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch at most `RIM` outside
+    the plate (0..1) is at its edge. Rejects touches that are farther off, have non-finite
+    coordinates or repeat an id within a frame (the last one counts); a contact whose touch is
+    rejected is lifted. Where the maximum number of contacts
     is reached, a contact of the input, origin or source with most is evicted if it has at least
     two more than that of the touch; else the touch is rejected.
     """
@@ -182,7 +189,7 @@ class ContactTracker:
         rejected: list[str] = []
         touches: dict[ContactKey, Touch] = {}
         if math.isfinite(frame.time):
-            touches = _valid_touches(frame, rejected)
+            touches = _valid_touches(frame, self._plate, rejected)
         elif frame.touches:
             rejected.append("no_time")
         if keeps_taps:
@@ -304,7 +311,7 @@ def _source_of(frame: TouchFrame) -> _Source:
     return _Source(frame.time, timeout, frame.time + timeout, origin)
 
 
-def _valid_touches(frame: TouchFrame, rejected: list[str]) -> dict[ContactKey, Touch]:
+def _valid_touches(frame: TouchFrame, plate: Plate, rejected: list[str]) -> dict[ContactKey, Touch]:
     """Return the touches that can be contacts; add a reason for each of the others."""
     last = {touch.id: touch for touch in frame.touches}
     rejected += ["twice"] * (len(frame.touches) - len(last))
@@ -312,8 +319,13 @@ def _valid_touches(frame: TouchFrame, rejected: list[str]) -> dict[ContactKey, T
     for touch in last.values():
         if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
             rejected.append("not_finite")
-        elif not (0 <= touch.x <= 1 and 0 <= touch.y <= 1):
-            rejected.append("off_plate")
-        else:
+        elif 0 <= touch.x <= 1 and 0 <= touch.y <= 1:
             valid[ContactKey(frame.source, touch.id)] = touch
+        else:
+            x, y = min(max(touch.x, 0.0), 1.0), min(max(touch.y, 0.0), 1.0)
+            beyond = math.hypot((touch.x - x) * plate.length, (touch.y - y) * plate.width)
+            if beyond > RIM:
+                rejected.append("off_plate")
+            else:
+                valid[ContactKey(frame.source, touch.id)] = replace(touch, x=x, y=y)
     return valid

@@ -8,10 +8,10 @@ import asyncio
 import contextlib
 import errno
 import fcntl
-import logging
 import math
 import os
 import struct
+import time
 from collections.abc import Callable, Iterator
 from urllib.parse import parse_qsl
 
@@ -21,10 +21,15 @@ from controller.sources.slots import (
     ABS_MT_PRESSURE,
     ABS_MT_SLOT,
     ABS_MT_TOUCH_MAJOR,
+    BTN_TOUCH,
+    SINGLE_TOUCH_AXES,
     SLOT_AXES,
+    TYPE_A,
+    InputEvent,
     Range,
     SlotReader,
     SlotState,
+    as_slot_event,
     light_press,
 )
 from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
@@ -35,6 +40,8 @@ _EVENT = struct.Struct("llHHi")  # struct input_event: time of two longs, type, 
 _AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fuzz, flat, resolution
 _INT = struct.Struct("i")
 _EVENTS_AT_ONCE = 64
+_KEYS = 0x300 // 8  # bytes of a set of keys, KEY_CNT bits
+_MAX_AGE = 1.0  # s; of an event, else its time is of another clock
 
 
 def _request(direction: int, number: int, size: int) -> int:
@@ -53,23 +60,23 @@ def eviocgmtslots(size: int) -> int:
 
 
 GRAB = _request(_WRITE, 0x90, _INT.size)  # EVIOCGRAB: exclusive access
+CLOCK = _request(_WRITE, 0xA0, _INT.size)  # EVIOCSCLOCKID: clock of the events
+PRESSED_KEYS = _request(_READ, 0x18, _KEYS)  # EVIOCGKEY
 
 
-def parse_events(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield type (EV_...), code and value of the complete events in data read from a device.
-
-    The kernel never splits one.
-    """
+def parse_events(data: bytes) -> Iterator[InputEvent]:
+    """Yield the complete events in data read from a device; the kernel never splits one."""
     whole = len(data) // _EVENT.size * _EVENT.size
-    for _, _, kind, code, value in _EVENT.iter_unpack(data[:whole]):
-        yield kind, code, value
+    for seconds, microseconds, kind, code, value in _EVENT.iter_unpack(data[:whole]):
+        yield seconds + 1e-6 * microseconds, kind, code, value
 
 
 class InputDevice:
     """An open panel at a path such as /dev/input/event5 or one under /dev/input/by-id.
 
-    grab: keep its touches from other programs, such as a desktop. Raises InputError if it cannot be
-    opened or is no panel of type B.
+    One for a single finger, which has no multi-touch axes, looks like one with a single slot. grab:
+    keep its touches from other programs, such as a desktop. Raises InputError if it cannot be
+    opened or is no panel.
     """
 
     def __init__(self, path: str, *, grab: bool = False) -> None:
@@ -79,12 +86,17 @@ class InputDevice:
         except OSError as error:
             raise InputError(f"touch source {path}: {_advice(error, path)}") from error
         try:
+            self._axis_codes: dict[int, int] = {}  # of axes with other codes than those of slots
+            if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # it does not have it
+                self._axis_codes = SINGLE_TOUCH_AXES
             self.ranges = {
                 axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
             }
             measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
             self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
-            self._slot_count = self._range(ABS_MT_SLOT)[1] + 1
+            self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
+            with contextlib.suppress(OSError):  # of an older kernel: see _MAX_AGE
+                fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
         except OSError as error:
@@ -95,8 +107,8 @@ class InputDevice:
                     f"(`sudo fuser -v {path}` names it)"
                 ) from error
             raise InputError(
-                f"touch source {path}: must be a touch panel that reports slots "
-                f"({error.strerror}); `libinput list-devices` or `evtest` list the devices"
+                f"touch source {path}: must be a touch panel ({error.strerror}); `libinput "
+                "list-devices` or `evtest` list the devices"
             ) from error
         except InputError:
             self.close()
@@ -112,11 +124,19 @@ class InputDevice:
         return self._axis(ABS_MT_SLOT)[0]
 
     def slots(self) -> dict[int, SlotState]:
-        """Return the state of every slot; raises OSError if the device is unplugged."""
+        """Return the state of every slot.
+
+        Raises OSError if the device is unplugged; EINVAL for one without slots, of type A.
+        """
+        if self._axis_codes:
+            keys = fcntl.ioctl(self._descriptor, PRESSED_KEYS, bytes(_KEYS))
+            is_down = keys[BTN_TOUCH // 8] >> BTN_TOUCH % 8 & 1
+            x, y, pressure = (self._axis(axis)[0] for axis in SINGLE_TOUCH_AXES)
+            return {0: SlotState(is_down - 1, x, y, pressure=pressure)}
         states = zip(*map(self._slot_values, SLOT_AXES), strict=True)
         return {slot: SlotState(*state) for slot, state in enumerate(states)}
 
-    def read(self) -> list[tuple[int, int, int]]:
+    def read(self) -> list[InputEvent]:
         """Return the pending events; raises OSError if the device is unplugged."""
         try:
             data = os.read(self._descriptor, _EVENT.size * _EVENTS_AT_ONCE)
@@ -124,15 +144,17 @@ class InputDevice:
             return []
         if not data:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
-        return list(parse_events(data))
+        events = parse_events(data)
+        return list(map(as_slot_event, events) if self._axis_codes else events)
 
     def close(self) -> None:
         """Close the device."""
         os.close(self._descriptor)
 
     def _axis(self, axis: int) -> tuple[int, int, int, int]:
-        """Return value, minimum, maximum and resolution of an axis."""
-        raw = fcntl.ioctl(self._descriptor, eviocgabs(axis), bytes(_AXIS.size))
+        """Return value, minimum, maximum and resolution of an axis; zeros if it has none."""
+        request = eviocgabs(self._axis_codes.get(axis, axis))
+        raw = fcntl.ioctl(self._descriptor, request, bytes(_AXIS.size))
         value, low, high, _, _, resolution = _AXIS.unpack(raw)
         return value, low, high, resolution
 
@@ -140,9 +162,11 @@ class InputDevice:
         """Return the range of an axis; raises InputError if it is empty."""
         _, low, high, _ = self._axis(axis)
         if low >= high:
+            code = self._axis_codes.get(axis, axis)
             raise InputError(
-                f"touch source {self.path}: minimum of axis {axis:#x} must be below its maximum, "
-                f"got {low} and {high}; choose a panel that reports slots (multi-touch type B)"
+                f"touch source {self.path}: minimum of axis {code:#x} must be below its maximum, "
+                f"got {low} and {high}; choose a multi-touch panel that reports slots (type B), or "
+                "a single-touch panel"
             )
         return low, high
 
@@ -169,12 +193,8 @@ def _advice(error: OSError, path: str) -> str:
 
 
 REPEAT_INTERVAL = 0.05  # s; a panel at rest is silent, but contacts time out without frames
-# Between attempts to reopen an unplugged panel [s], doubled each time.
-_FIRST_PAUSE, _MAX_PAUSE = 0.5, 5.0
 
 _LIGHT_PRESS = {"light_pressure": ABS_MT_PRESSURE, "light_major": ABS_MT_TOUCH_MAJOR}
-
-_logger = logging.getLogger(__name__)
 
 
 class EvdevSource(TouchSource):
@@ -183,8 +203,8 @@ class EvdevSource(TouchSource):
     `light_pressure=VALUE`, `light_major=VALUE`: of its axes under a finger that presses lightly.
 
     A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
-    detects an unplugged panel at once. It is reopened when it is back. Raises InputError for any
-    other URL, and in `run` if there is no panel.
+    detects an unplugged panel at once. Raises InputError for any other URL, and in `run` if there
+    is no panel, or none any more.
     """
 
     def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:
@@ -204,30 +224,17 @@ class EvdevSource(TouchSource):
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame per report until cancelled."""
         panel = self._open(self._path, grab=self._grab)
-        while True:
-            try:
-                await self._follow(panel, deliver)
-            except OSError as error:
-                if error.errno != errno.ENODEV:
-                    raise
-                self._deliver(deliver, ())
-                _logger.warning("%s: unplugged, lifting its touches", self._name)
-            finally:
-                panel.close()
-            panel = await self._reopened()
-            _logger.warning("%s: reconnected", self._name)
-
-    async def _reopened(self) -> InputDevice:
-        """Open the panel as soon as it is plugged in again."""
-        pause = _FIRST_PAUSE
-        while True:
-            await asyncio.sleep(pause)
-            with contextlib.suppress(InputError):
-                return self._open(self._path, grab=self._grab)
-            pause = min(2 * pause, _MAX_PAUSE)
+        try:
+            await self._follow(panel, deliver)
+        except OSError as error:
+            lost = f"lost ({error.strerror}); plug it in again"
+            reason = TYPE_A if error.errno == errno.EINVAL else lost
+            raise InputError(f"touch source {self._path}: {reason}") from error
+        finally:
+            panel.close()
 
     async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver the frames of a panel until it is unplugged; raises OSError then."""
+        """Deliver frames at the kernel's times; raises OSError if the panel is unplugged."""
         loop = asyncio.get_running_loop()
         press = light_press(panel.resolutions, self._light_values)
         reader = SlotReader(panel.ranges, light_press=press)
@@ -245,21 +252,29 @@ class EvdevSource(TouchSource):
                     self._deliver(deliver, reader.touches)
                     continue
                 readable.clear()
-                for event in panel.read():
+                for happened, *event in panel.read():
                     report = reader.feed(*event)
                     if report is None:
                         continue
                     if report.is_partial:
                         reader.resynchronise(panel.slots(), current=panel.current_slot)
-                        self._deliver(deliver, reader.touches)
+                        self._deliver(deliver, reader.touches, happened)
                     else:
                         for touches in report.states:
-                            self._deliver(deliver, touches)
+                            self._deliver(deliver, touches, happened)
         finally:
             loop.remove_reader(panel.fileno())
 
-    def _deliver(self, deliver: Callable[[TouchFrame], None], touches: tuple[Touch, ...]) -> None:
-        deliver(TouchFrame(self._name, asyncio.get_running_loop().time(), touches))
+    def _deliver(
+        self,
+        deliver: Callable[[TouchFrame], None],
+        touches: tuple[Touch, ...],
+        happened: float = -math.inf,
+    ) -> None:
+        """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
+        now = asyncio.get_running_loop().time()
+        time = happened if now - _MAX_AGE <= happened <= now else now
+        deliver(TouchFrame(self._name, time, touches))
 
 
 def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:

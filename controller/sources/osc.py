@@ -1,39 +1,46 @@
-"""Open Sound Control messages from untrusted datagrams: flat bundles, texts and numbers.
+"""Open Sound Control messages from untrusted datagrams: bundles, texts and numbers of any type.
 
 See the Open Sound Control 1.0 Specification (opensoundcontrol.stanford.edu/spec-1_0.html).
 """
 
 import re
 import struct
+from collections.abc import Iterator
 from functools import lru_cache
+from typing import TypeAlias
+
+Argument: TypeAlias = str | int | float | None
+"""Argument of a message; None for a blob, and for true, false, nil and impulse."""
 
 _BUNDLE = b"#bundle\0"
 _BUNDLE_HEADER = len(_BUNDLE) + 8  # the time tag is ignored: touches are current
-_RUNS = re.compile(rb"s|[if]+")
+_MAX_DEPTH = 8  # of bundles in bundles
+_ADDRESS = re.compile(rb"/[!-~]*")
+_RUNS = re.compile(rb"[sS]|b|[TFNI]+|[ifdhtcrm]+")
+_CODES = bytes.maketrans(b"htcrm", b"qQiII")  # of struct, which has those of i, f and d
 
 
 class OscError(ValueError):
-    """A datagram that is no OSC message or flat bundle of messages."""
+    """A message that cannot be read."""
 
 
-def osc_messages(datagram: bytes, *, address: str) -> list[tuple[str | int | float, ...]]:
-    """Return the arguments of every message to an address, in order.
+def osc_messages(datagram: bytes, *, depth: int = _MAX_DEPTH) -> Iterator[bytes]:
+    """Yield the encoded messages of a datagram in order, for `read_message`.
 
-    Arguments may be string, int32 and float32; messages to other addresses are skipped. Raises
-    OscError for a datagram that must be ignored as a whole.
+    What is neither a message nor a bundle is yielded, too; what follows an element whose size
+    exceeds its bundle is one such element. depth: how many bundles may enclose a message.
     """
-    expected = _padded(address)
-    return [
-        _arguments(element, len(expected))
-        for element in _elements(datagram)
-        if element.startswith(expected)
-    ]
-
-
-def _padded(text: str) -> bytes:
-    """Encode an OSC string: zero-terminated, padded to a multiple of four bytes."""
-    raw = text.encode()
-    return raw.ljust(_padded_length(len(raw)), b"\0")
+    if len(datagram) < _BUNDLE_HEADER or not datagram.startswith(_BUNDLE) or not depth:
+        yield datagram
+        return
+    offset = _BUNDLE_HEADER
+    while offset < len(datagram):
+        size = int.from_bytes(datagram[offset : offset + 4], "big", signed=True)
+        if not 0 < size <= len(datagram) - offset - 4:
+            yield datagram[offset:]
+            return
+        yield from osc_messages(datagram[offset + 4 : offset + 4 + size], depth=depth - 1)
+        offset += 4 + size
 
 
 def _padded_length(length: int) -> int:
@@ -41,49 +48,39 @@ def _padded_length(length: int) -> int:
     return length + 4 - length % 4
 
 
-def _elements(datagram: bytes) -> list[bytes]:
-    """Split a datagram into encoded messages."""
-    if not datagram.startswith(_BUNDLE):
-        elements = [datagram]
-    elif len(datagram) < _BUNDLE_HEADER:
-        raise OscError("bundle must have a complete header")
-    else:
-        elements = []
-        offset = _BUNDLE_HEADER
-        while offset < len(datagram):
-            size = int.from_bytes(datagram[offset : offset + 4], "big", signed=True)
-            offset += 4
-            if not 0 < size <= len(datagram) - offset:
-                raise OscError(f"size of a bundle element must fit its bundle, got {size}")
-            elements.append(datagram[offset : offset + size])
-            offset += size
-    for element in elements:
-        if not element.startswith(b"/"):
-            raise OscError("element must be an OSC message")
-    return elements
-
-
 # Most messages of a panel repeat: its name, the contacts that are alive, resting fingers.
 @lru_cache(maxsize=256)
-def _arguments(message: bytes, offset: int) -> tuple[str | int | float, ...]:
-    """Decode the arguments of a message whose type tags start at an offset."""
-    end = message.find(b"\0", offset)
-    tags = message[offset:end] if end > 0 else b""
-    if not tags.startswith(b",") or tags.strip(b"ifs") != b",":
-        raise OscError(f"argument types must be ',' and letters i, f, s, got {tags[:32]!r}")
-    arguments: list[str | int | float] = []
-    at = offset + _padded_length(len(tags))
+def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
+    """Return the address and the arguments of an encoded message; raises OscError.
+
+    Bytes of a text that are not UTF-8 are written as \\xNN.
+    """
+    address = message.partition(b"\0")[0]
+    at = _padded_length(len(address))
+    tags = message[at:].partition(b"\0")[0]
+    runs = _RUNS.findall(tags)
+    if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
+        raise OscError(f"element must be a message with argument types, got {message[:24]!r}")
+    if b"".join(runs) != tags.translate(None, b",[]"):
+        raise OscError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
+    arguments: list[Argument] = []
+    at += _padded_length(len(tags))
     try:
-        for run in _RUNS.findall(tags):  # numbers that follow each other at once
-            if run == b"s":
+        for run in runs:  # numbers that follow each other at once
+            if run in (b"s", b"S"):
                 end = message.index(b"\0", at)
-                arguments.append(message[at:end].decode())
+                arguments.append(message[at:end].decode(errors="backslashreplace"))
                 at += _padded_length(end - at)
+            elif run == b"b":
+                (size,) = struct.unpack_from(">I", message, at)
+                arguments.append(None)
+                at += 4 + (size + 3) // 4 * 4
+            elif run[0] in b"TFNI":
+                arguments += [None] * len(run)
             else:
-                arguments += struct.unpack_from(b">" + run, message, at)
-                at += 4 * len(run)
+                layout = ">" + run.translate(_CODES).decode()
+                arguments += struct.unpack_from(layout, message, at)
+                at += struct.calcsize(layout)
     except (struct.error, ValueError) as error:
         raise OscError(f"invalid message: {error}") from error
-    if at > len(message):
-        raise OscError("message must have all zeros after its last text")
-    return tuple(arguments)
+    return address.decode(), tuple(arguments)

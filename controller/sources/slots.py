@@ -1,7 +1,8 @@
 """Multi-touch protocol type B: the contacts in the slots of a Linux touch panel.
 
-Events are described in the Linux kernel's Documentation/input/multi-touch-protocol.rst; the
-numbers are those of its input-event-codes.h.
+A panel for a single finger is one with a single slot, see `as_slot_event`. Events are described in
+the Linux kernel's Documentation/input/multi-touch-protocol.rst; the numbers are those of its
+input-event-codes.h.
 """
 
 from collections.abc import Mapping
@@ -10,21 +11,43 @@ from typing import TypeAlias
 
 from controller.sources.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from controller.sources.touch import Touch
+from model.errors import InputError
 
-EV_SYN, EV_ABS = 0x00, 0x03
+TYPE_A = (
+    "multi-touch protocol must be type B (slots), got type A, which does not say which contact is "
+    "which; use another panel or driver, or a program that sends its touches as TUIO"
+)
+"""Why a panel is refused."""
+
+EV_SYN, EV_KEY, EV_ABS = 0x00, 0x01, 0x03
 SYN_REPORT, SYN_MT_REPORT, SYN_DROPPED = 0, 2, 3
+ABS_X, ABS_Y, ABS_PRESSURE, BTN_TOUCH = 0x00, 0x01, 0x18, 0x14A
 ABS_MT_SLOT, ABS_MT_POSITION_X, ABS_MT_POSITION_Y, ABS_MT_TRACKING_ID = 0x2F, 0x35, 0x36, 0x39
 ABS_MT_TOUCH_MAJOR, ABS_MT_TOOL_TYPE, ABS_MT_PRESSURE, ABS_MT_DISTANCE = 0x30, 0x37, 0x3A, 0x3B
 MT_TOOL_FINGER = 0  # others are a pen, a palm, a dial
 
 Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
+InputEvent: TypeAlias = tuple[float, int, int, int]
+"""An event of a panel: the kernel's time [s], type (EV_...), code and value."""
 
+SINGLE_TOUCH_AXES = {
+    ABS_MT_POSITION_X: ABS_X,
+    ABS_MT_POSITION_Y: ABS_Y,
+    ABS_MT_PRESSURE: ABS_PRESSURE,
+}
+"""Axes of a slot, and those in their place of a panel for a single finger."""
+
+_OF_ONE_FINGER = {(EV_ABS, single): (EV_ABS, axis) for axis, single in SINGLE_TOUCH_AXES.items()}
+_OF_ONE_FINGER[EV_KEY, BTN_TOUCH] = (EV_ABS, ABS_MT_TRACKING_ID)
 
 _GRAVITY = 9.81  # m/s²
 
 
-class EventError(ValueError):
-    """An invalid event of a type B panel."""
+def as_slot_event(event: InputEvent) -> InputEvent:
+    """Return an event of a panel for a single finger as that of the only slot of another."""
+    time, kind, code, value = event
+    id_or_value = value - 1 if kind == EV_KEY else value  # pressed is 1, released 0
+    return (time, *_OF_ONE_FINGER.get((kind, code), (kind, code)), id_or_value)
 
 
 @dataclass(frozen=True)
@@ -95,22 +118,23 @@ class SlotReader:
 
     @property
     def touches(self) -> tuple[Touch, ...]:
-        """All touches, by slot."""
-        touches = (self._touch(slot) for _, slot in sorted(self._slots.items()))
-        return tuple(touch for touch in touches if touch is not None)
+        """All touches, by slot; of two with one tracking id the second has an id of its slot."""
+        touches: dict[int, Touch] = {}
+        for number, slot in sorted(self._slots.items()):
+            if (touch := self._touch(slot)) is not None:
+                id = touch.id if touch.id not in touches else -1 - number
+                touches[id] = touch if id == touch.id else replace(touch, id=id)
+        return tuple(touches.values())
 
     def feed(self, kind: int, code: int, value: int) -> Report | None:
         """Process one event (EV_..., code and value); return the report that it completes, or None.
 
-        Raises EventError for events of type A and negative slots.
+        Slots that are negative are ignored. Raises InputError for type A.
         """
         if kind == EV_ABS:
             self._feed_axis(code, value)
         elif kind == EV_SYN and code == SYN_MT_REPORT:
-            raise EventError(
-                "multi-touch protocol must be type B (slots), got type A (SYN_MT_REPORT); use "
-                "another panel"
-            )
+            raise InputError(TYPE_A)
         elif kind == EV_SYN and code == SYN_DROPPED:
             self._dropped = True
         elif kind == EV_SYN and code == SYN_REPORT:
@@ -133,10 +157,8 @@ class SlotReader:
     def _feed_axis(self, code: int, value: int) -> None:
         """Process one EV_ABS event."""
         if code == ABS_MT_SLOT:
-            if value < 0:
-                raise EventError(f"slot must not be negative, got {value}")
             self._current = value
-        elif code in SLOT_AXES:
+        elif code in SLOT_AXES and self._current >= 0:
             if code == ABS_MT_TRACKING_ID:
                 if self._current in self._changed and not self._dropped:
                     self._pending.append(self.touches)

@@ -4,13 +4,16 @@ A calibration is an affine map from coordinates of a sensor to those of the plat
 c, y' = d x + e y + f on coordinates 0..1 from the top left corner.
 """
 
+import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 from urllib.parse import parse_qsl
 
+from controller.sources.reject_counter import RejectCounter
 from model.errors import InputError
 from model.structure.plate import Plate
 from registry.plugins import PluginRegistry
@@ -53,11 +56,22 @@ class TouchSource(ABC):
     A source that cannot repeat them states a longer timeout in its frames.
     """
 
+    @cached_property
+    def rejects(self) -> RejectCounter:
+        """Counter of malformed input; a daemon sets its own, before `run`."""
+        return RejectCounter(logging.getLogger(__name__))
+
+    @property
+    def problem(self) -> str | None:
+        """Why no touches come although it runs, and what to do; None if they may."""
+        return None
+
     @abstractmethod
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver frames until cancelled or, for a recording, until its end.
 
-        Malformed input must be counted and logged, not raised.
+        Malformed input must be counted in `rejects`, not raised; that it cannot be opened, or is
+        lost, is raised as InputError.
         """
 
 

@@ -2,30 +2,37 @@
 
 A bundle has the name of its sender (source), the session ids that are down (alive), the positions
 of those that changed (set) and a sequence number (fseq); see tuio.org, "TUIO 1.1 Protocol
-Specification". A bundle with any malformed message is ignored as a whole.
+Specification". Numbers count by their value, whatever their type; what follows the arguments that
+are needed is ignored. A malformed message is counted, and the others of its bundle are read.
 """
 
 import asyncio
-import logging
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import Datagram, Peer, listen
-from controller.sources.osc import OscError, osc_messages
+from controller.sources.osc import Argument, OscError, osc_messages, read_message
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
+from drivers import clock
 from model.errors import InputError
 
 ADDRESS = "/tuio/2Dcur"
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 3333  # registered for TUIO
 
-# Room for some 140 cursors; senders keep below 4 KiB so that a datagram is not fragmented.
-_MAX_DATAGRAM = 8 * 1024
-_MAX_NAME = 100
+# What is not served, of TUIO 1.1 and 2.0; a custom profile is another address.
+_PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
+_IDLE_ADDRESSES = ("/tuio2/frm", "/tuio2/alv")  # without a position
+
+_MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
+_MAX_MESSAGES = 256  # of a datagram: some 4 ms, and ten times as many cursors as there are contacts
+_MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
 # Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
@@ -36,42 +43,59 @@ _LATE_SECONDS = 0.5
 # message once a second.
 DEFAULT_TIMEOUT = 3.0  # s
 
-_logger = logging.getLogger(__name__)
+MUTE_AFTER = 10.0
+"""Time [s] without cursors after which a sender that should be heard is mute."""
+
+_MIN_REPEATS = 20  # frames without cursors in a row, of a sender that repeats itself at rest
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Bundle:
-    """The messages of one bundle; None where missing."""
+    """The messages of one bundle; None where missing.
+
+    malformed: why messages were refused; others: addresses that are not served, and whether they
+    had touches.
+    """
 
     source: str | None = None
     alive: tuple[int, ...] | None = None
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     sequence: int | None = None
+    malformed: list[str] = field(default_factory=list)
+    others: dict[str, bool] = field(default_factory=dict)
 
 
 @dataclass
 class _Sender:
-    """The state of one sender; peer: the host and port that it was last heard from."""
+    """The state of one sender; peer, former: host and port of it, and before.
+
+    alive: None until stated; resting: frames in a row without cursors.
+    """
 
     last_heard: float
     peer: Peer
+    former: Peer | None = None
     sequence: int = 0
     sequence_time: float = -math.inf  # when that sequence number arrived
-    alive: tuple[int, ...] = ()
+    alive: tuple[int, ...] | None = None
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+    resting: int = 0
 
 
 class TuioReader:
     """Decoder of datagrams into touch frames, without I/O; times are arguments.
 
     Senders are distinguished by the name in their source message and their host, or without a name
-    by host and port; where there are too many, a sender of the busiest peer is dropped. Every
-    bundle with cursors or an alive message confirms all contacts of its sender for the timeout [s].
-    Never raises: unusable datagrams are counted in `rejects`.
+    by host and port, as are programs that send under one name by turns; where there are too many,
+    a sender of the busiest peer is dropped. Every bundle with cursors or an alive message confirms
+    all contacts of its sender for the timeout [s]. Of a sender that never states what is alive,
+    that is what a bundle sets. Never raises: what is not used is counted in `rejects`.
     """
 
     def __init__(self, rejects: RejectCounter, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         self.rejects = rejects
+        self.others: set[str] = set()
+        """Profiles that have come and are not served."""
         self._timeout = timeout
         self._senders: dict[str, _Sender] = {}
 
@@ -80,32 +104,74 @@ class TuioReader:
 
         A cursor that is alive but was never set is omitted; positions may be NaN.
         """
-        if len(datagram) > _MAX_DATAGRAM:
-            self.rejects.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
+        bundle = _read_bundle(datagram)
+        self._count(bundle, f"{peer[0]}:{peer[1]}")
+        if bundle.alive is None and not bundle.positions:
             return None
-        try:
-            bundle = _read_bundle(datagram)
-        except OscError as error:
-            self.rejects.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
-            return None
-        if bundle == _Bundle(source=bundle.source):
-            return None  # another TUIO profile, or an empty bundle
-        name = f"tuio:{peer[0]}:{peer[1]}"
-        if bundle.source is not None:
-            name = f"tuio:{peer[0]}/{bundle.source}"
+        name = self._name(bundle, peer, now)
         sender = self._sender(name, peer, now)
         if sender is None or not self._accept_sequence(bundle.sequence, sender, name, now=now):
             return None
-        for x, y in bundle.positions.values():
-            if not (math.isfinite(x) and math.isfinite(y)):
-                self.rejects.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
+        if sender.peer != peer:
+            sender.former = sender.peer
         sender.last_heard, sender.peer = now, peer
         if bundle.alive is not None:
             sender.alive = tuple(dict.fromkeys(bundle.alive))
         known = sender.positions | bundle.positions
-        sender.positions = {id: known[id] for id in sender.alive if id in known}
+        alive = tuple(bundle.positions) if sender.alive is None else sender.alive
+        sender.positions = {id: known[id] for id in alive if id in known}
+        sender.resting = 0 if alive else sender.resting + 1
         touches = tuple(Touch(id, x, y) for id, (x, y) in sender.positions.items())
         return TouchFrame(name, now, touches, self._timeout, origin=f"tuio:{peer[0]}:{peer[1]}")
+
+    def is_mute(self, *, since: float, now: float) -> bool:
+        """Whether nothing was read since a time [s] though it should have been.
+
+        Nothing at all; or nothing more of a sender that has repeated itself without cursors.
+        """
+        if not self._senders:
+            return now - since >= MUTE_AFTER
+        last = max(self._senders.values(), key=lambda sender: sender.last_heard)
+        return last.resting >= _MIN_REPEATS and now - last.last_heard >= MUTE_AFTER
+
+    def _count(self, bundle: _Bundle, place: str) -> None:
+        """Count what of a bundle from a place is not used: other profiles, malformed messages."""
+        for address, has_touches in bundle.others.items():
+            profile = _PROFILE.match(address)
+            if profile:
+                self.others.add(profile[0])
+            if has_touches:
+                self.rejects.count(
+                    f"profile_{profile[1]}" if profile else "other_address",
+                    f"{address:.80} of {place} arrives, {ADDRESS} is served",
+                )
+        for problem in bundle.malformed:
+            self.rejects.count("malformed", f"message from {place}: {problem}")
+
+    def _name(self, bundle: _Bundle, peer: Peer, now: float) -> str:
+        """Return the name of a sender: of host and source, with the port where that is not unique.
+
+        A name that comes from another port is that of a program that was restarted, or that takes
+        another port for each datagram and goes on counting its frames. It is that of a second
+        program if its frames do not follow those that came just before, or the former port is
+        heard again.
+        """
+        own = f"tuio:{peer[0]}:{peer[1]}"
+        if bundle.source is None:
+            return own
+        shared, own = f"tuio:{peer[0]}/{bundle.source}", f"{own}/{bundle.source}"
+        if own in self._senders:
+            return own
+        known = self._senders.get(shared)
+        if known is None or known.peer == peer:
+            return shared
+        sequence = -1 if bundle.sequence is None else bundle.sequence
+        follows = sequence < 0 or 0 < sequence - known.sequence <= _LATE_FRAMES
+        if known.former != peer and (follows or now - known.last_heard >= _LATE_SECONDS):
+            return shared
+        ports = f"ports {known.peer[1]} and {peer[1]}"
+        self.rejects.count("same_name", f"{shared} comes from {ports}; rename one of the programs")
+        return own
 
     def _sender(self, name: str, peer: Peer, now: float) -> _Sender | None:
         """Return the state of a sender, a new one if it is unknown, None if there are too many."""
@@ -152,30 +218,51 @@ class TuioReader:
             if behind <= _LATE_FRAMES and now - sender.sequence_time < _LATE_SECONDS:
                 self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
                 return False
-            sender.alive, sender.positions = (), {}  # a restarted sender
+            sender.alive, sender.positions = None, {}  # a restarted sender
         sender.sequence, sender.sequence_time = sequence, now
         return True
 
 
 def _read_bundle(datagram: bytes) -> _Bundle:
-    """Read the cursor messages of a datagram; raises OscError."""
-    source: str | None = None
-    alive: tuple[int, ...] | None = None
-    positions: dict[int, tuple[float, float]] = {}
-    sequence: int | None = None
-    for arguments in osc_messages(datagram, address=ADDRESS):
-        match arguments:
-            case ("source", str(name)) if len(name) <= _MAX_NAME:
-                source = name
-            case ("alive", *ids) if all(isinstance(id, int) for id in ids):
-                alive = tuple(int(id) for id in ids)
-            case ("set", int(id), float(x), float(y), float(), float(), float()):
-                positions[id] = (x, y)
-            case ("fseq", int(number)):
-                sequence = number
-            case _:
-                raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
-    return _Bundle(source, alive, positions, sequence)
+    """Read the messages of a datagram."""
+    bundle = _Bundle()
+    messages = list(islice(osc_messages(datagram), _MAX_MESSAGES + 1))
+    if len(messages) > _MAX_MESSAGES:
+        bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
+    for message in messages[:_MAX_MESSAGES]:
+        try:
+            address, arguments = read_message(message)
+            if address == ADDRESS:
+                _read_cursors(bundle, arguments)
+            else:
+                is_idle = arguments[:1] in (("source",), ("fseq",)) or arguments == ("alive",)
+                is_idle |= address in _IDLE_ADDRESSES
+                bundle.others[address] = not is_idle or bundle.others.get(address, False)
+        except OscError as error:
+            bundle.malformed.append(str(error))
+    return bundle
+
+
+def _read_cursors(bundle: _Bundle, arguments: tuple[Argument, ...]) -> None:
+    """Add a message of cursors to a bundle; raises OscError."""
+    match arguments:
+        case ("source", str(name), *_):
+            bundle.source = name[:_MAX_NAME]
+        case ("alive", *ids):
+            bundle.alive = tuple(map(_whole, ids))
+        case ("set", id, int(x) | float(x), int(y) | float(y), *_):
+            bundle.positions[_whole(id)] = (float(x), float(y))
+        case ("fseq", number, *_):
+            bundle.sequence = _whole(number)
+        case _:
+            raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
+
+
+def _whole(value: Argument) -> int:
+    """Return the value of a whole number of any type; raises OscError."""
+    if not isinstance(value, int | float) or value % 1 != 0:  # NaN and infinity are not
+        raise OscError(f"session ids and frame numbers must be whole, got {value!r:.40}")
+    return int(value)
 
 
 def without_superseded(waiting: Sequence[Datagram]) -> list[Datagram]:
@@ -203,12 +290,7 @@ def _source_name(datagram: bytes) -> bytes:
 
 def _is_complete_bundle(datagram: bytes) -> bool:
     """Whether a bundle has all cursors that are alive, with their positions."""
-    if len(datagram) > _MAX_DATAGRAM:
-        return False
-    try:
-        bundle = _read_bundle(datagram)
-    except OscError:
-        return False
+    bundle = _read_bundle(datagram)
     return bundle.alive is not None and set(bundle.alive) <= bundle.positions.keys()
 
 
@@ -223,12 +305,25 @@ class TuioSource(TouchSource):
     def __init__(self, url: str) -> None:
         address, _, options = url.partition("?")
         self.host, self.port = _host_and_port(address)
-        self.rejects = RejectCounter(_logger)
         self._url = url
         self._reader = TuioReader(self.rejects, timeout=_timeout(url, options))
+        self._opened = math.inf  # s; when the port was bound
+
+    @property
+    def problem(self) -> str | None:
+        """Why no cursors come although the port is bound, and what to do."""
+        if not self._reader.is_mute(since=self._opened, now=clock.now()):
+            return None
+        others = ", ".join(sorted(self._reader.others))
+        return (
+            f"no {ADDRESS} on UDP {self.host}:{self.port} for {MUTE_AFTER:g} s"
+            f"{f' ({others} arrives instead)' if others else ''}; start the sender, and let it "
+            "send TUIO 1.1 cursors to this address"
+        )
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame per bundle until cancelled."""
+        self._reader.rejects = self.rejects
 
         def received(datagram: bytes, peer: Peer, arrived: float) -> None:
             frame = self._reader.read(datagram, peer, now=arrived)
@@ -246,8 +341,10 @@ class TuioSource(TouchSource):
         except OSError as error:
             raise InputError(
                 f"touch source {self._url}: cannot bind UDP {self.host}:{self.port} "
-                f"({error.strerror}); stop the program that uses it, or choose another port"
+                f"({error.strerror}); stop the program that uses it, or choose another port or "
+                "address of this machine"
             ) from error
+        self._opened = clock.now()
         try:
             await asyncio.get_running_loop().create_future()
         finally:

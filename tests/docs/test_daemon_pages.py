@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from controller.api.schema import headline
+from controller.api.schema import TouchInputStatus, headline
 from controller.api.topics import StateEvent
 from controller.daemon.api_views import learning_summary
 from controller.daemon.config_sections import (
@@ -72,9 +72,9 @@ async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:
         "predicted_level_db_sl": 20.0,
     }
     learning = learning_summary(LearningStatus(last_at=1.0), status.latency_ms, now=2.0)
-    touched = status.model_copy(
-        update={**playing, "rejected_touches": {"off_plate": 1}, "learning": learning}
-    )
+    panel = TouchInputStatus(name="panel", url="tuio:", state="open")
+    touches = {"rejected_touches": {"off_plate": 1}, "inputs": [panel]}
+    touched = status.model_copy(update={**playing, **touches, "learning": learning})
     served = []
     for family in text_string_to_metric_families(exposition(touched).decode()):
         name = family.name + ("_total" if family.type == "counter" else "")

@@ -23,6 +23,8 @@ EVEN = {"parity": "E", "stop": 1}
             *("/dev/ttyS1", 9, {"baud": 19_200, "parity": "N", "stop": 2}),
         ),
         (f"{RTU}:///dev/ttyS1", "/dev/ttyS1", 1, {"baud": 115_200, **EVEN}),
+        ("serial:///dev/by-id/a_#1-if00?baud=9600", "/dev/by-id/a_#1-if00", 1, {"baud": 9600}),
+        (f"{RTU}:///dev/by-id/a_#1-if00?stop=2#9", "/dev/by-id/a_#1-if00", 9, {"stop": 2}),
         (f"{TCP}://gw/3?baud=9600", "gw:502", 3, {"baud": 9600, **EVEN}),
         (f"{RTU}://srv:4001#2", "srv:4001", 2, {"baud": 0}),
         ("can+slcan:///dev/ttyACM0", "can+slcan:///dev/ttyACM0", 1, {"bitrate": 500_000}),

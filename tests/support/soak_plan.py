@@ -256,7 +256,7 @@ def _malformed(
         case 0:
             touches = ((number, math.nan, 0.5),)
         case 1:
-            touches = ((number, rng.choice((-0.1, 1.01, math.inf)), 0.5),)
+            touches = ((number, rng.choice((-0.1, 1.1, math.inf)), 0.5),)
         case 2:
             touches = (*touches, *touches)
         case 3:

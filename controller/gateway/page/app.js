@@ -6,7 +6,7 @@ import { Fingers } from "./fingers.js";
 import { fixed, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, timeOfDay } from "./side.js";
 
-const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate"];
+const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate", "inputs"];
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
@@ -137,7 +137,7 @@ function showUnknown(cause) {
   overlay.show({ contacts: [], layers: {} });
   showLayers();
   fieldView.clear();
-  at("summary").textContent = "";
+  at("summary").textContent = at("inputs").textContent = "";
   showAmplifiers(at("amplifiers"), null, []);
   linkLoss = null;
 }
@@ -248,6 +248,12 @@ const HANDLERS = {
     at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
     at("known").classList.toggle("bad", isBad);
     if (isBad || state === "explaining" || isAlarm) addEvent(log, "warning", cause, remedy);
+  },
+  inputs({ inputs, rejected_touches }) {
+    const lacking = inputs.filter(({ problem }) => problem);
+    at("inputs").textContent = lacking.map(({ name, state, problem }) => `Touch ${name}: ${state}: ${problem}`).join(" · ");
+    const counts = Object.entries(rejected_touches).map(([reason, count]) => `${reason.replaceAll("_", " ")} ${count}`);
+    at("rejected").textContent = counts.length ? `Rejected touches: ${counts.join(", ")}` : "";
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

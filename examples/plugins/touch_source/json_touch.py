@@ -6,12 +6,10 @@ finger is down, and sends [] when the last one lifts; after 150 ms without one a
 
 import asyncio
 import json
-import logging
 from collections.abc import Callable
 
 from era_haptics.plugins.touch_sources import (
     InputError,
-    RejectCounter,
     Touch,
     TouchFrame,
     TouchSource,
@@ -29,7 +27,6 @@ class JsonTouch(TouchSource):
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
             raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
-        self.rejects = RejectCounter(logging.getLogger(__name__))  # logs once a second
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame for each datagram until cancelled; malformed ones are counted."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import math
 import random
 import socket
@@ -12,16 +13,20 @@ from pathlib import Path
 
 import pytest
 
+from controller.api.topics import InputsEvent
+from controller.cli.shown import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.touch_inputs import TouchInputs
+from controller.gateway.metrics import exposition
 from controller.sources.contacts import Change
+from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource, turned
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from drivers import clock
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
-from tuio_messages import free_port, panel
+from tuio_messages import bundle, free_port, message, panel
 from virtual_loop import in_virtual_time
 from witness_config import tell_first
 
@@ -78,6 +83,11 @@ class Panel(TouchSource):
     error: Exception | None = None
     ended: list[str] = field(default_factory=list)
 
+    @property
+    def problem(self) -> str | None:
+        """Fail, for one of the panels."""
+        return None if self.name != "z" else str(1 / 0)
+
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame, of a touch that is and one that is none."""
         deliver(TouchFrame(self.name, 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
@@ -87,6 +97,14 @@ class Panel(TouchSource):
             await asyncio.Event().wait()
         finally:
             self.ended.append(self.name)
+
+
+def touch_inputs(
+    deliver: Callable[[TouchFrame], None] = lambda frame: None,
+    lift: Callable[[str], None] = lambda prefix: None,
+) -> TouchInputs:
+    """Inputs without a daemon."""
+    return TouchInputs(deliver, lift, rejects=RejectCounter(logging.getLogger("test")))
 
 
 async def test_inputs_run_beside_each_other(
@@ -102,9 +120,10 @@ async def test_inputs_run_beside_each_other(
         "c:": Panel("z"),
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
+    monkeypatch.setattr("controller.daemon.touch_inputs._WATCH_INTERVAL", 0.01)
     frames: list[TouchFrame] = []
     lifted: list[str] = []
-    inputs = TouchInputs(frames.append, lifted.append)
+    inputs = touch_inputs(frames.append, lifted.append)
     one, two, three = (
         TouchInput(name, url, turned(180))
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
@@ -118,6 +137,8 @@ async def test_inputs_run_beside_each_other(
         assert (frame.touches[1].id, math.isnan(frame.touches[1].x)) == (5, True)
     assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
     assert lifted == ["right:"]
+    states = ["open", "missing", "mute"]
+    await until(lambda: [each.state for each in inputs.event.inputs] == states)
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
     assert sorted(lifted[1:]) == ["left:", "table:"]
@@ -142,7 +163,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
-        LEFT.append(TouchInputs(lambda frame: None, lambda prefix: None))
+        LEFT.append(touch_inputs())
         LEFT[0].start([TouchInput("left", "a:", TouchCalibration())])
         await started.wait()
         await LEFT[0].close()
@@ -176,13 +197,15 @@ async def test_failed_input_is_restarted_after_growing_pauses(
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
     monkeypatch.setattr("controller.daemon.touch_inputs.asyncio.sleep", pause)
-    inputs = TouchInputs(lambda frame: None, lambda prefix: None)
+    monkeypatch.setattr("controller.daemon.touch_inputs._WATCH_INTERVAL", 0.5)
+    inputs = touch_inputs()
     inputs.start([TouchInput("left", "a:", TouchCalibration())])
     while len(runs) < 3:
         await sleep(0.001)
     failed = "touch source left: failed, restarting: "
     assert caplog.messages == [f"{failed}not plugged in", f"{failed}gone"]
-    assert (len(runs), paused) == (3, [1.0, 2.0])
+    assert (len(runs), [each for each in paused if each != 0.5]) == (3, [1.0, 2.0])
+    assert [each.state for each in inputs.event.inputs] == ["ended"]
     await inputs.close()
 
 
@@ -220,6 +243,42 @@ async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) ->
             ("right", 7): pytest.approx((0.2286, 0.05715)),
             ("api", 1): pytest.approx((0.15, 0.1)),
         }
+
+
+@in_virtual_time
+async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> None:
+    """First in the status, in an event and in the metrics, with what came instead, until it plays.
+
+    What a source rejects is counted with what cannot be a contact.
+    """
+    port = free_port()
+    more = (
+        "touch:\n"
+        '  - {name: gone, url: "evdev:/dev/input/event987"}\n'
+        f'  - {{name: table, url: "tuio:127.0.0.1:{port}"}}\n'
+    )
+    blob = bundle(message("set", 1, 0.5, 0.5, 0.1, address="/tuio/2Dblb"))
+    fingers = TouchFrame("table", 0.0, (Touch(1, 0.5, 0.5), Touch(2, 1.5, 0.5)))
+    async with ready_daemon(tmp_path, more) as (_, era):
+        shown = []
+        for datagram in (blob, tuio_datagram(fingers, 1)):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.sendto(datagram, ("127.0.0.1", port))
+            await asyncio.sleep(12)
+            status = await era.status()
+            shown.append([line.split(":")[:2] for line in show_status(status).splitlines()])
+        await era.subscribe("inputs")
+        event = await era.next_event()
+    gone, ready = ["touch gone", " missing"], ["ready", *shown[0][2][1:]]
+    assert shown[0][:3] == [gone, ["touch table", " mute"], ready]
+    assert shown[1][:2] == [gone, ready]
+    assert status.rejected_touches == {"profile_2Dblb": 1, "off_plate": 1}
+    assert "/tuio/2Dblb" in status.rejected_examples["profile_2Dblb"]
+    assert event is not None
+    assert InputsEvent.model_validate(event.data).inputs == status.inputs
+    exposed = exposition(status).decode()
+    assert 'era_touch_input_open{input="gone"} 0.0' in exposed
+    assert 'era_touch_input_open{input="table"} 1.0' in exposed
 
 
 @in_virtual_time

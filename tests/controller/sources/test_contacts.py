@@ -151,8 +151,17 @@ SCENARIOS: Mapping[str, Sequence[Then]] = {
     ],
     "not a number": invalid(math.nan, 0.5, "not_finite"),
     "infinite": invalid(0.5, math.inf, "not_finite"),
-    "west of the plate": invalid(-0.001, 0.5, "off_plate"),
-    "south of the plate": invalid(0.5, 1.001, "off_plate"),
+    "west of the plate": invalid(-0.025, 0.5, "off_plate"),
+    "south of the plate": invalid(0.5, 1.033, "off_plate"),
+    "beyond a corner": invalid(1.02, -0.025, "off_plate"),
+    # On a plate of 300 mm by 200 mm: 6.3 mm beyond an edge a finger is at it, 6.6 mm is off.
+    "a finger along the rim": [
+        Then(frame(0.0, (1, 1.021, 0.5)), down=[TAP], rejected=()),
+        Then(frame(0.1, (1, 0.99, 0.5)), up=[]),
+        Then(frame(0.2, (1, 1.0005, 0.5)), moved=[(pytest.approx(0.3), 0.0)], up=[]),
+        Then(frame(0.3, (1, -0.021, -0.001)), moved=[(0.0, 0.0)], up=[], rejected=()),
+        Then(frame(0.4, (1, 1.022, 0.5)), [], up=[TAP], rejected=("off_plate",)),
+    ],
     # Of two touches with one id in a frame the last counts; it is reported.
     "one id twice": [
         Then(

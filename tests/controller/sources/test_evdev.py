@@ -13,14 +13,16 @@ from typing import Any
 import pytest
 
 from controller.sources.evdev import (
+    CLOCK,
     GRAB,
+    PRESSED_KEYS,
     EvdevSource,
     InputDevice,
     eviocgabs,
     eviocgmtslots,
     parse_events,
 )
-from controller.sources.slots import SlotState
+from controller.sources.slots import InputEvent, SlotState, as_slot_event
 from controller.sources.touch import TouchFrame, open_source
 from model.errors import InputError
 from virtual_loop import run_virtual
@@ -32,12 +34,15 @@ KINDS = {
 }
 
 
-def raw(words: str, *, dropped: bool = False) -> bytes:
-    """A report such as "slot 0 id 7 x 100 y 50" as struct input_event puts it on x86-64 and Arm."""
+def raw(words: str, *, dropped: bool = False, at: float = 0.0) -> bytes:
+    """A report such as "slot 0 id 7 x 100 y 50" as struct input_event has it on x86-64 and Arm.
+
+    at: its time [s].
+    """
     pairs = words.split()
     events = [(*KINDS[key], int(value)) for key, value in zip(pairs[::2], pairs[1::2], strict=True)]
     events += [(0, 3, 0)] * dropped + [(0, 0, 0)]
-    return b"".join(struct.pack("@qqHHi", 0, 0, *event) for event in events)
+    return b"".join(struct.pack("@qqHHi", int(at), round(at % 1 * 1e6), *event) for event in events)
 
 
 class PipePanel:
@@ -48,7 +53,7 @@ class PipePanel:
         self.resolutions: dict[int, int] = {}
         self.current_slot = 0
         self.state = {0: EMPTY, 1: EMPTY}
-        self.is_gone = False
+        self.is_gone = 0  # the number of an error
         self._out, self.into = os.pipe()
         os.set_blocking(self._out, False)
 
@@ -59,13 +64,13 @@ class PipePanel:
     def slots(self) -> dict[int, SlotState]:
         """Return the state that a test has set."""
         if self.is_gone:
-            raise OSError(errno.ENODEV, "No such device")
+            raise OSError(self.is_gone, "gone")
         return self.state
 
-    def read(self) -> list[tuple[int, int, int]]:
+    def read(self) -> list[InputEvent]:
         """Return the events in the pipe."""
         if self.is_gone:
-            raise OSError(errno.ENODEV, "No such device")
+            raise OSError(self.is_gone, "gone")
         try:
             return list(parse_events(os.read(self._out, 4096)))
         except BlockingIOError:
@@ -215,27 +220,45 @@ def test_evdev_source_reports_loads(
     assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
 
 
-@pytest.mark.parametrize("notices", ["by reading", "by polling"])
-def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
-    """Its fingers are lifted when it is unplugged; it is followed once it is back."""
-    first, second = PipePanel(), PipePanel()
-    first.state = {0: SlotState(7, 0, 0), 1: EMPTY}
-    panels = [first]
+@pytest.mark.parametrize(
+    ("notices", "number", "words"),
+    [
+        ("by reading", errno.ENODEV, "lost.*plug it in"),
+        ("by polling", errno.ENODEV, "lost.*plug it in"),
+        ("at once", errno.EINVAL, "type A"),
+    ],
+)
+def test_evdev_source_ends_without_a_panel(notices: str, number: int, words: str) -> None:
+    """Within 60 ms of being unplugged, and at once for a panel without slots: EINVAL."""
+    panel = PipePanel()
+    panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
+    panel.is_gone = number if notices == "at once" else 0
 
     async def play() -> None:
         await asyncio.sleep(0.01)
-        first.is_gone = True
+        panel.is_gone = number
         if notices == "by reading":
-            os.write(first.into, b"x")  # a device that goes becomes readable
-        await asyncio.sleep(3)
-        panels.append(second)
-        await asyncio.sleep(6)
-        os.write(second.into, raw("id 8 x 1000 y 0"))
+            os.write(panel.into, b"x")  # a device that goes becomes readable
+        await asyncio.sleep(0.05)
+
+    with pytest.raises(InputError, match=words):
+        run_virtual(follow([panel], play))
+
+
+def test_evdev_source_has_the_times_of_the_kernel() -> None:
+    """When an event happened, not when it was read; now, if it is of another clock."""
+    panel = PipePanel()
+
+    async def play() -> None:
+        start = asyncio.get_running_loop().time()
+        await asyncio.sleep(5)
+        for happened in (4.98, 6.0, 3.0):
+            os.write(panel.into, raw("id 7 x 0 y 0", at=start + happened))
+            os.write(panel.into, raw("id -1", at=start + happened))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual(follow(panels, play))
-    assert touches_of(seen) == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
-    assert seen[1].time <= 0.06
+    seen = run_virtual(follow([panel], play))
+    assert [frame.time for frame in seen] == [0.0, 4.98, 4.98, 5.0, 5.0, 5.0, 5.0]
 
 
 def test_ioctl_request_numbers() -> None:
@@ -243,30 +266,44 @@ def test_ioctl_request_numbers() -> None:
     assert eviocgabs(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
     assert eviocgmtslots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
     assert GRAB == 0x40044590  # EVIOCGRAB
+    assert CLOCK == 0x400445A0  # EVIOCSCLOCKID
+    assert PRESSED_KEYS == 0x80604518  # EVIOCGKEY(96)
 
 
 def test_parse_events_skips_incomplete_events() -> None:
-    """Each complete event has its type, code and value."""
-    assert list(parse_events(raw("x -5") + b"\0" * 10)) == [
-        (3, 0x35, -5),
-        (0, 0, 0),
+    """Each complete event has its time, type, code and value."""
+    assert list(parse_events(raw("x -5", at=3.5) + b"\0" * 10)) == [
+        (3.5, 3, 0x35, -5),
+        (3.5, 0, 0, 0),
     ]
 
 
-def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None = None) -> None:
-    """Let the kernel report a panel with ten slots and a width."""
+def kernel(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    width: int,
+    slots: int = 10,
+    missing: tuple[int, ...] = (),
+    grab: OSError | None = None,
+) -> None:
+    """Let the kernel report a panel with a width; missing: axes that it does not have."""
 
     def ioctl(descriptor: int, request: int, argument: bytes | int) -> bytes:
         if request == GRAB:
             if grab is not None:
                 raise grab
             return b""
+        if request == CLOCK:
+            raise OSError(errno.EINVAL, "no such clock")
+        if request == PRESSED_KEYS:
+            return bytes(41) + b"\4" + bytes(54)  # bit 0x14a
         if isinstance(argument, bytes) and request == eviocgmtslots(len(argument)):
             (axis,) = struct.unpack_from("i", argument)
-            return struct.pack("11i", axis, *(axis + slot for slot in range(10)))
-        highs = {eviocgabs(0x2F): 9, eviocgabs(0x3A): 255, eviocgabs(0x30): 0}
-        resolution = {eviocgabs(0x35): 12, eviocgabs(0x3A): 3}.get(request, 0)
-        return struct.pack("6i", 0, 0, highs.get(request, width), 0, 0, resolution)
+            return struct.pack(f"{1 + slots}i", axis, *(axis + slot for slot in range(slots)))
+        highs = {0x2F: slots - 1, 0x3A: 255, 0x30: 0} | dict.fromkeys(missing, 0)
+        axis = request - eviocgabs(0)
+        resolution = {0x35: 12, 0x3A: 3}.get(axis, 0)
+        return struct.pack("6i", axis, 0, highs.get(axis, width), 0, 0, resolution)
 
     monkeypatch.setattr("controller.sources.evdev.fcntl.ioctl", ioctl)
 
@@ -280,7 +317,8 @@ BUSY = OSError(errno.EBUSY, "Device or resource busy")
         ("/dev/null", None, "evtest"),
         ("/dev/input/event987", None, "by-id"),
         ("/dev/null", {"width": 1000, "grab": BUSY}, "`sudo fuser -v /dev/null`"),
-        ("/dev/null", {"width": 0}, "0x35.*0 and 0"),
+        ("/dev/null", {"width": -1}, "0x35.*0 and -1"),
+        ("/dev/null", {"width": 0}, "0x0.*0 and 0.*single-touch"),
     ],
 )
 def test_input_device_refuses_what_is_no_usable_panel(
@@ -295,20 +333,32 @@ def test_input_device_refuses_what_is_no_usable_panel(
     assert sorted(Path("/proc/self/fd").iterdir()) == before
 
 
-def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has the ranges of its axes, and the kernel's values of all slots."""
-    kernel(monkeypatch, width=1000)
+@pytest.mark.parametrize("slots", [10, 1])
+def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch, slots: int) -> None:
+    """It has the ranges of its axes, and the kernel's values of all slots, of an only one, too."""
+    kernel(monkeypatch, width=1000, slots=slots)
     device = InputDevice("/dev/null")
     assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
     assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3, 0x30: 0}
-    assert device.slots()[2] == SlotState(
-        *(0x39 + 2, 0x35 + 2, 0x36 + 2),
-        tool=0x37 + 2,
-        distance=0x3B + 2,
-        pressure=0x3A + 2,
-        touch_major=0x30 + 2,
+    assert len(device.slots()) == slots
+    assert device.slots()[slots - 1] == SlotState(
+        *(axis + slots - 1 for axis in (0x39, 0x35, 0x36, 0x37, 0x3B, 0x3A, 0x30))
     )
     device.close()
+
+
+def test_input_device_reads_a_panel_for_a_single_finger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without multi-touch axes: ABS_X, ABS_Y, ABS_PRESSURE and BTN_TOUCH, as those of a slot."""
+    kernel(monkeypatch, width=1000, missing=(0x35, 0x36, 0x3A, 0x2F))
+    device = InputDevice("/dev/null")
+    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+    assert device.slots() == {0: SlotState(0, x=0x0, y=0x1, pressure=0x18)}
+    device.close()
+    events = [(3, 0, 250), (3, 1, 100), (3, 0x18, 9), (1, 0x14A, 1), (1, 0x14A, 0), (0, 0, 0)]
+    assert [as_slot_event((2.5, *event)) for event in events] == [
+        *((2.5, 3, 0x35, 250), (2.5, 3, 0x36, 100), (2.5, 3, 0x3A, 9)),
+        *((2.5, 3, 0x39, 0), (2.5, 3, 0x39, -1), (2.5, 0, 0, 0)),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.slots import EventError, Report, SlotReader
+from controller.sources.slots import Report, SlotReader
+from model.errors import InputError
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]
 
@@ -94,6 +95,18 @@ SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {
         ],
         [(0.0, {}), (1.0, {1: (0.1, 0.5)}), (2.0, {}), (3.0, {2: (0.2, 0.5)})],
     ),
+    "two slots with one tracking id, and a negative slot": (
+        [
+            (0, "id 1 x 100 y 0 slot 1 id 1 x 300 y 0"),
+            (1, "slot -1 id 4 x 500 slot 0 x 200"),
+            (2, "slot 0 id -1"),
+        ],
+        [
+            (0.0, {1: (0.1, 0.5), -2: (0.3, 0.5)}),
+            (1.0, {1: (0.2, 0.5), -2: (0.3, 0.5)}),
+            (2.0, {1: (0.3, 0.5)}),
+        ],
+    ),
     "another id without -1 before it": (
         [(0, "id 1 x 100 y 0"), (1, "id 2 x 200")],
         [(0.0, {1: (0.1, 0.5)}), (1.0, {2: (0.2, 0.5)})],
@@ -130,8 +143,7 @@ def test_at_most_as_many_touches_as_slots(reports: list[list[tuple[str, int]]]) 
     assert all(len(touches) <= len(slots) for _, touches in shown(enumerate(words)))
 
 
-@pytest.mark.parametrize("event", [(ABS, 0x2F, -1), (SYN, 2, 0)])
-def test_events_of_another_protocol_are_refused(event: tuple[int, int, int]) -> None:
-    """A negative slot, and a report of type A."""
-    with pytest.raises(EventError):
-        SlotReader(RANGES).feed(*event)
+def test_events_of_type_a_are_refused() -> None:
+    """SYN_MT_REPORT, with a reason that names the type."""
+    with pytest.raises(InputError, match="type A"):
+        SlotReader(RANGES).feed(SYN, 2, 0)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
@@ -77,6 +78,11 @@ HALF = [(1, 0.5, 0.5)]
 QUARTER = [(1, 0.25, 0.5)]
 NAMES = [(0.1, PEER, frame(source=f"s{number}"), ...) for number in range(16)]
 OTHERS = [(0.1, OTHER, frame(source=f"o{number}"), []) for number in range(8)]
+
+HERE = cursor(1, 0.5, 0.5)
+OBJECT = message("set", 3, 1, 0.5, 0.5, 0.1, address="/tuio/2Dobj")
+POINTER = message(1, 0, 0, 0.5, 0.5, 0.0, 0.0, 0.0, address="/tuio2/ptr")
+NO_OBJECTS = [message(*part, address="/tuio/2Dobj") for part in (["alive"], ["fseq", 7])]
 
 Read = tuple[float, tuple[str, int], bytes, Any]
 """Time [s], peer, datagram, and the touches that are read: None for no frame, ... for anything."""
@@ -152,9 +158,9 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
         {"too_many_senders": ...},
         [*[*NAMES, *OTHERS] * 3, (0.1, OTHER, frame(source="o8"), None)],
     ),
-    # Not a number and off the sensor are the tracker's to judge; the former is counted.
+    # Not a number and off the sensor are the tracker's to judge, which counts them.
     "positions are passed unchecked": (
-        {"not_finite": 1},
+        {},
         [
             (
                 0,
@@ -164,27 +170,43 @@ COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
             )
         ],
     ),
-    # Objects and blobs on the same port are neither frames nor errors.
+    # A table without objects says so in every frame; one with some, and other protocols, count.
     "other profiles": (
-        {},
+        {"profile_2Dobj": 2, "profile_25Dcur": 1, "profile_tuio2": 1, "other_address": 1},
         [
-            (
-                0,
-                PEER,
-                bundle(
-                    message("alive", 3, address="/tuio/2Dobj"),
-                    message("fseq", 7, address="/tuio/2Dobj"),
-                ),
-                None,
-            )
+            (0, PEER, bundle(*NO_OBJECTS), None),
+            (0, PEER, bundle(message("alive", 3, address="/tuio/2Dobj")), None),
+            (0, PEER, bundle(message("set", 3, 0.5, 0.5, 0.1, address="/tuio/25Dcur")), None),
+            (0, PEER, bundle(message(1, 5, address="/tuio2/frm"), POINTER), None),
+            (0, PEER, bytes(message(1, 0.5, address="/accelerometer").dgram), None),
+            (0, PEER, of(*NO_OBJECTS, OBJECT, message("alive", 1), HERE), HALF),
         ],
     ),
-    # More than eight kilobytes are no touch frame; a hundred cursors are.
-    "oversized bundles": (
-        {"oversized": 1},
+    # The cursors of a bundle with malformed messages are read.
+    "a bundle of good and bad": (
+        {"malformed": 2},
         [
-            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(100))), ...),
-            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(200))), None),
+            (0, PEER, of(message("set", 1), message("alive", 1), HERE), HALF),
+            (0, PEER, of(message("alive", 1, "2"), cursor(1, 0.25, 0.5)), QUARTER),
+        ],
+    ),
+    # Without any alive message the cursors that a bundle sets are alive.
+    "a sender that never says what is alive": (
+        {},
+        [
+            (0, PEER, of(HERE, cursor(2, 0.75, 0.5)), [*HALF, (2, 0.75, 0.5)]),
+            (0, PEER, of(cursor(2, 0.75, 0.5)), [(2, 0.75, 0.5)]),
+            (0, PEER, still(fseq=1), []),
+            (0, PEER, of(HERE), []),
+        ],
+    ),
+    # As much as UDP carries, but no more messages than ten times as many contacts need.
+    "big bundles": (
+        {"malformed": 1},
+        [
+            (0, PEER, of(message("alive", 1), HERE, message("set", 2, *[0.5] * 12_000)), HALF),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(250))), ...),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(300))), ...),
         ],
     ),
 }
@@ -215,24 +237,17 @@ MALFORMED = {
     "element of negative size": _raw((-4, b"")),
     "element of size zero": _raw((0, b"")),
     "element longer than the datagram": _raw((400, bytes(message("alive", 1).dgram))),
-    "bundle in a bundle": _raw((16, b"#bundle\0" + bytes(8))),
     "no type tags": b"/tuio/2Dcur\0",
     "no arguments": bytes(message().dgram),
-    "text that is not UTF-8": b"/tuio/2Dcur\0,s\0\0\xff\xfe\0\0",
-    "types nobody expects": bytes(message("alive", True).dgram),
+    "types without a value": bytes(message("alive", True).dgram),
     "a type that is unknown": b"/tuio/2Dcur\0,sXi\0\0\0\0alive\0\0\0\0\0\0\1",
-    "an id that is a float": bytes(message("alive", 1.0).dgram),
     "a position that is text": bytes(message("set", 1, "0.5", 0.5, 0.0, 0.0, 0.0).dgram),
-    "positions that are integers": bytes(message("set", 1, 0, 1, 0.0, 0.0, 0.0).dgram),
-    "too few arguments": bytes(message("set", 1, 0.5, 0.5).dgram),
-    "text without its last zeros": bytes(message("source", "abcd").dgram)[:-1],
     "text without an end": bytes(message("source", "abcd").dgram)[:-4],
     "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
     "unknown command": bytes(message("wave", 1).dgram),
-    "one bad message among good ones": bundle(
-        message("source", "table@a"), message("alive", 1, 2), cursor(1, 0.5, 0.5), message("set", 2)
-    ),
-    "a name of 4000 letters": bytes(message("source", "x" * 4000).dgram),
+    "an id that is not whole": bytes(message("alive", 1.5).dgram),
+    "a number that is infinite": bytes(message("fseq", math.inf).dgram),
+    "too few arguments": bytes(message("set", 1, 0.5).dgram),
 }
 
 
@@ -247,6 +262,99 @@ def test_reader_counts_malformed_datagrams(
     assert [record.name for record in caplog.records] == ["test"]
     still = bundle(message("source", "table@a"), message("alive", 1, 2), message("fseq", 2))
     assert touches(reader.read(still, PEER, now=0)) == [(1, 0.25, 0.5)]
+
+
+def typed(tags: str, *values: Any) -> Any:
+    """A message of cursors whose arguments have these types."""
+    builder = OscMessageBuilder("/tuio/2Dcur")
+    for tag, value in zip(tags, values, strict=True):
+        builder.add_arg(value, tag)
+    return builder.build()
+
+
+ALIVE = message("alive", 1)
+REST = (0.0, 0.0, 0.0)
+LIBERAL = {
+    "float ids": bundle(typed("sf", "alive", 1.0), typed("sfff", "set", 1.0, 0.25, 0.5)),
+    "double positions": bundle(ALIVE, typed("siddddd", "set", 1, 0.25, 0.5, *REST)),
+    "int64": bundle(typed("sh", "alive", 1), typed("shff", "set", 1, 0.25, 0.5)),
+    "further arguments": bundle(ALIVE, message("set", 1, 0.25, 0.5, *REST, 0.05, 0.06, "a")),
+    "further types": bundle(
+        ALIVE, typed("siffTFNbi", "set", 1, 0.25, 0.5, True, False, None, b"abcde", 7)
+    ),
+    "impulse, time tag and array": b"/tuio/2Dcur\0,siffI[t]\0\0\0set\0"
+    + struct.pack(">iffQ", 1, 0.25, 0.5, 1),
+    "bundles in a bundle": _raw(*[(len(frame(*QUARTER)), frame(*QUARTER))] * 2),
+    "a name in Latin-1": bundle(ALIVE, cursor(1, 0.25, 0.5))
+    + struct.pack(">i", 28)
+    + b"/tuio/2Dcur\0,ss\0source\0\0T\xfcr\0",
+    "a long name": of(ALIVE, cursor(1, 0.25, 0.5), source="x" * 4000),
+    "a time tag": frame(*QUARTER)[:8] + b"\xff" * 8 + frame(*QUARTER)[16:],
+}
+
+
+@pytest.mark.parametrize("datagram", LIBERAL.values(), ids=LIBERAL.keys())
+def test_reader_is_liberal(reader: TuioReader, datagram: bytes) -> None:
+    """Whatever its types, further arguments, name and bundles: a cursor is where it says."""
+    assert touches(reader.read(datagram, PEER, now=0)) == QUARTER
+    assert not counts(reader)
+
+
+@pytest.mark.parametrize(
+    ("sent", "seconds"),
+    [
+        # by port: one that takes another port for each datagram, another one a moment after
+        ([(1, 5, 0.0), (2, 6, 0.0), (3, 7, 0.0), (4, 5, 0.1), (3, 8, 0.1)], {4}),
+        # a program that is restarted, from another port
+        ([(1, 900, 0.0), (2, 1, 0.6), (2, 2, 0.7)], set()),
+        # two that are not numbered, or number alike, each with the next number
+        ([(1, -1, 0.0), (2, -1, 0.0), (1, -1, 0.1), (2, -1, 0.1)], {1}),
+        ([(1, 1, 0.0), (2, 2, 0.0), (1, 3, 0.1), (2, 4, 0.1)], {1}),
+    ],
+)
+def test_reader_tells_programs_of_one_name_apart(
+    reader: TuioReader, sent: list[tuple[int, int, float]], seconds: set[int]
+) -> None:
+    """By port, frame number and time [s]: those of a second program, counted once, and others."""
+    for number, (port, fseq, now) in enumerate(sent):
+        datagram = frame((port, 0.5, 0.5), fseq=fseq, source="a")
+        result = reader.read(datagram, ("192.0.2.7", port), now=now)
+        assert [id for id, _, _ in touches(result)] == [port]
+        is_second = port in seconds and number > 0
+        assert result is not None
+        assert result.source == f"tuio:192.0.2.7{f':{port}' if is_second else ''}/a"
+    assert counts(reader) == ({"same_name": 1} if seconds else {})
+
+
+def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
+    """After 10 s without anything, but not of a panel at rest.
+
+    A sender that repeats itself at rest and falls silent is mute, too.
+    """
+    assert [reader.is_mute(since=0, now=now) for now in (9.9, 10.1)] == [False, True]
+    for now in range(11, 14):
+        reader.read(frame((1, 0.5, 0.5)) if now < 13 else frame(), PEER, now=now)
+    assert not reader.is_mute(since=0, now=100)
+    for now in range(100, 120):
+        reader.read(frame(), PEER, now=now)
+    assert [reader.is_mute(since=0, now=now) for now in (128.9, 129.1)] == [False, True]
+
+
+@given(
+    st.lists(
+        st.integers(0, 9)
+        | st.binary(min_size=1, max_size=40).filter(lambda raw: not raw.startswith((b"/", b"#")))
+    )
+)
+def test_reader_reads_cursors_among_noise(parts: list[int | bytes]) -> None:
+    """Every cursor is read, and every other element is counted."""
+    raw = [each if isinstance(each, bytes) else cursor(each, 0.5, 0.5).dgram for each in parts]
+    reader = TuioReader(RejectCounter(logging.getLogger("test")))
+    result = reader.read(_raw(*((len(each), each) for each in raw)), PEER, now=0)
+    found = set() if result is None else {touch.id for touch in result.touches}
+    assert found == {each for each in parts if isinstance(each, int)}
+    noise = sum(isinstance(each, bytes) for each in parts)
+    assert counts(reader) == ({"malformed": noise} if noise else {})
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))

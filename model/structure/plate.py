@@ -256,8 +256,8 @@ class Plate(Sheet):
             )
         if not abs(self.loss_exponent) <= MAX_LOSS_EXPONENT:
             raise InputError(
-                f"plate: loss_exponent must be from -{MAX_LOSS_EXPONENT:g} to {MAX_LOSS_EXPONENT:g}, "
-                f"got {self.loss_exponent}"
+                f"plate: loss_exponent must be from -{MAX_LOSS_EXPONENT:g} to "
+                f"{MAX_LOSS_EXPONENT:g}, got {self.loss_exponent}"
             )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)

@@ -193,36 +193,38 @@ async def phases(subject: Subject) -> None:
     await subject.arm()
     await subject.require_interference()
     silent, slow = play(layer(0), *map(layer, subject.layers[1:])), max(subject.lowest, _SLOW) / 20
+    if subject.exchange_time / subject.client.transactions > 0.25 / slow:
+        raise Optional("the line is too slow to see phases of tones that began apart")
     for channel in subject.channels:
         first = layer(0, subject.tone(channel, 0.5, 30.0))
         for number in subject.layers[1:]:
             other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
             await subject.run([play(first, other), silent])
-        for phase in (90.0, -90.0):
-            await _expect_turned(subject, channel, phase, 0.25)
-    for periods in (0.25, 0.5):
-        await _expect_turned(subject, 0, 0.0, round(0.9 * slow) + periods)
-    for keep in (True, False):
-        await _expect_turned(subject, 0, 0.0, 0.5, keep=keep)
+    turned: list[tuple[int, float, float, bool | None]] = [
+        *((channel, phase, 1.25, None) for channel in subject.channels for phase in (90.0, -90.0)),
+        *((0, 0.0, round(0.9 * slow) + periods, None) for periods in (0.25, 0.5)),
+        *((0, 0.0, 0.5, keep) for keep in (True, False)),
+    ]
+    for case in turned:
+        await subject.in_time(partial(_expect_turned, subject, *case))
 
 
 async def _expect_turned(
-    subject: Subject, channel: int, phase: float, periods: float, *, keep: bool | None = None
+    subject: Subject, channel: int, phase: float, periods: float, keep: bool | None
 ) -> None:
     """Play two tones some periods apart; keep: both at once, one of them again with that flag."""
     slow = max(subject.lowest, _SLOW)
-    if subject.exchange_time > 0.25 * 20 / slow:
-        raise Optional("the line is too slow to see phases of tones that began apart")
+    await subject.arm()
+    subject.shown.outputs.interferes = True
     tone = subject.tone(channel, 0.5, frequency=slow)
     again = replace(subject.tone(channel, 0.5, phase, keep=bool(keep)), frequency=slow)
     time = periods * 20 / slow
     first = await subject.play(layer(0, tone), *([] if keep is None else [layer(1, tone)]))
-    await subject.pause(time)
+    await subject.pause(first.when.earliest + time - clock.now())
     second = await subject.play(layer(1, again))
     if second.when.latest - first.when.earliest > time + 0.25 * 20 / slow:
         raise Late("two sets were too far apart in time")
     await subject.status()
-    await subject.play(layer(0), layer(1))
 
 
 @driving(_PLACE)

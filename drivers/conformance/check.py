@@ -1,6 +1,7 @@
 """Checks, their execution until this machine was in time, and the report of a run."""
 
 from collections.abc import Awaitable, Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from inspect import isawaitable
@@ -8,6 +9,7 @@ from typing import Any, TypeAlias
 
 from drivers import clock
 from drivers.conformance.client import (
+    Armed,
     Client,
     Late,
     Optional,
@@ -35,7 +37,6 @@ class Check:
     """A rule of the contract: its name, what it requires, and the place that says so.
 
     drives: whether it arms the amplifier. kinds: of wires on which it can be tried, empty for all.
-    is_required: nothing is driven unless it passes.
     """
 
     name: str
@@ -44,7 +45,6 @@ class Check:
     drives: bool
     kinds: tuple[str, ...]
     run: Steps
-    is_required: bool = False
 
 
 class Result(StrEnum):
@@ -64,7 +64,8 @@ class CheckResult:
     """Result of a check; reason, seen, expected: of a violation, or why it was skipped.
 
     sent: the last set before a violation, in words and hexadecimal; came: the last bytes.
-    has_verdict: unless this machine or the line was always too slow for it.
+    has_verdict: unless this machine or the line was always too slow for it. is_armed: the
+    amplifier is armed, so that nothing may be driven.
     """
 
     check: Check
@@ -78,6 +79,7 @@ class CheckResult:
     has_verdict: bool = True
     sent: str = ""
     came: str = ""
+    is_armed: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Make a row with stable keys."""
@@ -147,16 +149,13 @@ class Report:
         return {result.value: results.count(result) for result in Result}
 
 
-def reading(
-    place: str, *kinds: str, drives: bool = False, is_required: bool = False
-) -> Callable[[Steps], Check]:
+def reading(place: str, *kinds: str, drives: bool = False) -> Callable[[Steps], Check]:
     """Make a check that only reads of its steps, whose docstring begins with 'It'."""
 
     def make(steps: Steps) -> Check:
         text = " ".join((steps.__doc__ or "").split())
         requirement = text.removeprefix("It ").removesuffix(".")
-        name = getattr(steps, "__name__", "")
-        return Check(name, requirement, place, drives, kinds, steps, is_required)
+        return Check(getattr(steps, "__name__", ""), requirement, place, drives, kinds, steps)
 
     return make
 
@@ -200,13 +199,8 @@ async def run_checks(
     for number, check in checks:
         if (took := clock.now() - began) > _LONGEST:
             why_none = why_none or f"not run: the checks before took {took:.0f} s"
-        bad = [
-            each.check.name
-            for each in (*before, *results)
-            if check.drives and each.check.is_required and each.result is Result.FAILED
-        ]
-        why = why_none or (f"not run: it failed {bad[0]}" if bad else "")
-        if why:
+        is_barred = check.drives and any(each.is_armed for each in (*before, *results))
+        if why := "not run: it is armed, perhaps by another host" if is_barred else why_none:
             result = CheckResult(check, number, Result.NOT_RUN, why)
         else:
             result, why_none = await _run(number, check, client, level)
@@ -243,6 +237,7 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
         has_verdict=not is_late,
         sent=getattr(finding, "sent", ""),
         came=getattr(finding, "came", ""),
+        is_armed=isinstance(finding, Armed),
     )
     return result, why and f"not run: after {check.name} {why}"
 
@@ -287,10 +282,10 @@ async def _left(
     due = clock.now() + _RETRIED
     while subject is None or check.drives:
         try:
-            await (subject.silence() if subject else identified(client, level))
+            with suppress(Unusable):  # it is silent, but cannot be judged
+                await (subject.rest() if subject else identified(client, level))
+            break
         except Violation as found:
             if clock.now() > due:
                 return found
-        else:
-            break
     return None

@@ -32,6 +32,10 @@ class Violation(Exception):
         super().__init__(f"{what} must be {expected}, got {seen}")
 
 
+class Armed(Violation):
+    """It is armed, perhaps by another host: nothing is driven."""
+
+
 class Optional(Exception):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
 
@@ -72,8 +76,9 @@ MAX_ATTEMPTS = 20
 """Of a check with all its cases, for which this machine was late."""
 _PATIENCE = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
+_STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
-_GATEWAY = 1.5  # s; in which a gateway says that a unit does not reply
+GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
@@ -131,9 +136,10 @@ class Client(ABC):
 
     heard: messages that no request was waiting for; events: those of type Event; order: types of
     all, as they came. reply_words: the longest reply to each message by its number, where it is
-    known. quiet: time [s] in which a reply comes. wire_time: on the wire [s], of a request and a
-    reply by their words; transit: of the longest reply. session: that was begun last. loss: why the
-    line was lost. came: bytes of the amplifier since the last request.
+    known. quiet: time [s] in which a reply comes; timeout: for which one is awaited. wire_time: on
+    the wire [s], of a request and a reply by their words; transit: of the longest reply. session:
+    that was begun last. loss: why the line was lost. came: bytes of the amplifier since the last
+    request.
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
@@ -163,6 +169,7 @@ class Client(ABC):
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit = 0.0
+        self.timeout = REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()
         self.free = self.attempts = 0
@@ -212,9 +219,9 @@ class Client(ABC):
             if address == self.address:
                 continue
             self.port.write(self.question(address))
-            wait = self.quiet if self.has_broadcasts else _GATEWAY
+            wait = self.quiet if self.has_broadcasts else GATEWAY_TIMEOUT
             found = await self.next(lambda each: True, wait)
-            if found is None and self.came and self.kind != "can":  # several replied at once
+            if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
                 self._others.add(address)
             if address not in self._others:
                 self.free = self.free or address
@@ -272,9 +279,7 @@ class Client(ABC):
         self.order.append(message.type)
         self._news.set()
 
-    async def next(
-        self, is_meant: Callable[[Heard], bool], timeout: float = REPLY_TIMEOUT
-    ) -> Heard | None:
+    async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:
         """Return the first message that is meant, None if it does not come in time [s]."""
         self.came = b""
         loop, due = asyncio.get_running_loop(), clock.now() + timeout
@@ -296,11 +301,14 @@ class Client(ABC):
 
     async def replied(self, is_meant: Callable[[Heard], bool], number: int) -> Heard:
         """Return the reply to a message that was sent; Violation where none comes."""
-        found = await self.next(is_meant)
+        before, self.lag = self.lag, 0.0
+        found = await self.next(is_meant, self.timeout)
+        if found is None and self.lag > _STALLED:
+            raise Late(f"no reply came to message {number}")
+        self.lag = max(self.lag, before)
         if found is None:
-            seen = f"none within {REPLY_TIMEOUT:g} s"
-            if self.came:
-                seen += f", but {self.came.hex(' ')}"
+            others = f", but {len(self.came)} other bytes" if self.came else ""
+            seen = f"none within {self.timeout:g} s{others}"
             raise Violation(f"reply to message {number}", expected="one", seen=seen)
         return found
 

@@ -32,6 +32,7 @@ from drivers.codec.modbus.registers import (
 )
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
+    GATEWAY_TIMEOUT,
     QUIET,
     Answer,
     Client,
@@ -75,7 +76,7 @@ class ModbusClient(Client):
         for adu in found:
             is_own = adu.unit == self.address or not adu.pdu
             if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY:
-                self.has_gateway = True
+                self.has_gateway, self.timeout = True, GATEWAY_TIMEOUT
                 continue
             kind, frame = (adu.pdu or b"\0")[0], (adu.unit, adu.pdu or adu.raw)
             self.take(Heard(clock.now(), adu.transaction, kind, (), frame))

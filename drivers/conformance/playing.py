@@ -15,7 +15,7 @@ from drivers.protocol.table import SHORTENED_FADE
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
 _MAX_VOICES = 24  # that are tried
-_PAUSE = 0.004  # s; between the sets of voices
+_PAUSE = 0.004  # s; between the sets of voices, at least
 
 
 @driving(_SETS)
@@ -238,10 +238,12 @@ async def voices(subject: Subject) -> None:
     ]
     await subject.arm()
     subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
+    # Apart, so that the oldest has faded further than the newest, but none ends before the last.
+    pause = max(0.4 * ramp / 1000 / sets - subject.exchange_time, _PAUSE + onset.step / 10_000)
     began = clock.now()
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
-        await asyncio.sleep(_PAUSE + onset.step / 10_000)
+        await asyncio.sleep(pause)
     if last.when.latest - began > 0.8 * ramp / 1000:
         raise Late("sets were too far apart for so many voices")
     cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)

@@ -8,6 +8,7 @@ from typing import cast
 from drivers import clock
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
+    Armed,
     Client,
     Optional,
     Violation,
@@ -63,10 +64,12 @@ async def capabilities(subject: Subject) -> None:
     expect_equal(again, subject.can.stated, "capabilities, read again")
 
 
-@reading("protocol.md#states", is_required=True)
+@reading("protocol.md#states")
 async def starts_disarmed(subject: Subject) -> None:
     """It is disarmed and silent unless it was armed, and shows what it has only."""
     status = (await subject.request("GetStatus")).values
+    if status["state"] == ENABLED:
+        raise Armed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
     disarmed = [number for number, name in NAMES.items() if number != ENABLED]
     expect_one_of(status["state"], disarmed, "state before Arm")
     is_open = flag(status, "interlock_open") and not subject.has("interlock")

@@ -124,10 +124,11 @@ class Subject(Material):
         self._check_fed()  # or it may have been carried out after the watchdog
         took = clock.now() - sent
         client.quiet = min(client.quiet, QUIET + took)
-        beyond = max(took - client.wire_time(len(raw), len(answer.words)), 0.0)
-        count = 1 if name in _READ_ALONE else client.transactions
-        client.fastest[name] = min(client.fastest.get(name, math.inf), took)
-        client.reactions[name].append(beyond / count)
+        if not answer.code:  # a refusal may come sooner
+            beyond = max(took - client.wire_time(len(raw), len(answer.words)), 0.0)
+            count = 1 if name in _READ_ALONE else client.transactions
+            client.fastest[name] = min(client.fastest.get(name, math.inf), took)
+            client.reactions[name].append(beyond / count)
         self.heard_at = answer.when.latest
         return answer
 
@@ -225,17 +226,12 @@ class Subject(Material):
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
-        await self.silence()
-        await self.watch()
-
-    async def silence(self) -> None:
-        """Bring it to silence, disarmed, nothing latched."""
         self.expected = None
         await self.request("Stop", ramp=0)
         stopped = await self.settle()
-        await self.request("Clear", latch=stopped["latch"])
-        cleared = await self.request("GetStatus")
+        cleared = await self.request("Clear", latch=stopped["latch"])
         expect_equal(cleared["state"], OFF, "state after Clear")
+        await self.watch()
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""

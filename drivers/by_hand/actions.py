@@ -206,19 +206,18 @@ async def clear(url: str) -> dict[str, Any]:
 
 async def leave(url: str) -> str:
     """Silence an amplifier whose checks were ended, and clear that; returns how it is left."""
-    cause, remedy = "", f"era amp clear {shlex.quote(url)}"
-    for action in (stop, clear):
-        try:
-            shown = await action(url)
-        except DriverError as error:
-            shown = {"cause": str(error)}
-        cause = shown.get("cause") or ""
-        if cause:
-            longest = f"{QUANTITIES['watchdog'].high:g} s"
-            return (
-                f"{url} is not confirmed to be silent: {cause}. Its watchdog silences it within "
-                f"{longest}, and leaves it in FAULT; once it can be reached: {remedy}"
-            )
+    remedy = f"era amp clear {shlex.quote(url)}"
+    try:
+        cause = (await stop(url))["cause"].removesuffix(f"; {_UNKNOWN}")
+        shown = {} if cause else await clear(url)
+    except DriverError as error:
+        cause = str(error)
+    if cause:
+        watchdog = f"{QUANTITIES['watchdog'].high:g} s"
+        return (
+            f"{url} is not confirmed to be silent: {cause}. Its watchdog silences it within "
+            f"{watchdog}, and leaves it in FAULT; once it can be reached: {remedy}"
+        )
     left = f"{url} is left in {shown['state']}, fault {shown['fault']}"
     is_off = shown["state"] == "SWITCH_ON_DISABLED"
     return f"{left}, silent" if is_off else f"{left}; once the cause is gone: {remedy}"

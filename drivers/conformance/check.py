@@ -25,7 +25,7 @@ from drivers.conformance.subject import Subject
 from drivers.errors import CommandError
 from drivers.protocol.table import MESSAGES, VERSION
 
-_LONGEST = 180.0  # s; after which a run begins no other check
+_MAX_TIME = 180.0  # s; after which a run begins no other check
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
 Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]
@@ -197,7 +197,7 @@ async def run_checks(
     began = clock.now()
     why_none = next((each.reason for each in before if each.result is Result.NOT_RUN), "")
     for number, check in checks:
-        if (took := clock.now() - began) > _LONGEST:
+        if (took := clock.now() - began) > _MAX_TIME:
             why_none = why_none or f"not run: the checks before took {took:.0f} s"
         is_barred = check.drives and any(each.is_armed for each in (*before, *results))
         if why := "not run: it is armed, perhaps by another host" if is_barred else why_none:

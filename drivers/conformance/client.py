@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
+from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REACTION, REFUSALS
 
 
 class Violation(Exception):
@@ -74,7 +74,7 @@ def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
 
 MAX_ATTEMPTS = 20
 """Of a check with all its cases, for which this machine was late."""
-_PATIENCE = 20.0  # s; of a run, for attempts that came too late
+_MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
 _STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
@@ -219,7 +219,8 @@ class Client(ABC):
             if address == self.address:
                 continue
             self.port.write(self.question(address))
-            wait = self.quiet if self.has_broadcasts else GATEWAY_TIMEOUT
+            wait = max(self.quiet, REACTION + self.transit)
+            wait = wait if self.has_broadcasts else GATEWAY_TIMEOUT
             found = await self.next(lambda each: True, wait)
             if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
                 self._others.add(address)
@@ -236,7 +237,7 @@ class Client(ABC):
         if self.attempts < MAX_ATTEMPTS:
             self.attempts += 1
             self.wasted += clock.now() - since
-        return self.attempts < MAX_ATTEMPTS and self.wasted < _PATIENCE
+        return self.attempts < MAX_ATTEMPTS and self.wasted < _MAX_WASTED
 
     @contextmanager
     def watching(self) -> Iterator[None]:

@@ -370,6 +370,13 @@ def test_every_check_says_what_it_requires() -> None:
         assert heading in headings(PAGES / page), place
 
 
+def test_page_counts_all_checks_of_a_serial_line() -> None:
+    """Of the firmware, where nothing fails."""
+    page = (PAGES.parent / "how-to" / "write-an-amplifier.md").read_text("utf-8")
+    (counts,) = re.findall(r"^(\d+) passed, 0 failed, (\d+) skipped", page, re.MULTILINE)
+    assert sum(map(int, counts)) == len(of_kind("serial"))
+
+
 RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 """To half of full level along 100 ms."""
 

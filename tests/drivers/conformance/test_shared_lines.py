@@ -8,6 +8,7 @@ import pytest
 from drivers.codec.can_bus.segments import unpack_frames
 from drivers.protocol.records import Values
 from judged_line import KINDS, JudgedLine, judged, varied
+from long_form import shortly
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
@@ -46,9 +47,17 @@ def neighbours_of(kind: str) -> dict[int, Neighbour]:
     return {each: Neighbour(f"at {each}") for each in (NEXT, HIGHEST.get(kind, 247))}
 
 
+REACHING_OTHERS = [
+    *("damaged_frames", "doubled_frames", "broadcasts", "present_areas", "events", "addresses"),
+    *("network_management", "exceptions", "limited"),
+]
+"""Checks that send what others hear, or listen to what all may say; and one that is skipped."""
+
+
+@pytest.mark.parametrize("names", shortly([[], REACHING_OTHERS], [REACHING_OTHERS]))
 @pytest.mark.parametrize("kind", KINDS)
 def test_conforming_amplifier_passes_on_a_shared_line(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+    kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its neighbours get nothing, and nodes on CAN stay out of operation, by their heartbeats."""
     others, beats, send = neighbours_of(kind), set[bytes](), JudgedLine._send
@@ -60,11 +69,11 @@ def test_conforming_amplifier_passes_on_a_shared_line(
         send(line, data)
 
     monkeypatch.setattr(JudgedLine, "_send", heard)
-    results = judged(kind, neighbours=others)
+    results = judged(kind, names, neighbours=others)
     failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
     assert not failed, failed
     skipped = {each.check.name: each.reason for each in results if each.result == "skipped"}
-    assert skipped.keys() == SKIPPED | FOR_ALL[kind]
+    assert skipped.keys() == ({"limited"} if names else SKIPPED) | FOR_ALL[kind]
     where = ", ".join(map(str, sorted(others)))
     assert all(where in skipped[name] for name in FOR_ALL[kind] - {"events"})
     assert [each.got for each in others.values()] == [[], []]
@@ -118,7 +127,7 @@ def test_units_behind_one_gateway() -> None:
     def far(send: Callable[[bytes], None]) -> Any:
         return Gateway(units, send)
 
-    names = ["identity", "damaged_frames", "addresses", "phases", "obeys_in_time"]
+    names = ["identity", "obeys_in_time", "damaged_frames", "addresses"]
     results = judged("tcp", names, far=far)
     assert [each.result for each in results] == ["passed"] * len(names), results
     assert [each.got for each in others.values()] == [[], []]

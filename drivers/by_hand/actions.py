@@ -204,6 +204,25 @@ async def clear(url: str) -> dict[str, Any]:
         return {"url": url, **status_rows(await amplifier.clear())}
 
 
+async def leave(url: str) -> str:
+    """Silence an amplifier whose checks were ended, and clear that; returns how it is left."""
+    remedy = f"era amp clear {shlex.quote(url)}"
+    try:
+        cause = (await stop(url))["cause"].removesuffix(f"; {_UNKNOWN}")
+        shown = {} if cause else await clear(url)
+    except DriverError as error:
+        cause = str(error)
+    if cause:
+        watchdog = f"{QUANTITIES['watchdog'].high:g} s"
+        return (
+            f"{url} is not confirmed to be silent: {cause}. Its watchdog silences it within "
+            f"{watchdog}, and leaves it in FAULT; once it can be reached: {remedy}"
+        )
+    left = f"{url} is left in {shown['state']}, fault {shown['fault']}"
+    is_off = shown["state"] == "SWITCH_ON_DISABLED"
+    return f"{left}, silent" if is_off else f"{left}; once the cause is gone: {remedy}"
+
+
 async def drive(
     url: str, channel: int, frequency: float, level: float, duration: float
 ) -> dict[str, Any]:

@@ -218,6 +218,7 @@ def conformance(
     json_: Json = False,
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
+    from drivers.by_hand.actions import leave
     from drivers.conformance import LEVEL, judge
 
     level = LEVEL if level is None else level
@@ -225,17 +226,22 @@ def conformance(
     report = _run(judge(url, drives=False, level=level, on_result=show), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
-            f"{report.not_run} more checks arm the amplifier and drive its channels at "
-            f"{level:.0%} of full level. Continue?"
+            f"{report.left} more checks arm the amplifier and drive its channels at {level:.0%} of "
+            "full level. Other addresses of the line are only asked whether they reply; if one "
+            "does, what is for all is left out. Continue?"
         )
-    if write and report.overall != "failed":
+    if write:
         more = judge(url, drives=True, level=level, on_result=show, before=report)
-        report = _run(more, trace)
+        try:
+            report = _run(more, trace)
+        except (KeyboardInterrupt, LinkError):
+            print(f"era: ended: {_run(leave(url), None)}", file=sys.stderr)
+            raise
     if json_:
         print(json.dumps(report.to_json()))
     else:
         print(report.summary)
-        if report.not_run and report.overall != "failed":
+        if report.left:
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if report.overall == "failed":
         raise typer.Exit(1)
@@ -244,10 +250,13 @@ def conformance(
 
 
 def _show_result(result: "CheckResult") -> None:
-    mark = result.result.value
+    mark = result.result.value.replace("_", " ")
     print(f"{mark.upper() if mark == 'failed' else mark:<7}  It {result.check.requirement}.")
     if result.reason:
         print(f"         {result.reason} ({result.check.place})")
+    for name in ("sent", "came"):
+        if text := getattr(result, name):
+            print(f"         {name}: {text}")
 
 
 def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:

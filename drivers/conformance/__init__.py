@@ -79,7 +79,7 @@ async def judge(
             for number, check in checks
             if number not in known and (drives or not check.drives)
         ]
-        found = await run_checks(chosen, client, level=level, on_result=on_result)
+        found = await run_checks(chosen, client, level=level, on_result=on_result, before=results)
     results = (*results, *found)
     driven = level if any(each.check.drives for each in results) else 0.0
     return Report(url, driven, results, len(checks) - len(results))

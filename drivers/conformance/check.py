@@ -1,17 +1,32 @@
 """Checks, their execution until this machine was in time, and the report of a run."""
 
 from collections.abc import Awaitable, Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from inspect import isawaitable
 from typing import Any, TypeAlias
 
 from drivers import clock
-from drivers.conformance.client import Client, Late, Optional, Violation, read_as
+from drivers.conformance.client import (
+    Armed,
+    Client,
+    Late,
+    Optional,
+    Unusable,
+    Violation,
+    expect,
+    read_as,
+)
 from drivers.conformance.material import FULL, Rows
-from drivers.conformance.subject import MAX_ATTEMPTS, Subject
+from drivers.conformance.sent import in_words
+from drivers.conformance.stated import STATED, Capabilities
+from drivers.conformance.subject import Subject
 from drivers.errors import CommandError
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import MESSAGES, VERSION
+
+_MAX_TIME = 180.0  # s; after which a run begins no other check
+_RETRIED = 2.0  # s; in which silence is tried again, or identification
 
 Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]
 """What a check does, or the rows that are carried out."""
@@ -33,18 +48,24 @@ class Check:
 
 
 class Result(StrEnum):
-    """What a check found; skipped: there is nothing to check, as the contract allows."""
+    """What a check found; skipped: there is nothing to check, as the contract allows.
+
+    Not run: what failed before leaves it nothing to try.
+    """
 
     PASSED = "passed"
     FAILED = "failed"
     SKIPPED = "skipped"
+    NOT_RUN = "not_run"
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
     """Result of a check; reason, seen, expected: of a violation, or why it was skipped.
 
-    has_verdict: unless this machine or the line was always too slow for it.
+    sent: the last set before a violation, in words and hexadecimal; came: the last bytes.
+    has_verdict: unless this machine or the line was always too slow for it. is_armed: the
+    amplifier is armed, so that nothing may be driven.
     """
 
     check: Check
@@ -56,6 +77,9 @@ class CheckResult:
     seconds: float = 0.0
     attempts: int = 1
     has_verdict: bool = True
+    sent: str = ""
+    came: str = ""
+    is_armed: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Make a row with stable keys."""
@@ -70,6 +94,8 @@ class CheckResult:
             "expected": self.expected,
             "seconds": round(self.seconds, 3),
             "attempts": self.attempts,
+            "sent": self.sent,
+            "came": self.came,
         }
 
 
@@ -77,13 +103,18 @@ class CheckResult:
 class Report:
     """Results of checks on one amplifier; level: the highest at which channels were driven.
 
-    not_run: number of checks that were not tried.
+    left: number of checks that were not chosen.
     """
 
     url: str
     level: float
     results: tuple[CheckResult, ...]
-    not_run: int
+    left: int
+
+    @property
+    def not_run(self) -> int:
+        """The number of checks that were not tried."""
+        return self.left + self._counts()["not_run"]
 
     @property
     def overall(self) -> str:
@@ -96,7 +127,7 @@ class Report:
     @property
     def summary(self) -> str:
         """The number of checks with each result."""
-        counted = [f"{count} {name}" for name, count in self._counts().items()]
+        counted = [f"{count} {name}" for name, count in [*self._counts().items()][:-1]]
         driven = f", driven at up to {self.level:.0%} of full level" if self.level else ""
         left = f", {self.not_run} not run" if self.not_run else ""
         return f"{', '.join(counted)}{left}{driven}"
@@ -137,13 +168,14 @@ def driving(place: str, *kinds: str) -> Callable[[Steps], Check]:
 async def identified(client: Client, level: float) -> Subject:
     """Identify the amplifier at the far end of a client; raises Violation."""
     identity = await client.hello()
-    client.reply_words = {}
+    versions, client.reply_words = identity["versions"], {}
+    expect(bool(versions >> VERSION & 1), "versions", expected="bit 3 set", seen=versions)
     message = MESSAGES["GetCaps"]
     answer = await client.exchange(message.number, ())
     if answer.code:
         raise Violation("GetCaps", expected="carried out", seen=answer.code)
-    can = read_as("reply to GetCaps", message.reply.unpack, answer.words, is_strict=False)
-    return Subject(client, identity, can, level)
+    can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
+    return Subject(client, identity, Capabilities(can), level)
 
 
 async def run_checks(
@@ -152,48 +184,69 @@ async def run_checks(
     *,
     level: float,
     on_result: Callable[[CheckResult], None] = lambda result: None,
+    before: Sequence[CheckResult] = (),
 ) -> Iterable[CheckResult]:
     """Run checks in turn, each with its number, on one amplifier; return their results.
 
-    Nothing is run after a check that the amplifier leaves without silence. One for which this
-    machine or the line is always too slow has no verdict. Raises LinkError for a line that is lost,
-    CommandError for a level below a step.
+    before: results of checks that were run already. Nothing is run, and each says so, once the
+    amplifier cannot be identified or silenced; nothing is driven without what is required. One for
+    which this machine or the line is always too slow has no verdict. Raises LinkError for a line
+    that is lost, CommandError for a level below a step.
     """
     results: list[CheckResult] = []
+    began = clock.now()
+    why_none = next((each.reason for each in before if each.result is Result.NOT_RUN), "")
     for number, check in checks:
-        result, is_at_rest = await _run(number, check, client, level)
+        if (took := clock.now() - began) > _MAX_TIME:
+            why_none = why_none or f"not run: the checks before took {took:.0f} s"
+        is_barred = check.drives and any(each.is_armed for each in (*before, *results))
+        if why := "not run: it is armed, perhaps by another host" if is_barred else why_none:
+            result = CheckResult(check, number, Result.NOT_RUN, why)
+        else:
+            result, why_none = await _run(number, check, client, level)
         results.append(result)
         on_result(result)
-        if not is_at_rest:
-            break
     return results
 
 
-async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, bool]:
-    began, attempts = clock.now(), 0
-    finding: Exception | None = Late("it was not tried")
-    while isinstance(finding, Late) and attempts < MAX_ATTEMPTS:
-        attempts += 1
-        finding, is_at_rest = await _attempt(check, client, level)
-    is_late, reason = isinstance(finding, Late), "" if finding is None else str(finding)
+async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, str]:
+    began, is_again, why = clock.now(), True, ""
+    finding: Exception | None = None
+    with client.watching():
+        while is_again:
+            since = clock.now()
+            finding, why, slow = await _attempt(check, client, level)
+            is_late = isinstance(finding, Late)
+            is_again = is_late and not slow and not why and client.was_late(since)
+    reason = "" if finding is None else str(finding)
+    kinds = {Optional: Result.SKIPPED, Late: Result.SKIPPED, Unusable: Result.NOT_RUN}
     if is_late:
-        reason = f"no verdict: this machine or the line was too slow {attempts} times ({finding})"
-    result = Result.SKIPPED if is_late or isinstance(finding, Optional) else Result.FAILED
-    return CheckResult(
+        late = f"this machine was late by {1e3 * client.lag:.0f} ms"
+        reason = f"no verdict in {client.attempts or 1} attempts: {reason}; {slow or late}"
+    if isinstance(finding, Unusable):
+        reason = f"not run: {reason}"
+    result = CheckResult(
         check=check,
         number=number,
-        result=Result.PASSED if finding is None else result,
+        result=kinds.get(type(finding), Result.FAILED) if finding else Result.PASSED,
         reason=reason,
         seen=getattr(finding, "seen", ""),
         expected=getattr(finding, "expected", ""),
         seconds=clock.now() - began,
-        attempts=attempts,
+        attempts=client.attempts + (not is_late),
         has_verdict=not is_late,
-    ), is_at_rest
+        sent=getattr(finding, "sent", ""),
+        came=getattr(finding, "came", ""),
+        is_armed=isinstance(finding, Armed),
+    )
+    return result, why and f"not run: after {check.name} {why}"
 
 
-async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, bool]:
-    """Run the steps once; return what they found, and whether the amplifier is at rest."""
+async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, str, str]:
+    """Run the steps once.
+
+    Returns what they found; why nothing more can be run, or ""; which reply is always late, or "".
+    """
     finding: Exception | None = None
     subject: Subject | None = None
     client.heard.clear()
@@ -202,7 +255,7 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
         subject = await identified(client, level)
         if check.drives:
             step = subject.can["level_step"] / FULL
-            if subject.level < step:
+            if level < step:
                 raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
             await subject.rest()
         else:
@@ -212,11 +265,27 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
         if client.heard:
             what = "messages that were not asked for"
             raise Violation(what, expected="none", seen=client.heard[0])
-    except (Violation, Optional, Late) as found:
+    except (Violation, Optional, Late, Unusable) as found:
         finding = found
-    try:
-        if check.drives and subject is not None:
-            await subject.rest()
-    except Violation as found:
-        return (finding if isinstance(finding, Violation) else found), False
-    return finding, subject is not None
+    if isinstance(finding, Violation):
+        finding.came = client.came.hex(" ")
+        finding.sent = in_words(subject.sent_set) if subject else ""
+    left = await _left(check, client, subject, level)
+    finding = left if left and not isinstance(finding, Violation) else finding
+    return finding, str(left or ""), subject.slow_reply if subject else ""
+
+
+async def _left(
+    check: Check, client: Client, subject: Subject | None, level: float
+) -> Violation | None:
+    """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
+    due = clock.now() + _RETRIED
+    while subject is None or check.drives:
+        try:
+            with suppress(Unusable):  # it is silent, but cannot be judged
+                await (subject.rest() if subject else identified(client, level))
+            break
+        except Violation as found:
+            if clock.now() > due:
+                return found
+    return None

@@ -7,26 +7,41 @@ contract, nothing to check, or that it came too late.
 
 import asyncio
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
+from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REACTION, REFUSALS
 
 
 class Violation(Exception):
-    """The amplifier does other than the contract: what must be what, and what was seen."""
+    """The amplifier does other than the contract: what must be what, and what was seen.
+
+    sent: the last set, came: the last bytes of the amplifier, in hexadecimal.
+    """
+
+    sent = came = ""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
         self.expected, self.seen = str(expected), f"{what}: {seen}"
         super().__init__(f"{what} must be {expected}, got {seen}")
 
 
+class Armed(Violation):
+    """It is armed, perhaps by another host: nothing is driven."""
+
+
 class Optional(Exception):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
+
+
+class Unusable(Exception):
+    """A capability that the check needs is not as it must be, which its own check reports."""
 
 
 class Late(Exception):
@@ -57,7 +72,14 @@ def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
         raise Violation(what, expected=" or ".join(map(str, known)), seen=seen)
 
 
+MAX_ATTEMPTS = 20
+"""Of a check with all its cases, for which this machine was late."""
+_MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
+_LOOK = 0.005  # s; between looks whether this machine is late
+_STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
+GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
+_MAX_SHOWN = 300  # bytes
 QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 _CODES = {number: name for name, number in REFUSALS.items()}
@@ -81,7 +103,7 @@ class When(NamedTuple):
 class Heard:
     """A message of the amplifier: number of its request (0: an event), type, words.
 
-    frame: that it came in, as its wire has it.
+    frame: that it came in, as its wire has it. Without a type these are bytes that are no frame.
     """
 
     at: float
@@ -114,14 +136,23 @@ class Client(ABC):
 
     heard: messages that no request was waiting for; events: those of type Event; order: types of
     all, as they came. reply_words: the longest reply to each message by its number, where it is
-    known. quiet: time [s] in which a reply comes. transit: time on the wire [s] of a request and
-    the longest reply. session: that was begun last. loss: why the line was lost.
+    known. quiet: time [s] in which a reply comes; timeout: for which one is awaited. wire_time: on
+    the wire [s], of a request and a reply by their words; transit: of the longest reply. session:
+    that was begun last. loss: why the line was lost. came: bytes of the amplifier since the last
+    request.
+
+    neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
+    looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
+    times until a reply began. attempts: of this check that came too late; wasted: the time
+    [s] of all of the run. lag: by how much this machine was late since the check began, at most.
     """
 
     kind: ClassVar[str]
     """Kind of wire: serial, rtu, tcp or can."""
     has_events: ClassVar[bool] = True
     """Whether the wire carries messages that were not asked for."""
+    has_broadcasts: ClassVar[bool] = True
+    """Whether one request can reach all addresses."""
     addresses: ClassVar[int] = 247
     """The highest address."""
     transactions: ClassVar[int] = 1
@@ -136,15 +167,32 @@ class Client(ABC):
         self.events: list[Heard] = []
         self.order: list[int] = []
         self.reply_words: dict[int, int] = {}
+        self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit = 0.0
+        self.timeout = REPLY_TIMEOUT
+        self.came = b""
+        self.neighbours: frozenset[int] = frozenset()
+        self.free = self.attempts = 0
+        self.fastest: dict[str, float] = {}
+        self.reactions: dict[str, list[float]] = defaultdict(list)
+        self.wasted = self.lag = 0.0
         self.quiet = QUIET
         self.session = 0
         self.loss: str | None = None
+        self._others: set[int] = set()
         self._news = asyncio.Event()
 
-    @abstractmethod
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
+        self.came = (self.came + self.hear(data))[-_MAX_SHOWN:]
+
+    @abstractmethod
+    def hear(self, data: bytes) -> bytes:
+        """Take messages from bytes; returns those bytes that are the amplifier's."""
+
+    @abstractmethod
+    def question(self, address: int) -> bytes:
+        """Return the frame of a request that only reads, to an address."""
 
     @abstractmethod
     async def hello(self) -> Values:
@@ -162,6 +210,52 @@ class Client(ABC):
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
 
+    async def look_around(self) -> None:
+        """Learn who else is on the line, by what only reads; once.
+
+        Every address is asked where a broadcast would reach it, else until one is free.
+        """
+        for address in range(self.addresses, 0, -1) if not self.free else ():
+            if address == self.address:
+                continue
+            self.port.write(self.question(address))
+            wait = max(self.quiet, REACTION + self.transit)
+            wait = wait if self.has_broadcasts else GATEWAY_TIMEOUT
+            found = await self.next(lambda each: True, wait)
+            if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
+                self._others.add(address)
+            if address not in self._others:
+                self.free = self.free or address
+                if not self.has_broadcasts:
+                    break
+        self.heard.clear()
+        expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
+        self.neighbours = self.neighbours or frozenset(self._others)
+
+    def was_late(self, since: float) -> bool:
+        """Note an attempt from a time on that came too late; returns whether to make it again."""
+        if self.attempts < MAX_ATTEMPTS:
+            self.attempts += 1
+            self.wasted += clock.now() - since
+        return self.attempts < MAX_ATTEMPTS and self.wasted < _MAX_WASTED
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Measure by how much this machine is late while the context lasts."""
+
+        async def look() -> None:
+            while True:
+                due = clock.now() + _LOOK
+                await asyncio.sleep(_LOOK)
+                self.lag = max(self.lag, clock.now() - due)
+
+        self.attempts, self.lag = 0, 0.0
+        looking = asyncio.create_task(look(), name="how late this machine is")
+        try:
+            yield
+        finally:
+            looking.cancel()
+
     def lost(self, cause: str) -> None:
         """Note why the line was lost."""
         self.loss = cause
@@ -174,6 +268,7 @@ class Client(ABC):
     async def send(self, data: bytes) -> list[Heard]:
         """Send bytes; return what is heard until a reply must have come."""
         self.heard.clear()
+        self.came = b""
         self.port.write(data)
         await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []
@@ -185,10 +280,9 @@ class Client(ABC):
         self.order.append(message.type)
         self._news.set()
 
-    async def next(
-        self, is_meant: Callable[[Heard], bool], timeout: float = REPLY_TIMEOUT
-    ) -> Heard | None:
+    async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:
         """Return the first message that is meant, None if it does not come in time [s]."""
+        self.came = b""
         loop, due = asyncio.get_running_loop(), clock.now() + timeout
         timer = loop.call_at(due, self._news.set)
         try:
@@ -205,6 +299,19 @@ class Client(ABC):
                 await self._news.wait()
         finally:
             timer.cancel()
+
+    async def replied(self, is_meant: Callable[[Heard], bool], number: int) -> Heard:
+        """Return the reply to a message that was sent; Violation where none comes."""
+        before, self.lag = self.lag, 0.0
+        found = await self.next(is_meant, self.timeout)
+        if found is None and self.lag > _STALLED:
+            raise Late(f"no reply came to message {number}")
+        self.lag = max(self.lag, before)
+        if found is None:
+            others = f", but {len(self.came)} other bytes" if self.came else ""
+            seen = f"none within {self.timeout:g} s{others}"
+            raise Violation(f"reply to message {number}", expected="one", seen=seen)
+        return found
 
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""
@@ -228,11 +335,3 @@ def read_as(what: str, read: Callable[..., _T], *arguments: object, **options: o
         return read(*arguments, **options)
     except Refusal as error:
         raise Violation(what, expected="as in the table", seen=error) from None
-
-
-def expect_reply(found: Heard | None, number: int) -> Heard:
-    """Return a reply; Violation where there is none."""
-    if found is None:
-        seen = f"none within {REPLY_TIMEOUT:g} s"
-        raise Violation(f"reply to message {number}", expected="one", seen=seen)
-    return found

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 from drivers.conformance.client import Optional
+from drivers.conformance.stated import Capabilities
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES, has_feature
@@ -60,22 +62,55 @@ FULL = QUANTITIES["level"].per_unit
 
 
 class Material:
-    """What an amplifier can play; level: of driven channels, at most.
+    """What an amplifier can play.
 
-    lowest, highest, frequency, other: frequencies of every channel, in steps.
+    A capability is looked at where it is needed.
     """
 
-    def __init__(self, can: Values, level: float) -> None:
+    def __init__(self, can: Capabilities, level: float) -> None:
         self.can = can
-        self.channels, self.layers = range(can["channels"]), range(can["layers"])
-        limits = [can, *can["limits"]]
-        self.lowest = max(one["frequency_min"] for one in limits)
-        self.highest = min(one["frequency_max"] for one in limits)
-        self.level = min(level, *(one["level_max"] / FULL for one in limits))
+        self._level = level
+        self.channels = range(can["channels"])
+
+    @property
+    def layers(self) -> range:
+        """The numbers of its layers."""
+        return range(self.can["layers"])
+
+    @cached_property
+    def level(self) -> float:
+        """Of driven channels, at most; Optional where it has none so low."""
+        limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
+        level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
+        if level < step:
+            raise Optional(f"its level_max of {level:g} is below its level_step of {step:g}")
+        return level
+
+    @cached_property
+    def lowest(self) -> int:
+        """The lowest frequency of every channel, in steps; Optional where they share none."""
+        limits = [self.can, *self.can["limits"]]
+        lowest = max(one["frequency_min"] for one in limits)
+        if lowest > self.highest:
+            raise Optional("its channels have no frequency in common")
+        return int(lowest)
+
+    @cached_property
+    def highest(self) -> int:
+        """The highest frequency of every channel, in steps."""
+        return int(min(one["frequency_max"] for one in (self.can, *self.can["limits"])))
+
+    @cached_property
+    def frequency(self) -> int:
+        """The usual frequency, in steps."""
         ordinary = QUANTITIES["frequency"].to_wire(110.0)
-        self.frequency = min(max(ordinary, self.lowest), self.highest)
+        return min(max(ordinary, self.lowest), self.highest)
+
+    @cached_property
+    def other(self) -> int:
+        """Another frequency, where there is one, in steps."""
         both = self.frequency + 800, self.lowest, self.highest
-        self.other = next(each for each in both if each <= self.highest)
+        return next(each for each in both if each <= self.highest)
 
     def has(self, feature: str) -> bool:
         """Whether it states a feature; empty: what all have."""

@@ -32,15 +32,16 @@ from drivers.codec.modbus.registers import (
 )
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
+    GATEWAY_TIMEOUT,
     QUIET,
     Answer,
     Client,
     Heard,
+    Late,
     When,
     altered,
     expect,
     expect_equal,
-    expect_reply,
     read_as,
 )
 from drivers.conformance.subject import Subject
@@ -57,22 +58,34 @@ class ModbusClient(Client):
 
     has_events = False
     transactions = 2
+    has_gateway = False
+    """Whether a gateway replies for units that are not there."""
 
     def __init__(self, address: int, *, is_rtu: bool) -> None:
         super().__init__(address)
         self.kind = "rtu" if is_rtu else "tcp"  # type: ignore[misc]
+        self.has_broadcasts = is_rtu  # type: ignore[misc]
         self.is_rtu = is_rtu
         self.number = 0
         self._buffer = b""
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the port."""
+    def hear(self, data: bytes) -> bytes:
+        """Take responses from bytes, also what is none; those of a gateway are left out."""
         split = partial(split_rtu, size_of=response_size) if self.is_rtu else split_tcp
         found, self._buffer = split(self._buffer + data)
         for adu in found:
-            expect(bool(adu.pdu), "response", expected="a valid frame", seen=adu.raw.hex())
-            heard = Heard(clock.now(), adu.transaction, adu.pdu[0], (), (adu.unit, adu.pdu))
-            self.take(heard)
+            is_own = adu.unit == self.address or not adu.pdu
+            if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY:
+                self.has_gateway, self.timeout = True, GATEWAY_TIMEOUT
+                continue
+            kind, frame = (adu.pdu or b"\0")[0], (adu.unit, adu.pdu or adu.raw)
+            self.take(Heard(clock.now(), adu.transaction, kind, (), frame))
+            self._others |= set() if is_own else {adu.unit}
+        return data
+
+    def question(self, address: int) -> bytes:
+        """Return the frame that reads the identity of a unit."""
+        return self.adu(read_pdu(IDENTITY, IDENTITY_COUNT), unit=address)
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
         """Return a PDU in a frame under the next transaction number."""
@@ -87,8 +100,9 @@ class ModbusClient(Client):
         self._buffer = b""
         number = 0 if self.is_rtu else self.number
         self.port.write(data)
-        heard = expect_reply(await self.next(lambda each: each.number == number), pdu[0])
+        heard = await self.replied(lambda each: each.number == number or not each.type, pdu[0])
         unit, response = heard.frame
+        expect(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
         seen = unit, response[0] & ~EXCEPTION
         expect_equal(seen, (self.address, pdu[0]), "unit, function of a response")
         head, size = response_form(pdu)
@@ -139,9 +153,10 @@ class ModbusClient(Client):
         return self.adu(self.write_of(number, words), unit=to)
 
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
-        """Yield frames with damage of all kinds."""
+        """Yield frames with damage of all kinds; a gateway keeps those to other units."""
         pdu = self.write_of(number, words)
-        yield "another unit", self.adu(pdu, unit=self.address % self.addresses + 1)
+        if not self.has_gateway:
+            yield "another unit", self.adu(pdu, unit=self.free)
         if self.is_rtu:
             frame = self.adu(pdu)
             for at in (-2, -1, -4):
@@ -157,6 +172,7 @@ class ModbusClient(Client):
 
 
 _PLACE = "modbus.md#registers"
+_GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response of it
 _PING, _STATUS, _CAPS, _ACHIEVED, _STOP = (
     MESSAGES[name].number for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop")
 )
@@ -185,7 +201,7 @@ async def areas(subject: Subject) -> None:
     for tag in (1, 0xFFFF, 77):
         await write(_PING, tag, 1)
         shown = await area(_PING)
-        behind = shown[HEAD + 9 + len(subject.channels) + len(subject.layers) :]
+        behind = shown[HEAD + client.reply_words[_PING] :]
         expect_equal((*shown[:2], any(behind)), (tag, 0, False), "tag, result, registers behind")
         expect_equal(await area(_PING, 3, HEAD + 3), shown[HEAD + 3 : HEAD + 6], "part of an area")
     await write(_ACHIEVED, 5, 0)
@@ -208,12 +224,14 @@ async def areas(subject: Subject) -> None:
 async def present_areas(subject: Subject) -> None:
     """It shows the status of the moment at every read, and other replies as they were."""
     client = _client(subject)
+    await client.look_around()
     await subject.run([subject.arm, subject.one(), subject.ping])
     kept = await client.read(BOX * _PING + REPLY, AREA)
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
     again = await client.read(BOX * _PING + REPLY, AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     if client.is_rtu:
+        subject.require_alone()
         data = client.adu(client.write_of(_PING, [subject.session], tag=4242), unit=0)
         await client.expect_silence(data, "a Ping for all")
         await subject.starve()
@@ -274,7 +292,7 @@ async def exceptions(subject: Subject) -> None:
 async def pieces(subject: Subject) -> None:
     """It takes a frame in pieces, gives half a frame up after a pause, and loses none behind it."""
     client = _client(subject)
-    pause = 0.012 if client.is_rtu else 0.2  # s; within a frame, none on RTU above 20 ms
+    pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
 
     def frame() -> bytes:
         return client.request(_PING, [1])
@@ -288,8 +306,11 @@ async def pieces(subject: Subject) -> None:
     else:
         cases.append((b"", 0.0, frame() + frame(), 2))
     for first, wait, second, count in cases:
+        began = clock.now()
         client.port.write(first)
         await asyncio.sleep(wait)
+        if wait < limit < clock.now() - began:
+            raise Late("the rest of a frame came too late")
         heard = await client.send(second)
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
         expect_equal(len(heard), count, what)

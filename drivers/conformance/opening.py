@@ -55,7 +55,8 @@ async def opened(url: str) -> AsyncIterator[Client]:
     client.port = _TracedPort(port, url)
     try:
         client.session = random.getrandbits(16)
-        client.transit = address.make_wire().exchange_time(0, MAX_WORDS)
+        client.wire_time = address.make_wire().exchange_time
+        client.transit = client.wire_time(0, MAX_WORDS)
         yield client
     finally:
         port.close()

@@ -15,7 +15,7 @@ from drivers.protocol.table import SHORTENED_FADE
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
 _MAX_VOICES = 24  # that are tried
-_PAUSE = 0.004  # s; between the sets of voices
+_PAUSE = 0.004  # s; between the sets of voices, at least
 
 
 @driving(_SETS)
@@ -193,36 +193,38 @@ async def phases(subject: Subject) -> None:
     await subject.arm()
     await subject.require_interference()
     silent, slow = play(layer(0), *map(layer, subject.layers[1:])), max(subject.lowest, _SLOW) / 20
+    if subject.exchange_time / subject.client.transactions > 0.25 / slow:
+        raise Optional("the line is too slow to see phases of tones that began apart")
     for channel in subject.channels:
         first = layer(0, subject.tone(channel, 0.5, 30.0))
         for number in subject.layers[1:]:
             other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
             await subject.run([play(first, other), silent])
-        for phase in (90.0, -90.0):
-            await _expect_turned(subject, channel, phase, 0.25)
-    for periods in (0.25, 0.5):
-        await _expect_turned(subject, 0, 0.0, round(0.9 * slow) + periods)
-    for keep in (True, False):
-        await _expect_turned(subject, 0, 0.0, 0.5, keep=keep)
+    turned: list[tuple[int, float, float, bool | None]] = [
+        *((channel, phase, 1.25, None) for channel in subject.channels for phase in (90.0, -90.0)),
+        *((0, 0.0, round(0.9 * slow) + periods, None) for periods in (0.25, 0.5)),
+        *((0, 0.0, 0.5, keep) for keep in (True, False)),
+    ]
+    for case in turned:
+        await subject.in_time(partial(_expect_turned, subject, *case))
 
 
 async def _expect_turned(
-    subject: Subject, channel: int, phase: float, periods: float, *, keep: bool | None = None
+    subject: Subject, channel: int, phase: float, periods: float, keep: bool | None
 ) -> None:
     """Play two tones some periods apart; keep: both at once, one of them again with that flag."""
     slow = max(subject.lowest, _SLOW)
-    if subject.exchange_time > 0.25 * 20 / slow:
-        raise Optional("the line is too slow to see phases of tones that began apart")
+    await subject.arm()
+    subject.shown.outputs.interferes = True
     tone = subject.tone(channel, 0.5, frequency=slow)
     again = replace(subject.tone(channel, 0.5, phase, keep=bool(keep)), frequency=slow)
     time = periods * 20 / slow
     first = await subject.play(layer(0, tone), *([] if keep is None else [layer(1, tone)]))
-    await subject.pause(time)
+    await subject.pause(first.when.earliest + time - clock.now())
     second = await subject.play(layer(1, again))
     if second.when.latest - first.when.earliest > time + 0.25 * 20 / slow:
         raise Late("two sets were too far apart in time")
     await subject.status()
-    await subject.play(layer(0), layer(1))
 
 
 @driving(_PLACE)
@@ -236,10 +238,12 @@ async def voices(subject: Subject) -> None:
     ]
     await subject.arm()
     subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
+    # Apart, so that the oldest has faded further than the newest, but none ends before the last.
+    pause = max(0.4 * ramp / 1000 / sets - subject.exchange_time, _PAUSE + onset.step / 10_000)
     began = clock.now()
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
-        await asyncio.sleep(_PAUSE + onset.step / 10_000)
+        await asyncio.sleep(pause)
     if last.when.latest - began > 0.8 * ramp / 1000:
         raise Late("sets were too far apart for so many voices")
     cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)

@@ -27,7 +27,6 @@ from drivers.conformance.client import (
     When,
     altered,
     expect_equal,
-    expect_reply,
     read_as,
 )
 from drivers.conformance.material import layer
@@ -50,8 +49,8 @@ class SerialClient(Client):
         self.invalid = 0
         self._reader = FrameReader(on_invalid=self._count)
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the port."""
+    def hear(self, data: bytes) -> bytes:
+        """Take messages from bytes."""
         for frame in self._reader.feed(data):
             is_text = frame.kind == HELLO | REPLY
             if len(frame.payload) % 2 and not is_text:
@@ -60,6 +59,12 @@ class SerialClient(Client):
             words = () if is_text else unpack_words(frame.payload)
             heard = Heard(clock.now(), frame.sequence, frame.kind, words, frame)
             self.take(heard, is_event=frame.kind == EVENT)
+            self._others |= {frame.address} - {self.address}
+        return data
+
+    def question(self, address: int) -> bytes:
+        """Return the frame of a Hello to an address."""
+        return self.frame(HELLO, b"", to=address, version=NEUTRAL)
 
     async def hello(self) -> Values:
         """Read the identity."""
@@ -92,8 +97,9 @@ class SerialClient(Client):
     async def _replied(self, number: int, payload: bytes, version: int) -> Heard:
         self.port.write(self.frame(number, payload, version=version))
         sequence = self.sequence
-        found = await self.next(lambda each: each.number == sequence and each.type != EVENT)
-        heard = expect_reply(found, number)
+        heard = await self.replied(
+            lambda each: each.number == sequence and each.type != EVENT, number
+        )
         expect_equal(heard.frame.address, self.address, "address of a reply")
         return heard
 
@@ -115,7 +121,6 @@ class SerialClient(Client):
         content = cobs.decode(good[1:-1])
         long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
         reply = bytes([content[0] | REPLY]) + content[1:-_CRC_SIZE]
-        other = self.address % self.addresses + 1
         bits = (
             (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
         )
@@ -127,7 +132,7 @@ class SerialClient(Client):
             "no CRC": _framed(content[:-_CRC_SIZE]),
             "more than 240 bytes of payload": _framed(_checked(long)),
             "the bit of a reply": _framed(_checked(reply)),
-            "another address": self.request(number, words, to=other),
+            "another address": self.request(number, words, to=self.free),
         }.items()
 
     def _count(self, piece: bytes) -> None:
@@ -150,6 +155,7 @@ _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 @driving(_PLACE)
 async def damaged_frames(subject: Subject) -> None:
     """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
+    await subject.client.look_around()
     await subject.arm()
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))

@@ -23,6 +23,7 @@ from drivers.conformance.client import (
 )
 from drivers.conformance.expected import NAMES, Judge
 from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
+from drivers.conformance.stated import STATED, Capabilities
 from drivers.expected.amplifier import OFF
 from drivers.host.wire import reply_words
 from drivers.protocol.records import Values
@@ -31,13 +32,12 @@ from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STAT
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
-MAX_ATTEMPTS = 10
-"""Of a check, or a case of one, for which this machine was late."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
 _PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest that count
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
+_FEW = 3  # replies, which this machine does not make late by chance
 _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
@@ -49,15 +49,16 @@ class Subject(Material):
     """An identified amplifier at the far end of a client; level: of driven channels, at most.
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
+    sent_set: the parts of the last set that was sent.
     """
 
-    def __init__(self, client: Client, identity: Values, can: Values, level: float) -> None:
+    def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
         super().__init__(can, level)
         self.client, self.identity = client, identity
         self.session, self.token = 1, 0
         self.expected: Judge | None = None
         self.is_starving = True
-        self._exchange_time = self._read_time = math.inf
+        self.sent_set: list[Sequence[int]] = []
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
         channels, layers = can["channels"], can["layers"]
@@ -115,15 +116,19 @@ class Subject(Material):
                 raw = message.request.pack(values)
             except ValueError:  # beyond the table
                 raw = [values[each] for each in message.request.names]
-        sent = clock.now()
-        answer = await self.client.exchange(message.number, raw)
+        if name == "Set":
+            is_part = self.sent_set and [*self.sent_set[-1][:2]] == [*raw[:2]]
+            self.sent_set = [*(self.sent_set if is_part else ()), raw]
+        client, sent = self.client, clock.now()
+        answer = await client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
         took = clock.now() - sent
-        self.client.quiet = min(self.client.quiet, QUIET + took)
-        if name in _READ_ALONE:
-            self._read_time = min(self._read_time, took)
-        else:
-            self._exchange_time = min(self._exchange_time, took)
+        client.quiet = min(client.quiet, QUIET + took)
+        if not answer.code:  # a refusal may come sooner
+            beyond = max(took - client.wire_time(len(raw), len(answer.words)), 0.0)
+            count = 1 if name in _READ_ALONE else client.transactions
+            client.fastest[name] = min(client.fastest.get(name, math.inf), took)
+            client.reactions[name].append(beyond / count)
         self.heard_at = answer.when.latest
         return answer
 
@@ -133,8 +138,8 @@ class Subject(Material):
 
     async def _carried_out(self, name: str, values: Values, answer: Answer) -> Answer:
         """Read the reply to a request, and compare it with what must be shown."""
-        unpack = MESSAGES[name].reply.unpack
-        shown = read_as(f"reply to {name}", unpack, answer.words, is_strict=False)
+        record = STATED if name == "GetCaps" else MESSAGES[name].reply
+        shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
@@ -220,13 +225,19 @@ class Subject(Material):
         self.is_starving = True
 
     async def rest(self) -> None:
-        """Bring it to silence, disarmed, nothing latched."""
+        """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
         self.expected = None
         await self.request("Stop", ramp=0)
         stopped = await self.settle()
-        await self.request("Clear", latch=stopped["latch"])
+        cleared = await self.request("Clear", latch=stopped["latch"])
+        expect_equal(cleared["state"], OFF, "state after Clear")
         await self.watch()
-        expect_equal(self.shown.state, OFF, "state after Clear")
+
+    def require_alone(self) -> None:
+        """Raise Optional where what is for all would reach other amplifiers."""
+        if others := sorted(self.client.neighbours):
+            where = ", ".join(map(str, others))
+            raise Optional(f"left out, since it would reach others: what is for all ({where})")
 
     async def watch(self) -> None:
         """Judge all replies from now on, by the status as it is."""
@@ -248,7 +259,9 @@ class Subject(Material):
     def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:
         """Return a set of one part that plays at once, and its words."""
         (part,) = self.parts(*layers)
-        return part, MESSAGES["Set"].request.pack({"session": self.session, **part})
+        words = MESSAGES["Set"].request.pack({"session": self.session, **part})
+        self.sent_set = [words]
+        return part, words
 
     def played(self, part: Values, when: When) -> None:
         """Note that a set of one part was carried out."""
@@ -263,14 +276,15 @@ class Subject(Material):
 
     @property
     def exchange_time(self) -> float:
-        """The shortest exchange [s] so far, or what it may take on this line if that is less.
+        """The shortest exchange [s] of the slowest message so far, or what it may take if less.
 
         Lest an amplifier that is late has longer times. A line may delay more than is known of it,
         which a reading shows.
         """
-        count = self.client.transactions
-        line = max(self.client.transit, count * self._read_time)
-        return min(self._exchange_time, count * REACTION + line)
+        count, fastest = self.client.transactions, self.client.fastest
+        read = min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
+        slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
+        return min(slowest, count * REACTION + max(self.client.transit, count * read))
 
     @property
     def slowness(self) -> float:
@@ -355,14 +369,23 @@ class Subject(Material):
 
     async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
         """Try a case, each time from rest, until this machine was in time."""
-        for attempt in range(1, MAX_ATTEMPTS + 1):
+        while True:
+            began = clock.now()
             await self.rest()
             try:
                 await case()
                 return
             except Late:
-                if attempt == MAX_ATTEMPTS:
+                if self.slow_reply or not self.client.was_late(began):
                     raise
+
+    @property
+    def slow_reply(self) -> str:
+        """Which message it always replies to later than it may, and by when; empty if none."""
+        for name, times in self.client.reactions.items():
+            if len(times) >= _FEW and (least := min(times)) > REACTION:
+                return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
+        return ""
 
     async def require_interference(self) -> None:
         """Raise Optional where levels do not show that tones of one frequency cancel."""

@@ -4,7 +4,7 @@ It is a simulated one, or any other far end of a wire: the firmware, an example.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
@@ -21,6 +21,7 @@ KINDS = tuple(PROTOCOLS)
 CLIENTS = {kind: BY_PROTOCOL[protocol] for kind, protocol in PROTOCOLS.items()}
 """Clients of the kinds of wires."""
 DELAY = 0.0002  # s; of bytes on their way
+_MOMENT = 1e-9  # s; between what is sent at once
 _TURN = 0.0005  # s; between looks at what is due
 
 Judged: TypeAlias = Amplifier | Callable[[Callable[[bytes], None]], FarEnd]
@@ -28,16 +29,20 @@ Judged: TypeAlias = Amplifier | Callable[[Callable[[bytes], None]], FarEnd]
 
 
 class JudgedLine:
-    """A line to an amplifier at address 1; a `Port` of its client."""
+    """A line to an amplifier at address 1 and its neighbours; a `Port` of its client."""
 
-    def __init__(self, kind: str, far: Judged) -> None:
+    def __init__(
+        self, kind: str, far: Judged, neighbours: Mapping[int, Amplifier] | None = None
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.port = self
+        self._due = 0.0
         self._ticked: list[Amplifier | FarEnd] = []
         if isinstance(far, Amplifier):
-            self._ticked.append(far)
-            self._end = WIRES[kind].far_end({1: far}, self._send)
+            known = {1: far, **(neighbours or {})}
+            self._ticked += known.values()
+            self._end = WIRES[kind].far_end(known, self._send)
         else:
             self._end = far(self._send)
         self._ticked.append(self._end)
@@ -54,7 +59,8 @@ class JudgedLine:
         self._ticking.cancel()
 
     def _send(self, data: bytes) -> None:
-        self._loop.call_later(DELAY, self.client.received, data)
+        self._due = max(self._loop.time() + DELAY, self._due + _MOMENT)  # in their order
+        self._loop.call_at(self._due, self.client.received, data)
 
     async def _tick(self) -> None:
         """Let happen what is due by itself."""
@@ -86,9 +92,10 @@ async def results_of(
     *,
     level: float = LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
+    neighbours: Mapping[int, Amplifier] | None = None,
 ) -> list[CheckResult]:
     """Results of checks by name, all without names, on an amplifier on a kind of wire."""
-    line = JudgedLine(kind, far)
+    line = JudgedLine(kind, far, neighbours)
     chosen = [each for each in of_kind(kind) if not names or each[1].name in names]
     try:
         return [*await run_checks(chosen, line.client, level=level, on_result=on_result)]
@@ -103,9 +110,12 @@ def judged(
     level: float = LEVEL,
     far: Judged | None = None,
     on_result: Callable[[CheckResult], None] = lambda result: None,
+    neighbours: Mapping[int, Amplifier] | None = None,
 ) -> list[CheckResult]:
     """Results on an amplifier, a `varied` one if none is given, in virtual time."""
     unknown = set(names) - {check.name for check in CHECKS}
     assert not unknown, unknown
     far = far or varied()
-    return run_virtual(results_of(kind, far, names, level=level, on_result=on_result))
+    return run_virtual(
+        results_of(kind, far, names, level=level, on_result=on_result, neighbours=neighbours)
+    )

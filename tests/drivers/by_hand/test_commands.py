@@ -13,8 +13,9 @@ from typer.testing import CliRunner, Result
 
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.by_hand.cli import app
+from drivers.conformance import Report
 from drivers.contents import Tone
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandError, CommandRefused, LinkError
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -169,6 +170,27 @@ async def test_conformance_stops_after_a_failed_reading_check() -> None:
         assert report["not_run"] > 40
         rows = {row["name"]: row for row in report["checks"]}
         assert rows["starts_disarmed"]["result"] == "failed"
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), LinkError("line was lost")])
+async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
+    end: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By Ctrl-C, or a line that was lost and is there again: stopped, cleared, its state told."""
+    async with WORD_WIRES["serial"](1) as far:
+
+        async def judged(url: str, *, drives: bool, **others: Any) -> Report:
+            if drives:
+                far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000}, monotonic())
+                raise end
+            return Report(url, 0.0, (), 1)
+
+        monkeypatch.setattr("drivers.conformance.judge", judged)
+        result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")
+        assert result.exit_code != 0
+        assert f"{far.url(1)} is left in SWITCH_ON_DISABLED" in result.stderr
+        assert far.amplifiers[1].state == "SWITCH_ON_DISABLED"
 
 
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,5 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -237,11 +236,12 @@ def amplifier_statuses(
     *,
     are_open: bool,
     lost: Loss | None,
+    what_may_play: Callable[[str], Stopped],
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last statuses, without sending a request.
 
     are_open: whether all are open together; else their last statuses are left out. lost: the loss
-    that has closed the others.
+    that has closed the others. what_may_play: by name, of those that do not reply.
     """
     missing = () if lost is None else lost.names
     return [
@@ -251,13 +251,20 @@ def amplifier_statuses(
             url,
             is_open=are_open,
             closed_with_lost=bool(missing) and name not in missing,
+            what_may_play=what_may_play,
         )
         for name, url in urls.items()
     ]
 
 
 def _amplifier_status(
-    name: str, amplifier: Amplifier | None, url: str, *, is_open: bool, closed_with_lost: bool
+    name: str,
+    amplifier: Amplifier | None,
+    url: str,
+    *,
+    is_open: bool,
+    closed_with_lost: bool,
+    what_may_play: Callable[[str], Stopped],
 ) -> AmplifierStatus:
     """closed_with_lost: whether it was closed because another amplifier was lost."""
     status = status_at = serial_number = None
@@ -283,6 +290,9 @@ def _amplifier_status(
         degraded=is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
+        silence=amplifier_silence(what_may_play(name), clock.now())
+        if status is None or is_degraded
+        else None,
         statistics=LinkCounters(
             frames_out=counts.frames_out,
             frames_in=counts.frames_in,
@@ -298,15 +308,8 @@ def _amplifier_status(
 
 
 def amplifier_silence(stopped: Stopped, now: float) -> AmplifierSilence:
-    """Describe what became of a stop at a time [s]."""
-    if stopped.is_confirmed:
-        return AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="")
-    left = stopped.may_play_until - now
-    return AmplifierSilence(
-        silence="watchdog_elapsed" if -math.inf < left <= 0 else "may_play",
-        may_play_for_s=round(max(left, 0.0), 3) if math.isfinite(left) else None,
-        cause=stopped.cause,
-    )
+    """Describe what an amplifier may play at a time [s], after a stop or as it is known."""
+    return AmplifierSilence(**stopped.rows(now))
 
 
 def learning_summary(

@@ -89,6 +89,7 @@ class Daemon:
                 config.urls,
                 are_open=self._controller.group.is_open,
                 lost=self._supervisor.operation.lost,
+                what_may_play=self._supervisor.what_may_play,
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,

@@ -8,7 +8,13 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from drivers.contents import Layer
-from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    LinkDegraded,
+    Preempted,
+    WrongAmplifier,
+)
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
@@ -384,5 +390,7 @@ class Dialogue:
             is_disarmed=True,
         )
 
-    def _driven_by_another(self) -> LinkError:
-        return LinkError(f"amplifier {self.name} is driven by another host; end that one first")
+    def _driven_by_another(self) -> WrongAmplifier:
+        return WrongAmplifier(
+            f"amplifier {self.name} is driven by another host; end that one first"
+        )

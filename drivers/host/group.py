@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
+from drivers import clock
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -20,7 +21,7 @@ from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.host.members import GroupState, Members, is_lost
-from drivers.host.stop import Stopped
+from drivers.host.stop import Stopped, what_may_play
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
@@ -238,8 +239,7 @@ class Group(Members):
             stops, await asyncio.gather(*stops.values(), return_exceptions=True), strict=True
         ):
             if isinstance(result, BaseException):
-                until = self.amplifiers[name].feeding.may_play_until
-                result = Stopped(False, until, f"{type(result).__name__}: {result}")
+                result = what_may_play(self.amplifiers[name], f"{type(result).__name__}: {result}")
             outcomes[name] = result
         return outcomes
 
@@ -282,15 +282,19 @@ class Group(Members):
 
         A failure stops all amplifiers and is logged. The lines are left to their owner.
         """
-        is_armed = self.is_armed
+        is_armed, now = self.is_armed, clock.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
         async with self._closing:
             members = [
                 each
                 for each in self.amplifiers.values()
-                if each.may_be_armed and (is_armed or not is_lost(each))
+                if each.may_be_armed
+                and (is_armed or each.line.loss is None)
+                and (is_armed or not is_lost(each) or what_may_play(each).may_play_until > now)
             ]
+            if self._silencing:  # a line is closed once what stops on it has ended
+                await asyncio.wait({*self._silencing})
             if not members:
                 return
             try:

@@ -27,7 +27,7 @@ from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
 from drivers.host.members import Played
 from drivers.host.stop import UNREACHED, Stopped, what_may_play
-from drivers.host.timing import HEARTBEAT
+from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
@@ -207,8 +207,8 @@ class Controller:
             amplifier.go_on_from(self._opened[name])
         self._opened[name] = self.group.amplifiers[name] = amplifier
         if name in self._owed:
-            stopping = asyncio.ensure_future(self.group.stop(waits_for=[name]))
-            self._owed.pop(name).set_result(stopping)
+            stopping = _identified(amplifier, self.group.stop(waits_for=[name]))
+            self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
         return amplifier
 
     async def arm(self) -> None:
@@ -236,12 +236,16 @@ class Controller:
         The requests on open lines are queued when this returns. Await it for what is known of each,
         by name: of one whose line is opened within 0.3 s by its reply.
         """
-        stopping, owed = self.group.stop(), self._owed
+        stopping = self.group.stop()
+        self._owe()
+        return self._stopped(stopping, {**self._owed})
+
+    def _owe(self) -> None:
+        """Owe a stop to each amplifier whose line is closed."""
         for name in self.urls:
             amplifier = self.group.amplifiers.get(name)
             if amplifier is None or amplifier.line.loss is not None:
-                owed.setdefault(name, asyncio.get_running_loop().create_future())
-        return self._stopped(stopping, {**owed})
+                self._owed.setdefault(name, asyncio.get_running_loop().create_future())
 
     async def _stopped(
         self,
@@ -251,6 +255,7 @@ class Controller:
         if owed:
             await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
         outcomes = {**await stopping}
+        self._owe()  # what was lost meanwhile
         for opened in owed.values():
             if opened.done():
                 outcomes |= await opened.result()
@@ -516,3 +521,14 @@ class Controller:
                 event(observer)
             except Exception:
                 _logger.exception("loop: observer failed")
+
+
+async def _identified(
+    amplifier: Amplifier, stopping: Awaitable[Mapping[str, Stopped]]
+) -> Mapping[str, Stopped]:
+    """Await a stop, and identify the amplifier meanwhile: an unknown one confirms nothing."""
+    identifying = asyncio.gather(amplifier.identify(timeout=REPLY_TIMEOUT), return_exceptions=True)
+    try:
+        return await stopping
+    finally:
+        identifying.cancel()

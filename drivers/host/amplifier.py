@@ -72,7 +72,8 @@ class Amplifier(Dialogue):
 
     def go_on_from(self, before: "Amplifier") -> None:
         """Know what was known of it when its line was opened before, and may have been lost."""
-        self.known, self.may_be_armed = what_may_play(before), before.may_be_armed
+        self.known = replace(what_may_play(before), is_confirmed=before.known.is_confirmed)
+        self.may_be_armed = before.may_be_armed
 
     async def open(self) -> None:
         """Identify it and leave it disarmed; a latched stop or fault stays.

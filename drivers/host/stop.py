@@ -54,15 +54,16 @@ UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
 
 
 def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
-    """Return what an amplifier may play by all that is known of it; cause: why no more is known.
+    """Return until when an amplifier may play by all that is known of it.
 
-    Silent is one that has confirmed a stop, and was sent neither Clear nor Arm since. Else the
-    watchdog ends what was fed; what was never fed, and showed that it is silent, is over. One that
-    shows more after its watchdog must have silenced it is fed by another, or broken.
+    cause: why no more is known. Over is what confirmed a stop, and was sent neither Clear nor Arm
+    since. Else the watchdog ends what was fed, and what was never fed is over once it has shown
+    that it is silent. One that shows more after its watchdog must have silenced it is fed by
+    another, or broken. Nothing confirms a stop but a status that comes after it.
     """
     known, status, at = amplifier.known, amplifier.status, amplifier.status_at
     if known.is_confirmed:
-        return known
+        return Stopped(False, known.may_play_until, cause)
     until = max(amplifier.feeding.may_play_until, known.may_play_until)
     if status is not None and at is not None:
         is_armed = status["state"] == ENABLED

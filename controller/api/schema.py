@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from controller.learning.learning_status import LearningState
+from drivers.host.reports import ReportKind
 
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
@@ -268,6 +269,14 @@ class AmplifierSilence(Message):
         return "unconfirmed, its watchdog has elapsed"
 
 
+class AmplifierReport(Message):
+    """What an amplifier reports beside a fault; it plays on."""
+
+    kind: ReportKind = Field(description="what it is about")
+    cause: str = Field(description="what it says, and who feels it")
+    remedy: str = Field(description="what to do about it")
+
+
 class AmplifierStatus(Message):
     """One amplifier according to its last reply; null where unknown."""
 
@@ -293,6 +302,9 @@ class AmplifierStatus(Message):
     lost: bool = Field(description="whether the link to it is lost")
     closed_with_lost: bool = Field(
         description="whether it still replied but was closed because another one is lost"
+    )
+    reports: list[AmplifierReport] = Field(
+        [], description="what it has reported within the last 10 s"
     )
     silence: AmplifierSilence | None = Field(
         None, description="what it may play while it does not reply; null while it does"

@@ -36,7 +36,9 @@ def show_status(status: StatusResult) -> str:
         for drive in status.layers.values()
         for era, tone in drive.items()
     ]
-    lines += map(_amplifier, status.amplifiers)
+    for amplifier in status.amplifiers:
+        told = [f"    {each.cause}; {each.remedy}" for each in amplifier.reports]
+        lines += [_amplifier(amplifier), *told]
     latency = status.latency_ms
     if latency.median is not None:
         lines.append(

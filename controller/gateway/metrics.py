@@ -21,6 +21,7 @@ from controller.api.schema import (
     LearningSummary,
 )
 from controller.learning.learning_status import LearningState
+from drivers.host.reports import ReportKind
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -159,7 +160,8 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     gauges = {
         name: GaugeMetricFamily(f"era_amplifier_{name}", text, labels=["amplifier"])
         for name, text in (
-            ("degraded", "Whether it does not reply but may still play."),
+            ("may_play_unconfirmed", "Whether it does not reply, and may still play."),
+            ("degraded", "Whether it does not reply but is not lost, so that nothing new plays."),
             ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
             ("high_voltage", "Whether high voltage is on."),
@@ -172,9 +174,17 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         name: CounterMetricFamily(f"era_link_{name}", text, labels=["amplifier"])
         for name, text in _LINK_COUNTS.items()
     }
+    reports = GaugeMetricFamily(
+        "era_amplifier_report", "1 for what it has reported lately.", labels=["amplifier", "kind"]
+    )
     for amplifier in amplifiers:
+        told = {each.kind for each in amplifier.reports}
+        for kind in get_args(ReportKind):
+            reports.add_metric([amplifier.name, kind], float(kind in told))
+        silence = amplifier.silence
         round_trip = amplifier.statistics.round_trip_ms
         values = {
+            "may_play_unconfirmed": silence is not None and silence.silence == "may_play",
             "degraded": float(amplifier.degraded),
             "lost": float(amplifier.lost),
             "fault": None if amplifier.fault is None else float(amplifier.fault != "NONE"),
@@ -189,5 +199,6 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         counts = amplifier.statistics.model_dump()
         for name, counter in counters.items():
             counter.add_metric([amplifier.name], counts[name])
+    yield reports
     yield from gauges.values()
     yield from counters.values()

@@ -158,6 +158,7 @@ class Amplifier(Dialogue):
                 self.may_be_armed = was_armed
             raise
         self.session, self.feeding.watchdog = session, watchdog
+        self.armed_latch = status["latch"]
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:

@@ -11,6 +11,7 @@ from drivers.contents import Layer
 from drivers.errors import (
     CommandError,
     CommandRefused,
+    FrameError,
     LinkDegraded,
     Preempted,
     WrongAmplifier,
@@ -18,6 +19,7 @@ from drivers.errors import (
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
+from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind, armed_problem, reports_of
 from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
@@ -28,7 +30,6 @@ from drivers.protocol.table import (
     MESSAGES,
     QUANTITIES,
     REACTION,
-    STATUS_FLAGS,
     name_of,
 )
 from drivers.statistics import LinkStatistics
@@ -140,6 +141,10 @@ class Dialogue:
         """The last one."""
         self.status_at: float | None = None
         """When [s] it was read."""
+        self.armed_latch: int | None = None
+        """That of the reply to the last Arm."""
+        self.reported_at: dict[ReportKind, float] = {}
+        """When [s] a status had a report last."""
         self.played_at = -math.inf
         """When [s] a set or silence was sent last."""
         self.committed = 0
@@ -183,14 +188,21 @@ class Dialogue:
         """Stage a set under a token, or play it at once.
 
         It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
-        the reason; Preempted where a stop came first.
+        the reason; Preempted where a stop came first; FrameError for two replies in a row with
+        another token.
         """
-        cuts: list[Values] = []
-        admitted: list[Staged] = []
-        make = partial(self._admit, token, layers, admitted, cuts, now=now)
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
-        (staged,) = admitted
+        for _ in range(MAX_CONTRADICTIONS):
+            cuts: list[Values] = []
+            admitted: list[Staged] = []
+            make = partial(self._admit, token, layers, admitted, cuts, now=now)
+            taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
+            (staged,) = admitted
+            if taken["token"] == token:
+                break
+        else:
+            problem = f"a set with token {token} must be taken, got token {taken['token']}"
+            raise FrameError(str(self.contradicted(problem)))  # no refusal: all are stopped
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
@@ -318,6 +330,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
+        for kind in reports_of(reply):
+            self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -331,11 +345,9 @@ class Dialogue:
         if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
-        problem = None
         tells = not fed and self.feeding.tells(sent_at)
-        if not reply["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
-            problem = "high voltage must be on, got off"
-        elif not fed:
+        problem = armed_problem(reply, self.armed_latch)
+        if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
         problem = problem or ledger.problem_of(reply, sent_at, now)
@@ -361,6 +373,15 @@ class Dialogue:
                     listener(arrival.values)
                 except Exception:
                     _logger.exception("amplifier %s: a listener failed", self.name)
+
+    def _note_report(self, kind: ReportKind, now: float) -> None:
+        """Note that a status has a report, and log it where the last was long ago."""
+        if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+            told = REPORTS[kind]
+            _logger.warning(
+                "amplifier %s: %s", self.name, told.cause, extra={"remedy": told.remedy}
+            )
+        self.reported_at[kind] = now
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it, which must feed within the longest time."""

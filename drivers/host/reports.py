@@ -1,0 +1,65 @@
+"""What an amplifier reports of itself, for its user, and what contradicts its requests."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.protocol.records import Values
+from drivers.protocol.table import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
+
+HOT = 70.0
+"""Temperature [°C] above which it is said; an amplifier that must not go on reports a fault."""
+REPORT_LIFE = 10.0
+"""For how long [s] a report is shown after the last status that had it."""
+_HOT = QUANTITIES["temperature"].to_wire(HOT)
+_HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
+_INTERLOCK, _LIMITED = 1 << STATUS_FLAGS["interlock_open"], 1 << STATUS_FLAGS["limited"]
+
+ReportKind = Literal["limited", "interlock_open", "hot"]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What is reported, in words, and what to do about it."""
+
+    cause: str
+    remedy: str
+
+
+REPORTS: dict[ReportKind, Report] = {
+    "limited": Report(
+        "a channel is cut off at full level: less is played than commanded",
+        "lower the levels, and check full level and capabilities of this amplifier",
+    ),
+    "interlock_open": Report(
+        "its interlock is open", "close the interlock; it does not arm before"
+    ),
+    "hot": Report(
+        f"it is hotter than {HOT:g} °C",
+        "let it cool, and check its fan and its load; it may play less, or stop with a fault",
+    ),
+}
+"""Reports of a status that are no fault, by kind."""
+
+
+def reports_of(status: Values) -> Iterable[ReportKind]:
+    """Return the kinds of reports of a status."""
+    flags = status["flags"]
+    shown = (flags & _LIMITED, flags & _INTERLOCK, status["temperature"] > _HOT)
+    return [kind for kind, is_shown in zip(REPORTS, shown, strict=True) if is_shown]
+
+
+def armed_problem(status: Values, latch: int | None) -> str | None:
+    """Describe what no armed amplifier may report; None if nothing.
+
+    latch: that of the reply to Arm, None before: a stop or fault since would have disarmed it.
+    """
+    if not status["flags"] & _HIGH_VOLTAGE:
+        return "high voltage must be on, got off"
+    if status["flags"] & _INTERLOCK:
+        return "interlock must be closed while armed, got open"
+    if status["fault"]:
+        return f"fault must be NONE while armed, got {name_of(FAULTS, status['fault'])}"
+    if latch not in (None, status["latch"]):
+        return f"latch must be {latch} since it was armed, got {status['latch']}"
+    return None

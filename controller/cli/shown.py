@@ -37,8 +37,8 @@ def show_status(status: StatusResult) -> str:
         for era, tone in drive.items()
     ]
     for amplifier in status.amplifiers:
-        told = [f"    {each.cause}; {each.remedy}" for each in amplifier.reports]
-        lines += [_amplifier(amplifier), *told]
+        reports = [f"    {each.cause}; {each.remedy}" for each in amplifier.reports]
+        lines += [_amplifier(amplifier), *reports]
     latency = status.latency_ms
     if latency.median is not None:
         lines.append(

@@ -178,9 +178,9 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         "era_amplifier_report", "1 for what it has reported lately.", labels=["amplifier", "kind"]
     )
     for amplifier in amplifiers:
-        told = {each.kind for each in amplifier.reports}
+        reported = {each.kind for each in amplifier.reports}
         for kind in get_args(ReportKind):
-            reports.add_metric([amplifier.name, kind], float(kind in told))
+            reports.add_metric([amplifier.name, kind], float(kind in reported))
         silence = amplifier.silence
         round_trip = amplifier.statistics.round_trip_ms
         values = {

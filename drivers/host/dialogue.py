@@ -377,9 +377,9 @@ class Dialogue:
     def _note_report(self, kind: ReportKind, now: float) -> None:
         """Note that a status has a report, and log it where the last was long ago."""
         if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
-            told = REPORTS[kind]
+            report = REPORTS[kind]
             _logger.warning(
-                "amplifier %s: %s", self.name, told.cause, extra={"remedy": told.remedy}
+                "amplifier %s: %s", self.name, report.cause, extra={"remedy": report.remedy}
             )
         self.reported_at[kind] = now
 

@@ -19,7 +19,16 @@ from drivers.errors import (
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
-from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind, armed_problem, reports_of
+from drivers.host.reports import (
+    HIGH_VOLTAGE,
+    HOT,
+    INTERLOCK,
+    REPORT_LIFE,
+    REPORTS,
+    ReportKind,
+    armed_problem,
+    reports_of,
+)
 from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
@@ -330,8 +339,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        for kind in reports_of(reply):
-            self._note_report(kind, now)
+        if (flags := reply["flags"]) & ~HIGH_VOLTAGE or reply["temperature"] > HOT:
+            self._note_reports(reply, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -346,7 +355,9 @@ class Dialogue:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
         tells = not fed and self.feeding.tells(sent_at)
-        problem = armed_problem(reply, self.armed_latch)
+        problem, is_voltage_on = None, flags & (HIGH_VOLTAGE | INTERLOCK) == HIGH_VOLTAGE
+        if not is_voltage_on or reply["fault"] or reply["latch"] != self.armed_latch:
+            problem = armed_problem(reply, self.armed_latch)
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
@@ -374,14 +385,15 @@ class Dialogue:
                 except Exception:
                     _logger.exception("amplifier %s: a listener failed", self.name)
 
-    def _note_report(self, kind: ReportKind, now: float) -> None:
-        """Note that a status has a report, and log it where the last was long ago."""
-        if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
-            report = REPORTS[kind]
-            _logger.warning(
-                "amplifier %s: %s", self.name, report.cause, extra={"remedy": report.remedy}
-            )
-        self.reported_at[kind] = now
+    def _note_reports(self, status: Values, now: float) -> None:
+        """Note the reports of a status, and log those of which the last was long ago."""
+        for kind in reports_of(status):
+            if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+                report = REPORTS[kind]
+                _logger.warning(
+                    "amplifier %s: %s", self.name, report.cause, extra={"remedy": report.remedy}
+                )
+            self.reported_at[kind] = now
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it, which must feed within the longest time."""

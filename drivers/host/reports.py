@@ -7,13 +7,13 @@ from typing import Literal
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
 
-HOT = 70.0
-"""Temperature [°C] above which it is said; an amplifier that must not go on reports a fault."""
+_HOT = 70.0
+HOT = QUANTITIES["temperature"].to_wire(_HOT)
+"""Temperature of the wire above which it is said; one that must not go on reports a fault."""
 REPORT_LIFE = 10.0
 """For how long [s] a report is shown after the last status that had it."""
-_HOT = QUANTITIES["temperature"].to_wire(HOT)
-_HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
-_INTERLOCK, _LIMITED = 1 << STATUS_FLAGS["interlock_open"], 1 << STATUS_FLAGS["limited"]
+HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
+INTERLOCK, _LIMITED = 1 << STATUS_FLAGS["interlock_open"], 1 << STATUS_FLAGS["limited"]
 
 ReportKind = Literal["limited", "interlock_open", "hot"]
 
@@ -35,7 +35,7 @@ REPORTS: dict[ReportKind, Report] = {
         "its interlock is open", "close the interlock; it does not arm before"
     ),
     "hot": Report(
-        f"it is hotter than {HOT:g} °C",
+        f"it is hotter than {_HOT:g} °C",
         "let it cool, and check its fan and its load; it may play less, or stop with a fault",
     ),
 }
@@ -45,7 +45,7 @@ REPORTS: dict[ReportKind, Report] = {
 def reports_of(status: Values) -> Iterable[ReportKind]:
     """Return the kinds of reports of a status."""
     flags = status["flags"]
-    shown = (flags & _LIMITED, flags & _INTERLOCK, status["temperature"] > _HOT)
+    shown = (flags & _LIMITED, flags & INTERLOCK, status["temperature"] > HOT)
     return [kind for kind, is_shown in zip(REPORTS, shown, strict=True) if is_shown]
 
 
@@ -54,9 +54,9 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
 
     latch: that of the reply to Arm, None before: a stop or fault since would have disarmed it.
     """
-    if not status["flags"] & _HIGH_VOLTAGE:
+    if not status["flags"] & HIGH_VOLTAGE:
         return "high voltage must be on, got off"
-    if status["flags"] & _INTERLOCK:
+    if status["flags"] & INTERLOCK:
         return "interlock must be closed while armed, got open"
     if status["fault"]:
         return f"fault must be NONE while armed, got {name_of(FAULTS, status['fault'])}"

@@ -269,12 +269,10 @@ class AmplifierSilence(Message):
         return "unconfirmed, its watchdog has elapsed"
 
 
-class AmplifierReport(Message):
-    """What an amplifier reports beside a fault; it plays on."""
+class AmplifierReport(Explained):
+    """What an amplifier reports beside a fault, and who feels it; it plays on."""
 
-    kind: ReportKind = Field(description="what it is about")
-    cause: str = Field(description="what it says, and who feels it")
-    remedy: str = Field(description="what to do about it")
+    kind: ReportKind
 
 
 class AmplifierStatus(Message):

@@ -327,10 +327,10 @@ def _amplifier_status(
 
 def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     """Describe a report; what is limited is felt less by every finger that feels something."""
-    report, felt = REPORTS[kind], ""
+    cause, remedy = REPORTS[kind]
     if kind == "limited" and targets:
-        felt = f", and fingers feel less than promised: {', '.join(targets)}"
-    return AmplifierReport(kind=kind, cause=report.cause + felt, remedy=report.remedy)
+        cause += f", and fingers feel less than promised: {', '.join(targets)}"
+    return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
 
 
 def amplifier_silence(stopped: Stopped, now: float) -> AmplifierSilence:

@@ -160,8 +160,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     gauges = {
         name: GaugeMetricFamily(f"era_amplifier_{name}", text, labels=["amplifier"])
         for name, text in (
-            ("may_play_unconfirmed", "Whether it does not reply, and may still play."),
-            ("degraded", "Whether it does not reply but is not lost, so that nothing new plays."),
+            ("degraded", "Whether it does not reply but may still play."),
             ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
             ("high_voltage", "Whether high voltage is on."),
@@ -181,10 +180,8 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         reported = {each.kind for each in amplifier.reports}
         for kind in get_args(ReportKind):
             reports.add_metric([amplifier.name, kind], float(kind in reported))
-        silence = amplifier.silence
         round_trip = amplifier.statistics.round_trip_ms
         values = {
-            "may_play_unconfirmed": silence is not None and silence.silence == "may_play",
             "degraded": float(amplifier.degraded),
             "lost": float(amplifier.lost),
             "fault": None if amplifier.fault is None else float(amplifier.fault != "NONE"),

@@ -157,14 +157,10 @@ class Controller:
                 self.group = Group(self._opened, watchdog=self.watchdog)
             opening = [self._amplifier(lines, name) for name in self.urls]
             results = await asyncio.gather(*opening, return_exceptions=True)
-            lost = tuple(
-                name
-                for name, each in zip(self.urls, results, strict=True)
-                if isinstance(each, LinkError)
-            )
-            for each in results:
-                if isinstance(each, LinkError):
-                    each.lost = lost
+            by_name = zip(self.urls, results, strict=True)
+            lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
+            for error in lost.values():
+                error.lost = tuple(lost)
             opened = self.group.checked(results)
             amplifiers = self.group.amplifiers = dict(zip(self.urls, opened, strict=True))
             self._connected(amplifiers)

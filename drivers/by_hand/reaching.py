@@ -91,7 +91,7 @@ def status_rows(status: Values) -> dict[str, Any]:
         "layer_tokens": status["tokens"],
         **({"other_flags": others} if others else {}),
         "reports": [
-            {"kind": kind, "cause": REPORTS[kind].cause, "remedy": REPORTS[kind].remedy}
+            dict(zip(("kind", "cause", "remedy"), (kind, *REPORTS[kind]), strict=True))
             for kind in reports_of(status)
         ],
     }

@@ -389,10 +389,8 @@ class Dialogue:
         """Note the reports of a status, and log those of which the last was long ago."""
         for kind in reports_of(status):
             if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
-                report = REPORTS[kind]
-                _logger.warning(
-                    "amplifier %s: %s", self.name, report.cause, extra={"remedy": report.remedy}
-                )
+                cause, remedy = REPORTS[kind]
+                _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
             self.reported_at[kind] = now
 
     def check_other_host(self) -> None:

@@ -290,8 +290,11 @@ class Group(Members):
                 each
                 for each in self.amplifiers.values()
                 if each.may_be_armed
-                and (is_armed or each.line.loss is None)
-                and (is_armed or not is_lost(each) or what_may_play(each).may_play_until > now)
+                and (
+                    is_armed
+                    or not is_lost(each)
+                    or (each.line.loss is None and what_may_play(each).may_play_until > now)
+                )
             ]
             if self._silencing:  # a line is closed once what stops on it has ended
                 await asyncio.wait({*self._silencing})

@@ -1,7 +1,6 @@
 """What an amplifier reports of itself, for its user, and what contradicts its requests."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
 
 from drivers.protocol.records import Values
@@ -18,28 +17,18 @@ INTERLOCK, _LIMITED = 1 << STATUS_FLAGS["interlock_open"], 1 << STATUS_FLAGS["li
 ReportKind = Literal["limited", "interlock_open", "hot"]
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """What is reported, in words, and what to do about it."""
-
-    cause: str
-    remedy: str
-
-
-REPORTS: dict[ReportKind, Report] = {
-    "limited": Report(
+REPORTS: dict[ReportKind, tuple[str, str]] = {
+    "limited": (
         "a channel is cut off at full level: less is played than commanded",
         "lower the levels, and check full level and capabilities of this amplifier",
     ),
-    "interlock_open": Report(
-        "its interlock is open", "close the interlock; it does not arm before"
-    ),
-    "hot": Report(
+    "interlock_open": ("its interlock is open", "close the interlock; it does not arm before"),
+    "hot": (
         f"it is hotter than {_HOT:g} °C",
         "let it cool, and check its fan and its load; it may play less, or stop with a fault",
     ),
 }
-"""Reports of a status that are no fault, by kind."""
+"""Cause and remedy of the reports of a status that are no fault, by kind."""
 
 
 def reports_of(status: Values) -> Iterable[ReportKind]:

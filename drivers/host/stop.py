@@ -56,12 +56,13 @@ UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
 def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
     """Return until when an amplifier may play by all that is known of it.
 
-    cause: why no more is known. Over is what confirmed a stop, and was sent neither Clear nor Arm
-    since. Else the watchdog ends what was fed, and what was never fed is over once it has shown
-    that it is silent. One that shows more after its watchdog must have silenced it is fed by
-    another, or broken. Nothing confirms a stop but a status that comes after it.
+    cause: why no more is known, by default what ails its line. Over is what confirmed a stop, and
+    was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was never
+    fed is over once it has shown that it is silent. One that shows more after its watchdog must
+    have silenced it is fed by another, or broken. A status after the stop alone confirms it.
     """
     known, status, at = amplifier.known, amplifier.status, amplifier.status_at
+    cause = cause or amplifier.line.loss or amplifier.silence_cause or ""
     if known.is_confirmed:
         return Stopped(False, known.may_play_until, cause)
     until = max(amplifier.feeding.may_play_until, known.may_play_until)
@@ -71,7 +72,7 @@ def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
             until = at if until == math.inf else max(until, at)
         elif (is_armed or any(status["levels"])) and at >= until:
             until = math.inf
-    return Stopped(False, math.inf if until == -math.inf else until, cause or known.cause)
+    return Stopped(False, math.inf if until == -math.inf else until, cause)
 
 
 class Stop:

@@ -30,6 +30,7 @@ let daemon = null;  // result of hello; null while disconnected
 let ownName;  // of this page, in the daemon's log
 let failure = "unreachable";
 let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
+let watchdog;  // s; after which an amplifier without commands silences itself
 let silences = [];  // what amplifiers may play that do not reply
 let outage = null;  // the event of the loss of gateway or daemon, until reconnected
 let linkLoss = null;  // the event of a lost link, and the number of retries
@@ -93,9 +94,10 @@ function showBanner() {
     reason = "link-lost";
     const mayPlay = silences.filter(({ silence }) => silence === "may_play");
     text = `The link to an amplifier is lost${since}. `;
-    if (silences.length && !mayPlay.length) text += "Its watchdog must have silenced it, unconfirmed.";
+    const after = watchdog ? ` after ${watchdog}\u00a0s` : "";
+    if (silences.length && !mayPlay.length) text += `Its watchdog must have silenced it${after}, unconfirmed.`;
     else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It may play until it is switched off.";
-    else text += "It may still be energised, until its watchdog silences it.";
+    else text += `It may still be energised; its watchdog silences it${after}, unconfirmed.`;
   } else if (daemon?.rig.simulated) {
     reason = "simulated";
     text = "Simulated amplifiers: nothing vibrates.";
@@ -121,6 +123,7 @@ function showState(next, word, cause, newEpoch = null) {
 
 function showStatus(status) {
   showState(status.state, status.word, status.cause, status.epoch);
+  watchdog = status.watchdog_s;
   silences = silencesOf(status);
   if (status.lost_for_s !== null) {
     lostSince = new Date(Date.now() - 1000 * status.lost_for_s);

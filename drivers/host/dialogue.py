@@ -39,6 +39,7 @@ from drivers.protocol.table import (
     MESSAGES,
     QUANTITIES,
     REACTION,
+    STATES,
     name_of,
 )
 from drivers.statistics import LinkStatistics
@@ -416,7 +417,8 @@ class Dialogue:
     def disarmed(self, status: Values) -> CommandRefused:
         """Return the error of what plays or feeds, once a status shows that it is not armed."""
         return CommandRefused(
-            f"amplifier {self.name} is no longer armed, fault {name_of(FAULTS, status['fault'])}; "
+            f"amplifier {self.name} is no longer armed but in {name_of(STATES, status['state'])}, "
+            f"fault {name_of(FAULTS, status['fault'])}; "
             "once the cause is gone, clear and arm again",
             is_disarmed=True,
         )

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
@@ -17,7 +18,7 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
-from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
+from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.host.members import GroupState, Members, is_lost
@@ -187,9 +188,11 @@ class Group(Members):
         self._leave_armed()
         await self._silenced(self._disarm, [*self.amplifiers.values()], ramp)
 
-    async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
+    async def _disarm(
+        self, members: Sequence[Amplifier], ramp: float, until: float = math.inf
+    ) -> None:
         try:
-            await self.all([_retried(each, partial(each.disarm, ramp)) for each in members])
+            await self.all([_retried(each, partial(each.disarm, ramp), until) for each in members])
         except BaseException:
             await self.stop()
             raise
@@ -301,7 +304,8 @@ class Group(Members):
             if not members:
                 return
             try:
-                await self._silenced(self._disarm, members, ramp)
+                # Of one that does not reply by then a stop is all that is left.
+                await self._silenced(self._disarm, members, ramp, now + CONFIRM_TIMEOUT)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
 
@@ -327,13 +331,15 @@ def _seen(sent: "asyncio.Future[Values]") -> None:
         sent.exception()
 
 
-async def _retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
-    """Repeat a request until it is answered or the amplifier is lost."""
+async def _retried(
+    amplifier: Amplifier, request: Callable[[], Awaitable[_T]], until: float = math.inf
+) -> _T:
+    """Repeat a request until it is answered or the amplifier is lost, or until a time [s]."""
     while True:
         try:
             return await request()
         except LinkTimeout:
-            if is_lost(amplifier):
+            if is_lost(amplifier) or clock.now() > until:
                 raise
             await asyncio.sleep(_REPEAT_INTERVAL)
 

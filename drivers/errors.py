@@ -2,6 +2,7 @@
 
     DriverError
     ├── LinkError (ConnectionError)       the wire or the amplifier on it cannot be reached
+    │   ├── WrongAmplifier                another one replies, or several, or for another host
     │   └── LinkTimeout (TimeoutError)    no reply in time
     │       └── LinkDegraded              no reply to several requests; the link may recover
     ├── FrameError                        bytes that are not a valid message; the amplifier's fault
@@ -24,6 +25,10 @@ class LinkError(DriverError, ConnectionError):
 
     lost: tuple[str, ...] = ()
     """Names of the amplifiers that are lost, where several are driven and these are known."""
+
+
+class WrongAmplifier(LinkError):
+    """What replies is not the expected amplifier, or not this host's; the text says what to do."""
 
 
 class LinkTimeout(LinkError, TimeoutError):

@@ -90,7 +90,7 @@ class NotSilent(RpcError):
             name: each for name, each in amplifiers.items() if each.silence != "confirmed_silent"
         }
         what = "not confirmed silent: " + ", ".join(
-            f"{name} ({_in_words(each)})" for name, each in unconfirmed.items()
+            f"{name} ({each.words}: {each.cause})" for name, each in unconfirmed.items()
         )
         remedy = "switch these amplifiers off"
         super().__init__(ErrorCode.NOT_SILENT, what, remedy=remedy)
@@ -279,12 +279,3 @@ def _first_problem(error: ValidationError, *, key: str | None = None) -> tuple[s
 def _printable(name: str) -> str:
     """A key, shortened and free of control characters."""
     return (name if name.isprintable() else ascii(name))[:80]
-
-
-def _in_words(outcome: AmplifierSilence) -> str:
-    match outcome.silence, outcome.may_play_for_s:
-        case "may_play", float(left):
-            return f"may play for {left:.2f} s more: {outcome.cause}"
-        case "may_play", _:
-            return f"may play until it is switched off: {outcome.cause}"
-    return f"unreachable, its watchdog has elapsed: {outcome.cause}"

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from controller.learning.learning_status import LearningState
+from drivers.host.reports import ReportKind
 
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
@@ -257,6 +258,38 @@ class LinkCounters(Message):
     round_trip_ms: float | None = Field(description="of the last request")
 
 
+class AmplifierSilence(Message):
+    """What an amplifier may play, after a stop or where it does not reply."""
+
+    silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
+        description="confirmed by its status after a stop; may play; or unconfirmed, but its "
+        "watchdog must have silenced it"
+    )
+    may_play_for_s: float | None = Field(
+        description="time until its watchdog must have silenced it; null if that is not known to "
+        "happen, or if silence is confirmed"
+    )
+    cause: str
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        match self.silence, self.may_play_for_s:
+            case "confirmed_silent", _:
+                return "confirmed silent"
+            case "may_play", float(left):
+                return f"may play for {left:.2f} s more"
+            case "may_play", _:
+                return "may play until it is switched off"
+        return "unconfirmed, its watchdog has elapsed"
+
+
+class AmplifierReport(Explained):
+    """What an amplifier reports beside a fault, and who feels it; it plays on."""
+
+    kind: ReportKind
+
+
 class AmplifierStatus(Message):
     """One amplifier according to its last reply; null where unknown."""
 
@@ -283,20 +316,13 @@ class AmplifierStatus(Message):
     closed_with_lost: bool = Field(
         description="whether it still replied but was closed because another one is lost"
     )
+    reports: list[AmplifierReport] = Field(
+        [], description="what it has reported within the last 10 s"
+    )
+    silence: AmplifierSilence | None = Field(
+        None, description="what it may play while it does not reply; null while it does"
+    )
     statistics: LinkCounters
-
-
-class AmplifierSilence(Message):
-    """Silence of an amplifier after a stop."""
-
-    silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
-        description="confirmed by its status after the stop; may play until its watchdog; or out "
-        "of reach for longer than its watchdog"
-    )
-    may_play_for_s: float | None = Field(
-        description="time until its watchdog silences it; null if none does, or if it is silent"
-    )
-    cause: str
 
 
 class LatencySummary(Message):

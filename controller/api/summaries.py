@@ -8,7 +8,10 @@ SUMMARIES = {
     "status": "Show daemon, amplifiers and contacts.",
     "arm": "Switch the high voltage on. Touches are felt until the lease expires.",
     "renew": "Extend the lease.",
-    "disarm": "Ramp to silence, then switch the high voltage off. Any client may.",
+    "disarm": (
+        "Ramp to silence, then switch the high voltage off. Any client may. While a link is lost "
+        "it stops all amplifiers."
+    ),
     "stop": (
         "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client may, at "
         "any time; error 1006 unless every amplifier is confirmed silent."

@@ -41,7 +41,9 @@ def show_status(status: StatusResult) -> str:
         for drive in status.layers.values()
         for era, tone in drive.items()
     ]
-    lines += map(_amplifier, status.amplifiers)
+    for amplifier in status.amplifiers:
+        reports = [f"    {each.cause}; {each.remedy}" for each in amplifier.reports]
+        lines += [_amplifier(amplifier), *reports]
     latency = status.latency_ms
     if latency.median is not None:
         lines.append(
@@ -66,6 +68,9 @@ def _loss(status: StatusResult) -> str | None:
         return None
     watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
     if status.assume_energised:
+        silences = [each.silence for each in status.amplifiers if each.silence is not None]
+        if any(each.silence == "may_play" and each.may_play_for_s is None for each in silences):
+            watchdog = "nothing that is known silences it: switch it off"
         return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
     return f"unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
 
@@ -111,9 +116,10 @@ def _amplifier(amplifier: AmplifierStatus) -> str:
     """Format an amplifier's last status."""
     details = _given(
         ("{}", amplifier.state),
-        ("does not reply, may play", amplifier.degraded),
+        ("does not reply", amplifier.degraded),
         ("LOST", amplifier.lost),
         ("closed because another was lost", amplifier.closed_with_lost),
+        ("{}", amplifier.silence and amplifier.silence.words),
         ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
         ("{:.1f} degC", amplifier.temperature_c),
         ("last reply {:.2f} s ago", amplifier.reply_age_s),

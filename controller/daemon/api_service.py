@@ -179,6 +179,8 @@ class ApiService:
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
         if params.lease is not None:
             check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+        if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
+            await self._stop(client, params)
         cause = f"disarmed by {params.client or client.name!a}"
         await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
         operation = self._supervisor.operation

@@ -1,7 +1,6 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 from controller.api.methods import EffectsResult, HelloResult
 from controller.api.schema import (
     API_VERSION,
+    AmplifierReport,
     AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
@@ -34,6 +34,7 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
+from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.stop import Stopped
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS, name_of
 from drivers.statistics import LinkStatistics
@@ -74,6 +75,12 @@ class PlateView:
             status.model_copy(update={"leak_db_sl": _finite(leaks[contact.key])})
             for status, contact in zip(statuses, self.contacts, strict=True)
         ]
+
+    @property
+    def targets(self) -> list[str]:
+        """The fingers that feel something now, by source and number."""
+        keys = [each.contact.key for each in self.applied.targets] if self.applied else []
+        return [f"{key.source} {key.id}" for key in keys]
 
     def contacts_event(self) -> ContactsEvent:
         """The event of topic `contacts`."""
@@ -237,11 +244,14 @@ def amplifier_statuses(
     *,
     are_open: bool,
     lost: Loss | None,
+    what_may_play: Callable[[str], Stopped],
+    targets: Sequence[str] = (),
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last statuses, without sending a request.
 
     are_open: whether all are open together; else their last statuses are left out. lost: the loss
-    that has closed the others.
+    that has closed the others. what_may_play: by name, of those that do not reply. targets: the
+    fingers that feel something now.
     """
     missing = () if lost is None else lost.names
     return [
@@ -251,23 +261,37 @@ def amplifier_statuses(
             url,
             is_open=are_open,
             closed_with_lost=bool(missing) and name not in missing,
+            what_may_play=what_may_play,
+            targets=targets,
         )
         for name, url in urls.items()
     ]
 
 
 def _amplifier_status(
-    name: str, amplifier: Amplifier | None, url: str, *, is_open: bool, closed_with_lost: bool
+    name: str,
+    amplifier: Amplifier | None,
+    url: str,
+    *,
+    is_open: bool,
+    closed_with_lost: bool,
+    what_may_play: Callable[[str], Stopped],
+    targets: Sequence[str],
 ) -> AmplifierStatus:
     """closed_with_lost: whether it was closed because another amplifier was lost."""
     status = status_at = serial_number = None
     is_degraded, counts = False, LinkStatistics()
+    reports: list[AmplifierReport] = []
     if amplifier is not None:
         is_known = is_open and not is_lost(amplifier)
         status = amplifier.status if is_known else None
         is_degraded = is_known and amplifier.silence_cause is not None
         status_at = amplifier.status_at
         serial_number = amplifier.identity.get("serial_number")
+        recent = clock.now() - REPORT_LIFE
+        reports = [
+            _report(kind, targets) for kind, at in amplifier.reported_at.items() if at > recent
+        ]
         counts = amplifier.statistics
     return AmplifierStatus(
         name=name,
@@ -283,6 +307,10 @@ def _amplifier_status(
         degraded=is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
+        reports=reports,
+        silence=amplifier_silence(what_may_play(name), clock.now())
+        if status is None or is_degraded
+        else None,
         statistics=LinkCounters(
             frames_out=counts.frames_out,
             frames_in=counts.frames_in,
@@ -297,16 +325,17 @@ def _amplifier_status(
     )
 
 
+def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
+    """Describe a report; what is limited is felt less by every finger that feels something."""
+    cause, remedy = REPORTS[kind]
+    if kind == "limited" and targets:
+        cause += f", and fingers feel less than promised: {', '.join(targets)}"
+    return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
+
+
 def amplifier_silence(stopped: Stopped, now: float) -> AmplifierSilence:
-    """Describe what became of a stop at a time [s]."""
-    if stopped.is_confirmed:
-        return AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="")
-    left = stopped.may_play_until - now
-    return AmplifierSilence(
-        silence="watchdog_elapsed" if -math.inf < left <= 0 else "may_play",
-        may_play_for_s=round(max(left, 0.0), 3) if math.isfinite(left) else None,
-        cause=stopped.cause,
-    )
+    """Describe what an amplifier may play at a time [s], after a stop or as it is known."""
+    return AmplifierSilence(**stopped.rows(now))
 
 
 def learning_summary(

@@ -89,6 +89,8 @@ class Daemon:
                 config.urls,
                 are_open=self._controller.group.is_open,
                 lost=self._supervisor.operation.lost,
+                what_may_play=self._supervisor.what_may_play,
+                targets=self._publisher.view.targets,
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,

@@ -6,7 +6,6 @@ outcome of each action at the amplifiers is the next event; a lost link is one w
 
 import asyncio
 import logging
-import math
 import secrets
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
@@ -29,16 +28,21 @@ from controller.daemon.states import (
 )
 from controller.loop.loop import Controller
 from drivers import clock
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+    WrongAmplifier,
+)
 from drivers.host.stop import Stopped
 from registry.plugins import failure_text
 
 _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON
 _MAX_READ_BACKS = 15
-_WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
-_NOT_CONNECTED = Stopped(False, -math.inf, "the amplifier is not connected")
-SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
+_REOPENING = "the daemon reconnects by itself and stays disarmed"
 
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
 StateObserver = Callable[[Operation, Operation], None]
@@ -111,11 +115,14 @@ class Operator:
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
 
-    def note_lost(self, names: tuple[str, ...]) -> None:
-        """Note which amplifiers are lost now, where that is known."""
-        lost = self.operation.lost
-        if names and lost is not None:
-            self.operation = replace(self.operation, lost=lost._replace(names=names))
+    def note_lost(self, error: Exception) -> None:
+        """Note which amplifiers are lost now, where that is known, and the present cause."""
+        lost, names = self.operation.lost, error.lost if isinstance(error, LinkError) else ()
+        if lost is not None:
+            lost = lost._replace(names=names or lost.names)
+            self.operation = replace(
+                self.operation, cause=str(error), remedy=remedy_of(error), lost=lost
+            )
 
     def tick(self) -> None:
         """End the lease if it has expired, else look again when it will have."""
@@ -137,8 +144,6 @@ class Operator:
         """Apply one transition; return its actions."""
         before, now = self.operation, clock.now()
         try:
-            if event.trigger in (Trigger.LINK_LOST, Trigger.NOT_FOUND):
-                event = replace(event, energised_until=self._energised_until(now))
             self.operation, actions = step(before, event, now)
         except Exception as error:
             self.operation, actions = failed(before, failure_text(error)), (Action.STOP,)
@@ -187,7 +192,7 @@ class Operator:
 
         The requests to the amplifiers are queued when this returns.
         """
-        stopping = self._spawn(self._stopped(self.controller.stop()))
+        stopping = self._spawn(self._stopped(self.controller.stop_all()))
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
@@ -200,25 +205,16 @@ class Operator:
             call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
 
     def assume_energised(self, now: float) -> bool:
-        """Whether a lost amplifier may still be playing at a time [s].
+        """Whether a lost amplifier may still be playing at a time [s], as a stop would say."""
+        return self.operation.lost is not None and any(
+            now < self.what_may_play(name).may_play_until for name in self.controller.urls
+        )
 
-        Over a network for longer: there a request without reply may arrive late, and feed its
-        watchdog.
-        """
+    def what_may_play(self, name: str) -> Stopped:
+        """What an amplifier may play as far as is known, and why no more is."""
         lost = self.operation.lost
-        return lost is not None and now < max(lost.energised_until, self._may_play_until)
-
-    @property
-    def _may_play_until(self) -> float:
-        """When [s] the watchdog must have silenced each amplifier as identified last."""
-        known = self.controller.amplifiers.values()
-        return max((each.feeding.may_play_until for each in known), default=-math.inf)
-
-    def _energised_until(self, now: float) -> float:
-        """When [s] amplifiers that are lost now must be silent; one never seen may be armed."""
-        if self.controller.amplifiers:
-            return self._may_play_until
-        return now + self.controller.watchdog + _WATCHDOG_MARGIN
+        is_named = lost is not None and name in (lost.names or self.controller.urls)
+        return self.controller.what_may_play(name, self.operation.cause if is_named else "")
 
     def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         report = partial(self._link_observer, change, lost, message)
@@ -266,14 +262,10 @@ class Operator:
             raise
 
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
-        """Await a stop of all amplifiers; one that is lost is a lost link."""
+        """Await a stop; an amplifier that is lost is a lost link, handled after its return."""
         stopped = await stopping
-        outcomes = {name: stopped.get(name, _NOT_CONNECTED) for name in self.controller.urls}
-        try:
-            await self._check_links()
-        except Exception:
-            _logger.exception("handling of a lost link failed")
-        return outcomes
+        self._spawn(self._check_links())  # which may stop all once more
+        return stopped
 
     async def _stop(self) -> None:
         await self._stopped(self.controller.stop())
@@ -287,7 +279,10 @@ class Operator:
         """Handle the loss of an amplifier unless it is handled already."""
         causes = self.controller.group.lost_by.values()
         if causes and not self._is_loss_handled:
-            await self._handle_loss(LinkError(next(iter(causes))))
+            try:
+                await self._handle_loss(LinkError(next(iter(causes))))
+            except Exception:
+                _logger.exception("handling of a lost link failed")
 
     async def _arm(self) -> None:
         await self.controller.arm()
@@ -355,8 +350,17 @@ class Operator:
             if self.operation.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, text)
             cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
-            event = DaemonEvent(Trigger.LINK_LOST, cause, SEARCHING, amplifiers=lost)
+            event = DaemonEvent(Trigger.LINK_LOST, cause, remedy_of(error), amplifiers=lost)
             await self.handle(event)
+
+
+def remedy_of(error: Exception) -> str:
+    """What to do about amplifiers that cannot be opened: that of the error itself comes first."""
+    return (
+        _REOPENING
+        if isinstance(error, WrongAmplifier)
+        else f"check cables and supply; {_REOPENING}"
+    )
 
 
 def _log_transition(before: Operation, after: Operation) -> None:

@@ -117,7 +117,7 @@ class EventPublisher:
             event=change,
             amplifier=lost[0] if len(lost) == 1 else None,
             message=message,
-            remedy=None if change in ("restored", "reopened") else "check cables and supply",
+            remedy=None if change in ("restored", "reopened") else self._operation().remedy,
         )
         self.hub.publish("link", lambda: event)
 

@@ -88,8 +88,7 @@ class Lease:
 class DaemonEvent:
     """An event with its cause and a remedy for the user.
 
-    amplifiers: names of those that are lost, or do not reply; energised_until [s]: when what was
-    lost must be silent.
+    amplifiers: names of those that are lost, or do not reply.
     """
 
     trigger: Trigger
@@ -97,17 +96,16 @@ class DaemonEvent:
     remedy: str | None = None
     lease: Lease | None = None
     amplifiers: tuple[str, ...] = ()
-    energised_until: float = -math.inf
 
 
 class Loss(NamedTuple):
-    """A loss of amplifiers: since when [s], when they must be silent [s], and their names.
+    """A loss of amplifiers: since when [s], why, and their names.
 
     All others were closed because of these; no names: it is not known which are lost.
     """
 
     at: float
-    energised_until: float
+    cause: str
     names: tuple[str, ...] = ()
 
 
@@ -248,7 +246,7 @@ def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operati
             return replace(operation, is_latched=True)
         case Trigger.NOT_FOUND | Trigger.LINK_LOST if operation.lost is None:
             is_latched = operation.is_latched or operation.state in ENERGISED
-            lost = Loss(now, event.energised_until, event.amplifiers)
+            lost = Loss(now, event.cause, event.amplifiers)
             return replace(operation, lost=lost, is_latched=is_latched)
         case Trigger.LINK_CHANGED:
             return replace(operation, degraded=event.amplifiers)
@@ -267,7 +265,8 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
     cause, remedy = event.cause or before.cause, event.remedy
     is_back = to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED)
     if before.state is DaemonState.COMM_LOST and is_back:
-        cause = f"all amplifiers reply again and are disarmed; before: {cause}"
+        was = cause if before.lost is None else before.lost.cause
+        cause = f"all amplifiers reply again and are disarmed; before: {was}"
         remedy = ACKNOWLEDGE if to is DaemonState.FAULT else None
     return replace(
         updated,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from controller.daemon.deferred_calls import call_guarded
-from controller.daemon.operation import SEARCHING, LinkChange, Operator, StateObserver
+from controller.daemon.operation import LinkChange, Operator, StateObserver, remedy_of
 from controller.daemon.read_back import are_silent, find_problem
 from controller.daemon.states import (
     ACKNOWLEDGE,
@@ -139,7 +139,7 @@ class Supervisor(Operator):
             await self.controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
             lost = self._not_opened(error)
-            event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING, amplifiers=lost)
+            event = DaemonEvent(Trigger.NOT_FOUND, str(error), remedy_of(error), amplifiers=lost)
         if self._closing.is_set():
             await self.controller.close()
         else:
@@ -187,7 +187,8 @@ class Supervisor(Operator):
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
-            self.note_lost(self._not_opened(error))
+            self._not_opened(error)
+            self.note_lost(error)
             await self.controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
@@ -200,10 +201,11 @@ class Supervisor(Operator):
         return lost
 
     async def _pause(self, duration: float) -> None:
-        """Wait for a time [s], or until `close`."""
+        """Wait for a time [s], or until `close` or a stop, for which lines are opened at once."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(duration):
-                await self._closing.wait()
+                await self._changed.wait()
+                self._changed.clear()
 
     async def _poll(self) -> None:
         """Read the status of disarmed amplifiers; the control loop reads that of armed ones.

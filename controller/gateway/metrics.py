@@ -21,6 +21,7 @@ from controller.api.schema import (
     LearningSummary,
 )
 from controller.learning.learning_status import LearningState
+from drivers.host.reports import ReportKind
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -180,7 +181,13 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         name: CounterMetricFamily(f"era_link_{name}", text, labels=["amplifier"])
         for name, text in _LINK_COUNTS.items()
     }
+    reports = GaugeMetricFamily(
+        "era_amplifier_report", "1 for what it has reported lately.", labels=["amplifier", "kind"]
+    )
     for amplifier in amplifiers:
+        reported = {each.kind for each in amplifier.reports}
+        for kind in get_args(ReportKind):
+            reports.add_metric([amplifier.name, kind], float(kind in reported))
         round_trip = amplifier.statistics.round_trip_ms
         values = {
             "degraded": float(amplifier.degraded),
@@ -197,5 +204,6 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
         counts = amplifier.statistics.model_dump()
         for name, counter in counters.items():
             counter.add_metric([amplifier.name], counts[name])
+    yield reports
     yield from gauges.values()
     yield from counters.values()

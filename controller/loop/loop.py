@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from typing import Any
 
 from controller.loop.capabilities import playback_capabilities
@@ -23,11 +23,11 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
 from drivers.host.members import Played
-from drivers.host.stop import Stopped
-from drivers.host.timing import HEARTBEAT
+from drivers.host.stop import UNREACHED, Stopped, what_may_play
+from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
@@ -83,6 +83,8 @@ class Controller:
             )
         self._make_lines = lines
         self._lines_if_open: Lines | None = None
+        self._opened: dict[str, Amplifier] = {}  # last, identified or not
+        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -139,6 +141,7 @@ class Controller:
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 
+        A stop reaches each as soon as its line is open, whatever becomes of the others.
         An amplifier that was open before must have the serial number that it had, and keeps the
         vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
         for a wired channel that its amplifier does not have or a drive mode that one cannot play.
@@ -146,10 +149,17 @@ class Controller:
         self._is_closed = False
         lines = self._lines_if_open = self._make_lines()
         try:
-            amplifiers = {name: await self._amplifier(lines, name) for name in self.urls}
-            self._connected(amplifiers)
             async with self._sending:  # to those of before
-                self.group = Group(amplifiers, watchdog=self.watchdog)  # a stop reaches them now
+                self.group = Group(self._opened, watchdog=self.watchdog)
+            opening = [self._amplifier(lines, name) for name in self.urls]
+            results = await asyncio.gather(*opening, return_exceptions=True)
+            by_name = zip(self.urls, results, strict=True)
+            lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
+            for error in lost.values():
+                error.lost = tuple(lost)
+            opened = self.group.checked(results)
+            amplifiers = self.group.amplifiers = dict(zip(self.urls, opened, strict=True))
+            self._connected(amplifiers)
             await self.group.open()
             for name, amplifier in amplifiers.items():
                 self._serial_numbers[name] = amplifier.identity["serial_number"]
@@ -174,18 +184,24 @@ class Controller:
         self._decider_if_open = decider
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
-        """Open the line of an amplifier; raises LinkError, CommandError."""
-        try:
-            return await lines.amplifier(
-                self.urls[name],
-                self._rig.limits,
-                name=name,
-                serial_number=self._serial_numbers.get(name),
-                is_output=name in self._rig.outputs,
-            )
-        except LinkError as error:
-            error.lost = (name,)
-            raise
+        """Open the line of an amplifier, and send the stop that it is owed.
+
+        Raises LinkError, CommandError.
+        """
+        amplifier = await lines.amplifier(
+            self.urls[name],
+            self._rig.limits,
+            name=name,
+            serial_number=self._serial_numbers.get(name),
+            is_output=name in self._rig.outputs,
+        )
+        if name in self._opened:
+            amplifier.go_on_from(self._opened[name])
+        self._opened[name] = self.group.amplifiers[name] = amplifier
+        if name in self._owed:
+            stopping = _identified(amplifier, self.group.stop(waits_for=[name]))
+            self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
+        return amplifier
 
     async def arm(self) -> None:
         """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
@@ -203,8 +219,44 @@ class Controller:
         await self.group.disarm()
 
     def stop(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
-        """Quick-stop every amplifier; latched until `clear`; see `Group.stop`."""
+        """Quick-stop every amplifier on an open line; latched until `clear`; see `Group.stop`."""
         return self.group.stop()
+
+    def stop_all(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+        """Quick-stop every amplifier, those whose lines are closed as soon as they are opened.
+
+        The requests on open lines are queued when this returns. Await it for what is known of each,
+        by name: of one whose line is opened within 0.3 s by its reply.
+        """
+        stopping = self.group.stop()
+        self._owe()
+        return self._stopped(stopping, {**self._owed})
+
+    def _owe(self) -> None:
+        """Owe a stop to each amplifier whose line is closed."""
+        for name in self.urls:
+            amplifier = self.group.amplifiers.get(name)
+            if amplifier is None or amplifier.line.loss is not None:
+                self._owed.setdefault(name, asyncio.get_running_loop().create_future())
+
+    async def _stopped(
+        self,
+        stopping: Awaitable[Mapping[str, Stopped]],
+        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]],
+    ) -> Mapping[str, Stopped]:
+        if owed:
+            await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
+        outcomes = {**await stopping}
+        self._owe()  # what was lost meanwhile
+        for opened in owed.values():
+            if opened.done():
+                outcomes |= await opened.result()
+        return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
+
+    def what_may_play(self, name: str, cause: str = "") -> Stopped:
+        """What an amplifier may play as far as is known; cause: why no more is; see there."""
+        opened = self._opened.get(name)
+        return UNREACHED if opened is None else what_may_play(opened, cause)
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -461,3 +513,14 @@ class Controller:
                 event(observer)
             except Exception:
                 _logger.exception("loop: observer failed")
+
+
+async def _identified(
+    amplifier: Amplifier, stopping: Awaitable[Mapping[str, Stopped]]
+) -> Mapping[str, Stopped]:
+    """Await a stop, and identify the amplifier meanwhile: an unknown one confirms nothing."""
+    identifying = asyncio.gather(amplifier.identify(timeout=REPLY_TIMEOUT), return_exceptions=True)
+    try:
+        return await stopping
+    finally:
+        identifying.cancel()

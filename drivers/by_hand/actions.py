@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import shlex
 from collections.abc import Sequence
 from typing import Any
@@ -24,6 +25,7 @@ from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
+from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import (
@@ -147,13 +149,8 @@ async def stop(url: str) -> dict[str, Any]:
                 rows = status_rows(amplifier.status)
     except LinkError as error:
         cause = f"{error}; {_UNKNOWN}"
-    return {
-        "url": url,
-        "silence": "may_play" if cause else "confirmed_silent",
-        "may_play_for_s": None,
-        "cause": cause,
-        **rows,
-    }
+    stopped = Stopped(not cause, math.inf, cause)  # another host may feed it
+    return {"url": url, **stopped.rows(clock.now()), **rows}
 
 
 async def _stop(amplifier: Amplifier) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.limits import FREQUENCY_FLOOR
+from drivers.host.reports import REPORTS, reports_of
 from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
 from drivers.opening import Lines
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
@@ -89,6 +90,10 @@ def status_rows(status: Values) -> dict[str, Any]:
         "levels": [level.from_wire(each) for each in status["levels"]],
         "layer_tokens": status["tokens"],
         **({"other_flags": others} if others else {}),
+        "reports": [
+            dict(zip(("kind", "cause", "remedy"), (kind, *REPORTS[kind]), strict=True))
+            for kind in reports_of(status)
+        ],
     }
 
 

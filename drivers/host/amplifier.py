@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 from drivers import clock
-from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
+from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
 from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.stop import Stop, Stopped
+from drivers.host.stop import UNREACHED, Stop, Stopped, what_may_play
 from drivers.host.timing import REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
@@ -66,7 +66,14 @@ class Amplifier(Dialogue):
         self.limits, self._serial_number = limits, serial_number
         self._is_output = is_output
         self.identity: Values = {}
+        self.known = UNREACHED
+        """What it may play by what is known beside its statuses and what fed it."""
         self._stop: Stop | None = None
+
+    def go_on_from(self, before: "Amplifier") -> None:
+        """Know what was known of it when its line was opened before, and may have been lost."""
+        self.known = replace(what_may_play(before), is_confirmed=before.known.is_confirmed)
+        self.may_be_armed = before.may_be_armed
 
     async def open(self) -> None:
         """Identify it and leave it disarmed; a latched stop or fault stays.
@@ -92,7 +99,9 @@ class Amplifier(Dialogue):
             self._check_alone()
             raise
         self._check_alone()
+        shown, self.capabilities = self.capabilities, {}  # another one's silence confirms nothing
         check_identity(identity, self.name, self._serial_number)
+        self.capabilities = shown
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
         check_capabilities(can, self.name, is_output=self._is_output)
         if self._ledger is None:
@@ -106,9 +115,10 @@ class Amplifier(Dialogue):
         return await self.read_status()
 
     def _check_alone(self) -> None:
-        """Raise LinkError where several replied."""
+        """Raise LinkError where several replied; the silence of one confirms nothing."""
         if self._are_several:
-            raise LinkError(
+            self.capabilities = {}
+            raise WrongAmplifier(
                 f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
                 f"{self.line.name}; give each its own: era amp address --serial-number"
             )
@@ -137,6 +147,7 @@ class Amplifier(Dialogue):
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
             if clock.now() - began > _ARM_WITHIN:  # this machine slept: nobody waits for it now
                 raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
+            self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
             return values
 
         was_armed = self.may_be_armed
@@ -147,6 +158,7 @@ class Amplifier(Dialogue):
                 self.may_be_armed = was_armed
             raise
         self.session, self.feeding.watchdog = session, watchdog
+        self.armed_latch = status["latch"]
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:
@@ -220,6 +232,7 @@ class Amplifier(Dialogue):
         latch = status["latch"] if has_restarted else shown
         if before != self.silences:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+        self.known = replace(self.known, is_confirmed=False)
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
 
     def stop(
@@ -282,13 +295,13 @@ def check_identity(identity: Values, name: str, serial_number: str | None) -> No
     """
     if not identity["versions"] >> VERSION & 1:  # bit n: version n
         spoken = map(str, bits_of(identity["versions"]))
-        raise LinkError(
+        raise WrongAmplifier(
             f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "
             "update it"
         )
     serial = identity["serial_number"]
     if serial_number not in (None, serial):
-        raise LinkError(
+        raise WrongAmplifier(
             f"amplifier {name}: serial number must be {serial_number}, got {serial}; connect the "
             "expected amplifier, or restart with this one"
         )
@@ -302,16 +315,16 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
     """
     for each in _POSITIVE:
         if not can[each] > 0:
-            raise LinkError(f"amplifier {name}: {each} must be above 0, got {can[each]}")
+            raise WrongAmplifier(f"amplifier {name}: {each} must be above 0, got {can[each]}")
     for each in ("watchdog", "envelope_step", "frequency"):
         low, high = can[f"{each}_min"], can[f"{each}_max"]
         if low > high:
-            raise LinkError(
+            raise WrongAmplifier(
                 f"amplifier {name}: {each}_min must be at most {each}_max, got {low} and {high}"
             )
     has_output = has_feature(can, "output")
     if is_output is not None and has_output is not is_output:
-        raise LinkError(
+        raise WrongAmplifier(
             f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
             f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
         )

@@ -8,10 +8,27 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from drivers.contents import Layer
-from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    FrameError,
+    LinkDegraded,
+    Preempted,
+    WrongAmplifier,
+)
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
+from drivers.host.reports import (
+    HIGH_VOLTAGE,
+    HOT,
+    INTERLOCK,
+    REPORT_LIFE,
+    REPORTS,
+    ReportKind,
+    armed_problem,
+    reports_of,
+)
 from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
@@ -22,7 +39,7 @@ from drivers.protocol.table import (
     MESSAGES,
     QUANTITIES,
     REACTION,
-    STATUS_FLAGS,
+    STATES,
     name_of,
 )
 from drivers.statistics import LinkStatistics
@@ -134,6 +151,10 @@ class Dialogue:
         """The last one."""
         self.status_at: float | None = None
         """When [s] it was read."""
+        self.armed_latch: int | None = None
+        """That of the reply to the last Arm."""
+        self.reported_at: dict[ReportKind, float] = {}
+        """When [s] a status had a report last."""
         self.played_at = -math.inf
         """When [s] a set or silence was sent last."""
         self.committed = 0
@@ -177,14 +198,21 @@ class Dialogue:
         """Stage a set under a token, or play it at once.
 
         It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
-        the reason; Preempted where a stop came first.
+        the reason; Preempted where a stop came first; FrameError for two replies in a row with
+        another token.
         """
-        cuts: list[Values] = []
-        admitted: list[Staged] = []
-        make = partial(self._admit, token, layers, admitted, cuts, now=now)
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
-        (staged,) = admitted
+        for _ in range(MAX_CONTRADICTIONS):
+            cuts: list[Values] = []
+            admitted: list[Staged] = []
+            make = partial(self._admit, token, layers, admitted, cuts, now=now)
+            taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
+            (staged,) = admitted
+            if taken["token"] == token:
+                break
+        else:
+            problem = f"a set with token {token} must be taken, got token {taken['token']}"
+            raise FrameError(str(self.contradicted(problem)))  # no refusal: all are stopped
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
@@ -312,6 +340,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
+        if (flags := reply["flags"]) & ~HIGH_VOLTAGE or reply["temperature"] > HOT:
+            self._note_reports(reply, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -325,11 +355,11 @@ class Dialogue:
         if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
-        problem = None
         tells = not fed and self.feeding.tells(sent_at)
-        if not reply["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
-            problem = "high voltage must be on, got off"
-        elif not fed:
+        problem, is_voltage_on = None, flags & (HIGH_VOLTAGE | INTERLOCK) == HIGH_VOLTAGE
+        if not is_voltage_on or reply["fault"] or reply["latch"] != self.armed_latch:
+            problem = armed_problem(reply, self.armed_latch)
+        if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
         problem = problem or ledger.problem_of(reply, sent_at, now)
@@ -356,6 +386,14 @@ class Dialogue:
                 except Exception:
                     _logger.exception("amplifier %s: a listener failed", self.name)
 
+    def _note_reports(self, status: Values, now: float) -> None:
+        """Note the reports of a status, and log those of which the last was long ago."""
+        for kind in reports_of(status):
+            if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+                cause, remedy = REPORTS[kind]
+                _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
+            self.reported_at[kind] = now
+
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it, which must feed within the longest time."""
         if self._time() - self._other_host_at <= _WATCHDOG.high:
@@ -379,10 +417,13 @@ class Dialogue:
     def disarmed(self, status: Values) -> CommandRefused:
         """Return the error of what plays or feeds, once a status shows that it is not armed."""
         return CommandRefused(
-            f"amplifier {self.name} is no longer armed, fault {name_of(FAULTS, status['fault'])}; "
+            f"amplifier {self.name} is no longer armed but in {name_of(STATES, status['state'])}, "
+            f"fault {name_of(FAULTS, status['fault'])}; "
             "once the cause is gone, clear and arm again",
             is_disarmed=True,
         )
 
-    def _driven_by_another(self) -> LinkError:
-        return LinkError(f"amplifier {self.name} is driven by another host; end that one first")
+    def _driven_by_another(self) -> WrongAmplifier:
+        return WrongAmplifier(
+            f"amplifier {self.name} is driven by another host; end that one first"
+        )

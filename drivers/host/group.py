@@ -2,11 +2,13 @@
 
 import asyncio
 import logging
+import math
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
+from drivers import clock
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -16,11 +18,11 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
-from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
+from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.host.members import GroupState, Members, is_lost
-from drivers.host.stop import Stopped
+from drivers.host.stop import Stopped, what_may_play
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
@@ -186,9 +188,11 @@ class Group(Members):
         self._leave_armed()
         await self._silenced(self._disarm, [*self.amplifiers.values()], ramp)
 
-    async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
+    async def _disarm(
+        self, members: Sequence[Amplifier], ramp: float, until: float = math.inf
+    ) -> None:
         try:
-            await self.all([_retried(each, partial(each.disarm, ramp)) for each in members])
+            await self.all([_retried(each, partial(each.disarm, ramp), until) for each in members])
         except BaseException:
             await self.stop()
             raise
@@ -238,8 +242,7 @@ class Group(Members):
             stops, await asyncio.gather(*stops.values(), return_exceptions=True), strict=True
         ):
             if isinstance(result, BaseException):
-                until = self.amplifiers[name].feeding.may_play_until
-                result = Stopped(False, until, f"{type(result).__name__}: {result}")
+                result = what_may_play(self.amplifiers[name], f"{type(result).__name__}: {result}")
             outcomes[name] = result
         return outcomes
 
@@ -282,19 +285,27 @@ class Group(Members):
 
         A failure stops all amplifiers and is logged. The lines are left to their owner.
         """
-        is_armed = self.is_armed
+        is_armed, now = self.is_armed, clock.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
         async with self._closing:
             members = [
                 each
                 for each in self.amplifiers.values()
-                if each.may_be_armed and (is_armed or not is_lost(each))
+                if each.may_be_armed
+                and (
+                    is_armed
+                    or not is_lost(each)
+                    or (each.line.loss is None and what_may_play(each).may_play_until > now)
+                )
             ]
+            if self._silencing:  # a line is closed once what stops on it has ended
+                await asyncio.wait({*self._silencing})
             if not members:
                 return
             try:
-                await self._silenced(self._disarm, members, ramp)
+                # Of one that does not reply by then a stop is all that is left.
+                await self._silenced(self._disarm, members, ramp, now + CONFIRM_TIMEOUT)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
 
@@ -320,13 +331,15 @@ def _seen(sent: "asyncio.Future[Values]") -> None:
         sent.exception()
 
 
-async def _retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
-    """Repeat a request until it is answered or the amplifier is lost."""
+async def _retried(
+    amplifier: Amplifier, request: Callable[[], Awaitable[_T]], until: float = math.inf
+) -> _T:
+    """Repeat a request until it is answered or the amplifier is lost, or until a time [s]."""
     while True:
         try:
             return await request()
         except LinkTimeout:
-            if is_lost(amplifier):
+            if is_lost(amplifier) or clock.now() > until:
                 raise
             await asyncio.sleep(_REPEAT_INTERVAL)
 

@@ -1,16 +1,20 @@
-"""One stop of one amplifier: its request goes out first, then its silence is confirmed."""
+"""One stop of one amplifier: its request goes out first, then its silence is confirmed.
+
+Here alone is known what an amplifier may still play, for whoever stops it or asks for its status.
+"""
 
 import asyncio
 import contextlib
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivers import clock
 from drivers.host.jobs import Priority
 from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
-from drivers.protocol.table import LATCHED, QUANTITIES
+from drivers.protocol.table import ENABLED, LATCHED, QUANTITIES
 
 if TYPE_CHECKING:
     from drivers.host.amplifier import Amplifier
@@ -21,14 +25,54 @@ _RAMP = QUANTITIES["ramp"]
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """What became of a stop: confirmed silent, or until when [s] it may play, and why.
+    """What an amplifier may play: confirmed silent, or until when [s] it may play, and why.
 
-    may_play_until: infinite without a watchdog that is known.
+    may_play_until: infinite where nothing is known to silence it.
     """
 
     is_confirmed: bool
     may_play_until: float
     cause: str = ""
+
+    def rows(self, now: float) -> dict[str, Any]:
+        """Return it in words at a time [s]: `silence`, `may_play_for_s` and `cause`."""
+        left = self.may_play_until - now
+        if self.is_confirmed:
+            silence = "confirmed_silent"
+        else:
+            silence = "may_play" if left > 0 else "watchdog_elapsed"
+        is_bounded = not self.is_confirmed and left < math.inf
+        return {
+            "silence": silence,
+            "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
+            "cause": self.cause,
+        }
+
+
+UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
+"""What is known of an amplifier before its first reply."""
+
+
+def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
+    """Return until when an amplifier may play by all that is known of it.
+
+    cause: why no more is known, by default what ails its line. Over is what confirmed a stop, and
+    was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was never
+    fed is over once it has shown that it is silent. One that shows more after its watchdog must
+    have silenced it is fed by another, or broken. A status after the stop alone confirms it.
+    """
+    known, status, at = amplifier.known, amplifier.status, amplifier.status_at
+    cause = cause or amplifier.line.loss or amplifier.silence_cause or ""
+    if known.is_confirmed:
+        return Stopped(False, known.may_play_until, cause)
+    until = max(amplifier.feeding.may_play_until, known.may_play_until)
+    if status is not None and at is not None:
+        is_armed = status["state"] == ENABLED
+        if amplifier.is_silent(status) and not is_armed:  # and identified
+            until = at if until == math.inf else max(until, at)
+        elif (is_armed or any(status["levels"])) and at >= until:
+            until = math.inf
+    return Stopped(False, math.inf if until == -math.inf else until, cause)
 
 
 class Stop:
@@ -83,7 +127,8 @@ class Stop:
                         status = await stopping
                         while is_stopping(status, self._latch):
                             if amplifier.is_silent(status):
-                                return Stopped(True, clock.now())
+                                amplifier.known = Stopped(True, clock.now())
+                                return amplifier.known
                             await asyncio.sleep(_INTERVAL)
                             status = await amplifier.line.submit(
                                 amplifier, Priority.STOP, "GetStatus", {}
@@ -93,8 +138,7 @@ class Stop:
                     await asyncio.sleep(pause)
         except TimeoutError:
             cause = cause or f"silence was not reported within {self._timeout:g} s"
-        loss = amplifier.line.loss
-        return Stopped(False, amplifier.feeding.may_play_until, loss or cause)
+        return what_may_play(amplifier, amplifier.line.loss or cause)
 
 
 def is_stopping(status: Values, before: int | None) -> bool:

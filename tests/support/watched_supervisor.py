@@ -82,6 +82,11 @@ class Watched(Acted):
         stopped = await self.supervisor.stop("as told")
         assert {name: each.is_confirmed for name, each in stopped.items()} == confirmed
 
+    def becomes(self, serial_number: str) -> None:
+        """Have another amplifier in place of the first."""
+        self.far_end.amplifier.identity["serial_number"] = serial_number
+        self.far_end.disturb()
+
     def fails_once(self, method: str) -> None:
         """Let a method of the controller fail once, while the amplifier is reached."""
         work, failures = getattr(self.controller, method), [LinkError("as told")]
@@ -106,11 +111,16 @@ class Watched(Acted):
 
 @asynccontextmanager
 async def watched(
-    *amplifiers: str, refuses: bool = False, breaks: str | None = None, **options: Any
+    *amplifiers: str,
+    refuses: bool = False,
+    unplugged: bool = False,
+    breaks: str | None = None,
+    **options: Any,
 ) -> AsyncIterator[Watched]:
     """A supervisor with a running control loop, which must end when it is closed.
 
     amplifiers: one unless more are named; refuses: whether it refuses all requests at first;
+    unplugged: whether the first is not reached then;
     breaks: the only rules of the witness that are broken; options: as for `set_chain`.
     """
 
@@ -135,6 +145,8 @@ async def watched(
         )
         if refuses:
             daemon.refuse("GetCaps")
+        if unplugged:
+            daemon.fault("unplug", of=0)
         running = asyncio.create_task(supervisor.run())
         await supervisor.started.wait()
         await asyncio.sleep(0.005)

@@ -31,6 +31,7 @@ let ownName;  // of this page, in the daemon's log
 let failure = "unreachable";
 let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
 let watchdog;  // s; after which an amplifier without commands silences itself
+let silences = [];  // what amplifiers may play that do not reply
 let outage = null;  // the event of the loss of gateway or daemon, until reconnected
 let linkLoss = null;  // the event of a lost link, and the number of retries
 
@@ -91,8 +92,12 @@ function showBanner() {
     text = `${FAILURES[failure][0]}${["daemon", "unreachable"].includes(failure) ? since : ""}. ${warning}`;
   } else if (state === "COMM_LOST") {
     reason = "link-lost";
-    text = `The link to an amplifier is lost${since}. It may still be energised`;
-    text += watchdog ? `; its watchdog silences it after ${watchdog}\u00a0s, unconfirmed.` : ".";
+    const mayPlay = silences.filter(({ silence }) => silence === "may_play");
+    text = `The link to an amplifier is lost${since}. `;
+    const after = watchdog ? ` after ${watchdog}\u00a0s` : "";
+    if (silences.length && !mayPlay.length) text += `Its watchdog must have silenced it${after}, unconfirmed.`;
+    else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It may play until it is switched off.";
+    else text += `It may still be energised; its watchdog silences it${after}, unconfirmed.`;
   } else if (daemon?.rig.simulated) {
     reason = "simulated";
     text = "Simulated amplifiers: nothing vibrates.";
@@ -119,12 +124,15 @@ function showState(next, word, cause, newEpoch = null) {
 function showStatus(status) {
   showState(status.state, status.word, status.cause, status.epoch);
   watchdog = status.watchdog_s;
+  silences = silencesOf(status);
   if (status.lost_for_s !== null) {
     lostSince = new Date(Date.now() - 1000 * status.lost_for_s);
     showLinkLoss(status.cause, status.remedy);
   }
   showBanner();
 }
+
+const silencesOf = ({ amplifiers }) => amplifiers.map(({ silence }) => silence).filter(Boolean);
 
 function showOutage(message) {
   lostSince = new Date();
@@ -230,6 +238,8 @@ const HANDLERS = {
     summariseSilence();
   },
   amplifiers({ amplifiers }) {
+    silences = silencesOf({ amplifiers });
+    showBanner();
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
   layout({ layout }) {

@@ -20,11 +20,16 @@ function ageText(seconds) {
   return seconds < 120 ? `${fixed(seconds)} s` : `${fixed(seconds / 60)} min`;
 }
 
+function silenceText({ silence, may_play_for_s }) {
+  if (silence !== "may_play") return "unconfirmed; its watchdog has elapsed";
+  return may_play_for_s === null ? "may play until it is switched off" : `may play for ${fixed(may_play_for_s, 2)} s more`;
+}
+
 // eras: of the rig, for the names of the channels.
 function tile(amplifier, eras) {
-  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
+  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost, silence, reports } = amplifier;
   const isFaulty = fault && fault !== "NONE";
-  const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
+  const made = element("article", undefined, lost || isFaulty || reports.length ? "tile bad" : "tile");
   const title = element("h3");
   const status = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
   title.append(element("span", name), element("span", status));
@@ -46,7 +51,9 @@ function tile(amplifier, eras) {
   if (temperature_c !== null) add("Temperature", `${fixed(temperature_c)} °C`);
   add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${fixed(high_voltage_v)} V`);
   add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
+  if (silence) add("Silence", silenceText(silence));
   made.append(list);
+  reports.forEach(({ cause, remedy }) => made.append(element("p", `${cause}; ${remedy}`)));
   return made;
 }
 

@@ -108,6 +108,7 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
         await until_losses(main=lost, side=lost)
         far.devices["side"].recover()
         await until_losses(main=lost, side=closed)
+        assert await error_code(era.disarm()) is ErrorCode.NOT_SILENT  # it is a stop then
 
 
 @in_virtual_time

@@ -105,10 +105,9 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
         Trigger.LINK_LOST,
         *("unplugged", "look at cables"),
         amplifiers=("main",),
-        energised_until=ENERGISED_UNTIL,
     )
     lost, _ = step(before, unplugged, LOST_AT)
-    assert lost.lost == (LOST_AT, ENERGISED_UNTIL, ("main",))
+    assert lost.lost == (LOST_AT, "unplugged", ("main",))
     back, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
     assert back.state is DaemonState.FAULT
     assert back.cause.endswith("unplugged")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
 from courses import courses, follow
@@ -207,6 +208,34 @@ async def test_stop_in_progress_is_not_repeated(
         await stopping
         await asyncio.sleep(0.1)
         assert "stop repeated" in caplog.text
+
+
+@in_virtual_time
+async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixture) -> None:
+    """What it limits, with who feels less, and its temperature; it plays on, and is logged once."""
+    async with watched() as daemon:
+
+        def reports() -> dict[str, str]:
+            (shown,) = amplifier_statuses(
+                daemon.controller.amplifiers,
+                daemon.controller.urls,
+                are_open=True,
+                lost=None,
+                what_may_play=daemon.supervisor.what_may_play,
+                targets=["panel 1"],
+            )
+            return {each.kind: each.cause + each.remedy for each in shown.reports}
+
+        await daemon.handle(ARM)
+        daemon.answer("Ping", "GetStatus", flags=0b101, temperature=2000)
+        await asyncio.sleep(1)
+        assert daemon.state is ENABLED
+        assert reports().keys() == {"limited", "hot"}
+        assert "panel 1" in reports()["limited"]
+        assert sum(hasattr(record, "remedy") for record in caplog.records) == 2
+        daemon.obey()
+        await asyncio.sleep(11)
+        assert not reports()
 
 
 @in_virtual_time

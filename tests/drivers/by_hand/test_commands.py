@@ -83,7 +83,7 @@ def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
 URL = f"sim://{example_rig_path()}?exact"
 COMMON = {
     *("url", "state", "fault", "interlock_open", "limited", "token", "high_voltage"),
-    *("high_voltage_v", "temperature_c", "watchdog_left_s", "levels", "layer_tokens"),
+    *("high_voltage_v", "temperature_c", "watchdog_left_s", "levels", "layer_tokens", "reports"),
 }
 
 

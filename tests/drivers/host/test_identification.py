@@ -52,6 +52,7 @@ async def test_another_amplifier_is_not_armed(wire: str) -> None:
     with pytest.raises(LinkError):
         await group.arm()
     assert end.far["a"].state == "SWITCH_ON_DISABLED"
+    assert not (await group.stop())["a"].is_confirmed  # the other one is silent
 
 
 @in_virtual_time

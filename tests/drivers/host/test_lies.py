@@ -27,7 +27,7 @@ LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 STATUS = {
     **{"state": (0, 255), "latch": (3, 0), "watchdog_left": (4, 65535), "temperature": (5, 32767)},
     **{"channels": (8, 200 << 8 | 8), "no channels": (8, 8), "levels": (9, 65535)},
-    "layers": (8, 2 << 8 | 7),
+    **{"layers": (8, 2 << 8 | 7), "fault": (1, 2), "interlock": (2, 0b11), "latch jumps": (3, 77)},
 }
 """Word and value of what each status says."""
 CAPABILITIES = {
@@ -126,8 +126,31 @@ async def test_status_that_cannot_be_ends_in_silence(
             await group.beat()
         assert not group.is_armed
     stopped = (await group.stop())["a"]
-    assert stopped.is_confirmed is (lie == "layers")  # all levels are there
+    # All levels are there, and a latch that is newer.
+    assert stopped.is_confirmed is (lie in ("layers", "fault", "interlock"))
     await stops_truthfully(group, end)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@in_virtual_time
+async def test_set_taken_under_another_token_is_sent_again(
+    wire: str, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once; two such replies in a row stop it."""
+    group, end = await armed(wire)
+    record, lies = MESSAGES["Set"].reply, [1] * times
+    pack = record.pack
+
+    def lying(values: Values) -> list[int]:
+        return pack({**values, "token": values["token"] ^ lies.pop() if lies else values["token"]})
+
+    monkeypatch.setattr(record, "pack", lying)
+    is_refused = pytest.raises(DriverError, match="token")
+    with contextlib.nullcontext() if times == 1 else is_refused:
+        await group.apply({"a": [LOUD]})
+    assert group.is_armed is (times == 1)
+    await asyncio.sleep(0.02)
+    assert end.levels("a") == [0.5 if times == 1 else 0.0, 0.0]
 
 
 @pytest.mark.parametrize("text", ["vendor\n", "a\x1b[2J"])

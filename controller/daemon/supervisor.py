@@ -182,13 +182,17 @@ class Supervisor(Operator):
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
-        """Open all amplifiers, disarmed; none that may be armed stays open."""
+        """Open all amplifiers, disarmed; none that may be armed stays open.
+
+        Ports stay open between attempts: a board may restart whenever its own is opened.
+        """
         try:
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             self.note_lost(self._not_opened(error))
-            await self.controller.release()
+            if self.controller.group.is_open:
+                await self.controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
         return True

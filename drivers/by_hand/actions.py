@@ -38,7 +38,8 @@ from drivers.protocol.table import (
 from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
-_STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
+_STOP_TIMEOUT = 2.0  # s
+_STOP_INTERVAL = 0.5  # s; of stops while it is identified
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
 _UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
@@ -159,10 +160,14 @@ async def stop(url: str) -> dict[str, Any]:
 async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
     cause = ""
-    with contextlib.suppress(DriverError):
-        await amplifier.request("Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+    identifying: asyncio.Future[Any] | None = None
+    while identifying is None or not identifying.done():  # for long where a board may restart
+        with contextlib.suppress(DriverError):
+            await amplifier.request("Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+        identifying = identifying or asyncio.ensure_future(amplifier.identify())
+        await asyncio.wait([identifying], timeout=_STOP_INTERVAL)
     try:
-        await amplifier.identify()
+        identifying.result()
     except DriverError as error:  # its channels are unknown, but the stop goes on
         cause = str(error)
     stopped = await amplifier.stop(timeout=_STOP_TIMEOUT)

@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from drivers.errors import CommandError
 from drivers.protocol.table import REACTION
 
+BOOT_TIME = 6.0
+"""For the first reply on a line [s], of a board that restarts when its port is opened."""
 REPLY_TIMEOUT = 0.030
 """For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
 FAST = REPLY_TIMEOUT - REACTION

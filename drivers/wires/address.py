@@ -18,6 +18,8 @@ class WireAddress(ABC):
     line: str
     settings: Mapping[str, object]
     number: int
+    boot_time: float = 0.0
+    """How long what is behind the port may take to start once that is opened [s]."""
 
     @abstractmethod
     def __init__(self, url: str) -> None:

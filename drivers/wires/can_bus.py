@@ -21,11 +21,12 @@ from drivers.codec.can_bus.adapter_text import (
     TextFormat,
     TextReader,
 )
-from drivers.codec.can_bus.canopen import BITRATE
+from drivers.codec.can_bus.canopen import BITRATE, ERROR_ID, CanFrame
 from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX, pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.can_wire import CanWire
+from drivers.host.timing import BOOT_TIME
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, AmplifierUrl
@@ -122,8 +123,10 @@ def _number_or_text(text: str) -> int | str:
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames; on_other: with other text; cut_off: ends a line of which a
-    port that was blocked has dropped the rest; goodbye: sent before it is closed.
+    on_data: called with packed frames, and with an error where text ends in BEL; on_other: with
+    other text; hello: goes before frames until one has come, since an adapter may restart when its
+    port is opened; cut_off: ends a line of which a port that was blocked has dropped the rest;
+    goodbye: sent before it is closed.
     """
 
     def __init__(
@@ -132,15 +135,16 @@ class TextPort(PortAbove):
         on_data: Callable[[bytes], None],
         *,
         on_other: Callable[[bytes], None] = lambda text: None,
+        hello: bytes = b"",
         cut_off: bytes = b"",
         goodbye: bytes = b"",
     ) -> None:
         self._encode, self._reader, self._on_data = form.encode, TextReader(form, on_other), on_data
-        self._cut_off, self._goodbye = cut_off, goodbye
+        self._hello, self._cut_off, self._goodbye = hello, cut_off, goodbye
 
     def write(self, data: bytes) -> None:
         """Send frames; raises LinkError."""
-        text = b"".join(map(self._encode, unpack_frames(data)))
+        text = self._hello + b"".join(map(self._encode, unpack_frames(data)))
         self.below.write(self._cut_off + text if self.below.is_blocked else text)
 
     def close(self) -> None:
@@ -153,16 +157,21 @@ class TextPort(PortAbove):
     def received(self, data: bytes) -> None:
         """Take text of the adapter."""
         if frames := pack_frames(self._reader.feed(data)):
+            self._hello = b""
             self._on_data(frames)
+        if data.endswith(_BELL):
+            self._on_data(pack_frames([CanFrame(ERROR_ID, _BELL)]))
 
 
 _SLCAN_FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"
 _BAUD = 115_200  # of the adapter's serial port
-_CLOSE = b"\rC\r"
+_CLOSE, _BELL = b"\rC\r", b"\x07"
 
 
 class SlcanAddress(CanAddress):
     """A node behind a serial adapter with LAWICEL's commands, on a port or behind a TCP port."""
+
+    boot_time = BOOT_TIME
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SLCAN_FORM, known=("bitrate", "baud"))
@@ -179,16 +188,11 @@ class SlcanAddress(CanAddress):
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
-        """Open the port, and the adapter's channel at the bit rate; raises LinkError."""
-        port = TextPort(SLCAN, on_data, cut_off=b"\r", goodbye=_CLOSE)
-        port.below = await open_port(self.place, port.received, on_loss)
+        """Open the port; the first request opens the adapter's channel. Raises LinkError."""
         # Closed first, where an earlier host has left it open.
-        try:
-            port.below.write(_CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate))
-        except LinkError:
-            port.close()
-            await port.wait_closed()
-            raise
+        hello = _CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate)
+        port = TextPort(SLCAN, on_data, hello=hello, cut_off=b"\r", goodbye=_CLOSE)
+        port.below = await open_port(self.place, port.received, on_loss)
         return port
 
 

@@ -13,6 +13,7 @@ from typing import final
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.modbus_wire import ModbusWire
+from drivers.host.timing import BOOT_TIME
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
@@ -105,6 +106,7 @@ class ModbusAddress(WireAddress):
         self.place = replace(place, parity=_PARITIES[parity], stop=stop)
         self.number = parsed.whole(unit, "unit", ADDRESS_MAX) if unit else ADDRESS
         self.line = self.place.name
+        self.boot_time = BOOT_TIME if self._is_rtu else 0.0
         self.settings = {
             "protocol": "Modbus RTU" if self._is_rtu else "Modbus TCP",
             "baud": self.place.baud,

@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 from drivers.hardware import Port
 from drivers.host.serial_wire import SerialWire
+from drivers.host.timing import BOOT_TIME
+from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
@@ -14,6 +16,8 @@ _FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a seri
 
 class SerialAddress(WireAddress):
     """An amplifier on a serial port of this machine, or behind a serial server."""
+
+    boot_time = BOOT_TIME
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _FORM, known=("baud", "address"))
@@ -27,8 +31,8 @@ class SerialAddress(WireAddress):
 
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
-        baud = self.place.baud if self.place.device else 0
-        return SerialWire(baud, sequence=random.getrandbits(16))
+        delay = 0.0 if self.place.device else NETWORK_DELAY
+        return SerialWire(self.place.baud, sequence=random.getrandbits(16), delay=delay)
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]

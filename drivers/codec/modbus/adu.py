@@ -183,7 +183,8 @@ class ResponseReader:
 
     def clear(self) -> None:
         """Discard partial data."""
-        self._counters.invalid_frames += bool(self._buffer)
+        if self._buffer:
+            self._count_invalid(self._buffer)
         self._buffer = b""
 
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
@@ -192,7 +193,7 @@ class ResponseReader:
         responses = []
         for adu in self._split(to):
             if not adu.pdu:
-                self._counters.invalid_frames += 1
+                self._count_invalid(adu.raw)
                 continue
             self._counters.frames_in += 1
             if adu.transaction in self.unawaited:
@@ -203,6 +204,11 @@ class ResponseReader:
                 response = _response(adu.pdu, to)
             if response is None:
                 self._counters.unexpected_frames += 1
+                self._counters.remark = (
+                    f"a response of transaction {adu.transaction}, unit {adu.unit} and function "
+                    f"{adu.pdu[0]} came that is not of this request: check the unit, that a "
+                    "gateway repeats unit and transaction, and that nothing delays responses"
+                )
             else:
                 responses.append(response)
         return responses
@@ -217,12 +223,22 @@ class ResponseReader:
         for start in range(len(self._buffer) - 4):
             adu = checked(self._buffer, start, self._rtu_size(start, to))
             if adu is not None:
-                self._counters.invalid_frames += start > 0
+                if start:
+                    self._count_invalid(self._buffer[:start])
                 self._buffer = self._buffer[start + len(adu.raw) :]
                 return adu
         if len(self._buffer) > 2 * RTU_MAX:
             self.clear()
         return None
+
+    def _count_invalid(self, data: bytes) -> None:
+        self._counters.invalid_frames += 1
+        check = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
+        if self._is_rtu:
+            check = "baud rate, parity, cable and protocol, and whether the adapter echoes"
+        self._counters.remark = (
+            f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')}): check {check}"
+        )
 
     def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
         """Return the length of a frame that begins here; 0 if none can.

@@ -7,8 +7,10 @@ import pty
 import socket
 import subprocess
 import sys
+import termios
 import tty
 from collections.abc import Iterator
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -20,6 +22,7 @@ from drivers.ports import serial_port, tcp
 from drivers.ports.serial_port import SerialPort
 from drivers.ports.tcp import open_connection
 from drivers.urls import Place
+from virtual_loop import in_virtual_time
 
 
 @pytest.mark.parametrize(
@@ -28,14 +31,19 @@ from drivers.urls import Place
 def test_device_is_opened_alone_with_low_latency_and_its_settings(
     monkeypatch: pytest.MonkeyPatch, device: str, parity: str
 ) -> None:
-    """A pseudo-terminal has no parity."""
+    """A pseudo-terminal has no parity. DTR stays up afterwards: it restarts boards."""
+    far, near = os.openpty()
     made = Mock()
+    made.return_value.fileno.return_value = near
     monkeypatch.setattr(serial_port.serial, "Serial", made)
     serial_port._open_device(Place(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
     assert made.call_args.kwargs["exclusive"]
+    assert not termios.tcgetattr(near)[2] & termios.HUPCL
+    os.close(near)
+    os.close(far)
 
 
 async def test_port_that_fails_amid_its_opening_is_released(
@@ -168,6 +176,33 @@ async def test_first_address_that_accepts_is_used(
         connection.close()
         await connection.wait_closed()
         await asyncio.sleep(0)
+
+
+@in_virtual_time
+async def test_address_that_hangs_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second of a name is tried 250 ms later (RFC 8305); the first, if it accepts then, not."""
+    loop, accepts = asyncio.get_running_loop(), asyncio.Event()
+    server = await loop.create_server(asyncio.Protocol, port=502)
+    connect, losses = loop.create_connection, list[str]()
+
+    async def hang_at_first(make: Any, address: str, port: int) -> Any:
+        if address == "fd00::1":
+            await accepts.wait()
+        return await connect(make, address, port)
+
+    async def found(host: str) -> list[str]:
+        return ["fd00::1", "192.0.2.1"]
+
+    monkeypatch.setattr(loop, "create_connection", hang_at_first)
+    monkeypatch.setattr(tcp, "_addresses", found)
+    began = loop.time()
+    connection = await open_connection("amplifier.test", 502, lambda _: None, losses.append)
+    assert loop.time() - began == pytest.approx(0.25, abs=0.01)
+    accepts.set()
+    await asyncio.sleep(1.0)
+    assert losses == []
+    connection.close()
+    server.close()
 
 
 async def test_connection_gives_up_what_is_not_taken_within_a_second() -> None:

@@ -65,12 +65,7 @@ class Lines:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
                 self._opened[address.line] = opened
-        for setting, value in opened.settings.items():
-            if (got := address.settings.get(setting)) != value:
-                raise LinkError(
-                    f"{address.line}: {setting} must be {value} as for the other amplifiers on "
-                    f"it, got {got}"
-                )
+        address.check_agrees(opened.settings)
         former = opened.line.members.get(address.number)
         if former is not None and former.name != name:
             raise LinkError(f"address {address.number} on {address.line} must be used once")

@@ -1,5 +1,6 @@
 """Loads and validates a daemon's configuration and the files that it names; what may change."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,8 +18,7 @@ from controller.sources.touch import (
     open_source,
     turned,
 )
-from drivers.errors import CommandError
-from drivers.wires.known import address_of
+from drivers.by_hand.rig_check import check_links
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
@@ -221,11 +221,10 @@ def _urls(
         name: f"sim://{here}?amplifier={quote(name)}" if url == "sim://" else url
         for name, url in rig.amplifiers.items()
     }
-    for name, url in urls.items():
-        try:
-            address_of(url)
-        except CommandError as error:
-            validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
+    wired = Counter(channel.amplifier for channel in rig.wiring.values())
+    errors, _ = check_links(urls, channels=wired, limits=rig.limits)
+    for name, error in errors.items():
+        validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
     if len({url.startswith("sim://") for url in urls.values()}) > 1:
         validation.add(
             ("rig",),

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.errors import CommandError
+from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import (
@@ -34,11 +34,13 @@ def check_links(
     errors: dict[str, str] = {}
     addresses: dict[str, WireAddress] = {}
     by_place: dict[tuple[str, int], str] = {}
+    lines: dict[str, WireAddress] = {}
     for name, url in urls.items():
         try:
             address = address_of(url)
-            check_watchdog(WATCHDOG, address.set_time(channels.get(name, 0)))
-        except CommandError as error:
+            check_watchdog(WATCHDOG, address.longest_set_time)
+            address.check_agrees(lines.setdefault(address.line, address).settings)
+        except (CommandError, LinkError) as error:
             errors[name] = str(error)
             continue
         other = by_place.setdefault((address.line, address.number), name)

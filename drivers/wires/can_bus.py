@@ -33,6 +33,7 @@ from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress
 
 _BITRATES = 10_000, 1_000_000
+_NODE = "node must be given as #{}"
 
 
 class CanAddress(WireAddress):
@@ -84,13 +85,14 @@ class PythonCanAddress(CanAddress):
         options = _OPTIONS.get(interface, ())
         parsed = AmplifierUrl(url, _PYTHON_CAN_FORM, known=("bitrate", *options))
         if parsed.scheme == "can+socketcan":
-            interface, channel, rest = "socketcan", parsed.place, parsed.path.strip("/")
+            interface, channel = "socketcan", parsed.place
+            parsed.check_path(parsed.path, _NODE)
         else:
-            channel, rest = parsed.path.removeprefix("/"), ""
+            channel = parsed.path.removeprefix("/")
             if not interface or interface in _OTHERS:
-                raise parsed.refused("interface must be named")
-        if rest or not channel.strip("/"):
-            raise parsed.refused("bus must be named")
+                raise parsed.refused(f"interface must be one of python-can, got {interface!r}")
+        if not channel.strip("/"):
+            raise parsed.refused("bus must be given")
         chosen = {
             name: _number_or_text(parsed.options[name])
             for name in options
@@ -175,7 +177,7 @@ class SlcanAddress(CanAddress):
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SLCAN_FORM, known=("bitrate", "baud"))
-        self.place = parsed.server() if parsed.place else parsed.device(_BAUD)
+        self.place = parsed.server(number=_NODE) if parsed.place else parsed.device(_BAUD)
         super().__init__(
             parsed,
             f"can+slcan://{self.place.name}",
@@ -206,9 +208,11 @@ class SocketcandAddress(CanAddress):
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SOCKETCAND_FORM, known=("bitrate",))
-        self.place, self.channel = parsed.server(has_path=True), parsed.path.strip("/")
+        self.place, path = parsed.server(), parsed.path.strip("/")
+        self.channel, _, rest = path.partition("/")
+        parsed.check_path(rest, _NODE)
         if not self.channel:
-            raise parsed.refused("bus must be named")
+            raise parsed.refused("bus must be given behind the host")
         line = f"can+socketcand://{self.place.name}/{self.channel}"
         super().__init__(parsed, line, delay=NETWORK_DELAY, settings={})
 

@@ -79,7 +79,7 @@ class SilentPort(PortAbove):
             self._send()
 
 
-_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, that of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"
 _TCP_PORT = 502
 _PARITIES = {"even": "E", "odd": "O", "none": "N"}
@@ -92,13 +92,14 @@ class ModbusAddress(WireAddress):
         self._is_rtu = url.lower().startswith("modbus+rtu")
         if self._is_rtu:
             parsed = AmplifierUrl(url, _RTU_FORM, known=("baud", "parity", "stop"))
-            place = parsed.server() if parsed.place else parsed.device(RTU_BAUD)
+            number = "unit must be given as #{}"
+            place = parsed.server(number=number) if parsed.place else parsed.device(RTU_BAUD)
             unit = parsed.number
         else:
             parsed = AmplifierUrl(url, _TCP_FORM, known=("baud",))
             if parsed.number:
-                raise parsed.refused("unit must follow the host")
-            place, unit = parsed.server(port=_TCP_PORT, has_path=True), parsed.path.strip("/")
+                raise parsed.refused(f"unit must be given as /{parsed.number} behind the host")
+            place, unit = parsed.server(port=_TCP_PORT), parsed.path.strip("/")
         parity = parsed.options.get("parity", "even")
         if parity not in _PARITIES:
             raise parsed.refused(f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}")

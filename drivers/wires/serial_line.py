@@ -1,4 +1,4 @@
-"""Serial lines: serial:///dev/ttyUSB0?baud=921600&address=1 and serial+tcp://HOST:PORT."""
+"""Serial lines: serial:///dev/ttyUSB0?baud=921600&address=1, on a server serial+tcp://HOST:PORT."""
 
 import random
 from collections.abc import Callable
@@ -11,7 +11,10 @@ from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
 
-_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a serial server)"
+_FORM = (
+    "serial:///dev/ttyUSB0?baud=921600&address=1, or serial+tcp://HOST:PORT?baud=921600&address=1 "
+    "for a serial server"
+)
 
 
 class SerialAddress(WireAddress):
@@ -24,7 +27,8 @@ class SerialAddress(WireAddress):
         if parsed.number:
             raise parsed.refused(f"address must be given as ?address={parsed.number}")
         is_server = parsed.scheme == "serial+tcp"
-        self.place = parsed.server() if is_server else parsed.device(BAUD)
+        number = "address must be given as ?address={}"
+        self.place = parsed.server(number=number) if is_server else parsed.device(BAUD)
         self.number = parsed.whole_option("address", ADDRESS, ADDRESS_MAX)
         self.line = self.place.name
         self.settings = {"protocol": "serial", "baud": self.place.baud}

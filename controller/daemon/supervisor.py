@@ -268,7 +268,8 @@ class Supervisor(Operator):
         cause = "all amplifiers reply again and play what they should"
         if degraded:
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
-            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
+            why = group.amplifiers[degraded[0]].silence_cause
+            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played: {why}"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
         _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)

@@ -29,6 +29,7 @@ from drivers.host.members import Played
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines
+from drivers.wires.known import address_of
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -193,7 +194,10 @@ class Controller:
                 is_output=name in self._rig.outputs,
             )
         except LinkError as error:
-            error.lost = (name,)
+            line = address_of(self.urls[name]).line
+            error.lost = tuple(
+                each for each, url in self.urls.items() if address_of(url).line == line
+            )
             raise
 
     async def arm(self) -> None:

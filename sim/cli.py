@@ -143,11 +143,8 @@ def sim(
         if firmware and (common is not None or wire or faults or virtual_time):
             raise InputError("--firmware has a serial line and real time; omit the other options")
         programs = find_firmware() if firmware else None
-        wires: Mapping[str, Wire] = {}
-        if not firmware:
-            wires = assign_wires(
-                loaded.amplifiers, common=common, options=wire or [], defaults=defaults
-            )
+        to_wire = {} if firmware else loaded.amplifiers
+        wires = assign_wires(to_wire, common=common, options=wire or [], defaults=defaults)
         links = links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers))
         simulation = Simulation(
             loaded,

@@ -8,9 +8,11 @@ from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import (
     MAX_LOSS_DETECTION_TIME,
+    TAKEN_WORDS,
     check_watchdog,
     loss_detection_time,
 )
+from drivers.host.wire import request_words
 from drivers.protocol.table import QUANTITIES
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
@@ -38,7 +40,8 @@ def check_links(
     for name, url in urls.items():
         try:
             address = address_of(url)
-            check_watchdog(WATCHDOG, address.longest_set_time)
+            longest = address.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
+            check_watchdog(WATCHDOG, longest)
             address.check_agrees(lines.setdefault(address.line, address).settings)
         except (CommandError, LinkError) as error:
             errors[name] = str(error)

@@ -1,6 +1,5 @@
 """Opens the line of an amplifier for its checks, by its URL."""
 
-import asyncio
 import contextlib
 import random
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -57,11 +56,9 @@ async def opened(url: str) -> AsyncIterator[Client]:
     client.port = _TracedPort(port, url)
     try:
         boots_until = clock.now() + address.boot_time
-        while clock.now() < boots_until:
+        while clock.now() < boots_until and not client.order:  # nothing was heard yet
             with contextlib.suppress(Violation):
                 await client.hello()
-                break
-            await asyncio.sleep(client.quiet)
         client.session = random.getrandbits(16)
         client.transit = address.make_wire().exchange_time(0, MAX_WORDS)
         yield client

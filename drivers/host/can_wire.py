@@ -130,15 +130,11 @@ class CanWire(Wire):
 
     def _remark_other(self, node: int) -> None:
         """Note a frame of a node that is no reply; what its amplifier sends says the most."""
-        remark = f"frames of node {node} came, none of node {self._requested}: check the node"
-        if node == self._requested:
-            remark = (
-                f"frames of node {node} came that are no reply: check that it speaks this "
-                "protocol, and that nothing delays the bus"
+        if node == self._requested or not self.counters.remark:
+            self.counters.remark = (
+                f"frames of node {node} came in place of a reply of node {self._requested}: check "
+                "the node and its protocol, and that nothing delays the bus"
             )
-        elif self.counters.remark:
-            return
-        self.counters.remark = remark
 
     def _from_amplifier(self, node: int, data: bytes) -> list[Arrival]:
         now = clock.now()

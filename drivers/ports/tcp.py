@@ -15,6 +15,7 @@ from drivers.threads import in_thread
 
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
 _NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for
+_NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
 _UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
@@ -121,10 +122,5 @@ async def _addresses(host: str) -> list[str]:
         found = await in_thread(
             lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
         )
-        return [_with_zone(*address) for *_, address in found]
-
-
-def _with_zone(address: str | int, *numbers: str | int | bytes) -> str:
-    """Append the zone of a link-local IPv6 address."""
-    *_, zone = numbers  # of an IPv4 address the port, 0
-    return f"{address}%{zone!s}" if zone else str(address)
+        # With the zone of a link-local address.
+        return [socket.getnameinfo(each, _NUMERIC)[0] for *_, each in found]

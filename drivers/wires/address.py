@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.timing import TAKEN_WORDS, set_words
-from drivers.host.wire import Wire, request_words
+from drivers.host.wire import Wire
 
 
 class WireAddress(ABC):
@@ -33,11 +33,6 @@ class WireAddress(ABC):
     def set_time(self, channels: int) -> float:
         """Return how long a set of these channels and its reply take [s]; 0 if unknown."""
         return self.make_wire().exchange_time(set_words(channels), TAKEN_WORDS)
-
-    @property
-    def longest_set_time(self) -> float:
-        """How long the longest part of a set and its reply take [s]; 0 if unknown."""
-        return self.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
 
     def check_agrees(self, settings: Mapping[str, object]) -> None:
         """Raise LinkError unless its settings are those of the others on its line."""

@@ -208,15 +208,16 @@ def assign_wires(
 
 
 def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:
-    """Paths of the rig's URLs at which terminals are placed, by the first amplifier on each.
+    """Paths of the rig's URLs at which terminals are placed, by one of the amplifiers on each.
 
     Those in /dev are of real ports.
     """
-    paths: dict[str, str] = {}
-    for name, wire in wires.items():
-        if wire.line.startswith("/") and not wire.line.startswith("/dev/"):
-            paths.setdefault(wire.line, name)
-    return {name: Path(path) for path, name in paths.items()}
+    names = {
+        wire.line: name
+        for name, wire in wires.items()
+        if wire.line.startswith("/") and not wire.line.startswith("/dev/")
+    }
+    return {name: Path(path) for path, name in names.items()}
 
 
 def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:

@@ -24,6 +24,8 @@ _LENGTH_MAX = 254  # unit and PDU
 _RTU_MIN = 4  # unit, function, CRC
 _WITH_TWO_WORDS, _TWO_WORDS_SIZE = range(1, 7), 8  # functions, and the size of their requests
 _WRITE_SIZE, _COUNT_AT = 9, 6  # without the registers that the byte there counts
+_RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
+_TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
 _COUNTED, _ECHOING = (3, 4, 23), (5, 6, 15, 16)  # functions by the form of their responses
 
 
@@ -233,11 +235,9 @@ class ResponseReader:
 
     def _count_invalid(self, data: bytes) -> None:
         self._counters.invalid_frames += 1
-        check = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
-        if self._is_rtu:
-            check = "baud rate, parity, cable and protocol, and whether the adapter echoes"
         self._counters.remark = (
-            f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')}): check {check}"
+            f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')}): check "
+            f"{_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
         )
 
     def _rtu_size(self, start: int, to: RequestAdu | None) -> int:

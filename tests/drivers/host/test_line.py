@@ -167,11 +167,11 @@ IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "tcp, exception 10": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0a", "no path to unit 1"),
     "tcp, exception 11": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0b", "no response of unit 1"),
     "tcp, RTU in it": ("tcp", lambda data: b"\1\x10\x09\0\0\1\2\x55", r"Modbus TCP.*modbus\+rtu"),
-    "can, other node": ("can", lambda data: frames((0x705, b"\5")), "node 5 came, none of node 1"),
+    "can, other node": ("can", lambda data: frames((0x705, b"\5")), "node 5 came .* of node 1:"),
     "can, heartbeat": (
         "can",
         lambda data: frames((0x701, b"\5"), (0x702, b"\5")),
-        "node 1 .*no reply",
+        "node 1 came in place of .* of node 1:",
     ),
     "can, BEL": ("can", lambda data: frames((0x800, b"\7")), r"adapter .*\(07\).*termination"),
 }

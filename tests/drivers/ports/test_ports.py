@@ -162,30 +162,17 @@ async def test_connection_timeout_has_a_remedy(
             await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
 
 
-async def test_first_address_that_accepts_is_used(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The amplifier listens on the second address only, such as IPv4."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
-        monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
-        connection = await open_connection("amplifier.test", port, lambda _: None, lambda _: None)
-        taken, _ = listening.accept()
-        taken.close()
-        connection.close()
-        await connection.wait_closed()
-        await asyncio.sleep(0)
-
-
+@pytest.mark.parametrize("first", ["hangs", "refuses"])
 @in_virtual_time
-async def test_address_that_hangs_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second of a name is tried 250 ms later (RFC 8305); the first, if it accepts then, not."""
+async def test_next_address_of_a_host_is_tried(first: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 250 ms (RFC 8305), or at once where the first refuses; that one then has no effect."""
     loop, accepts = asyncio.get_running_loop(), asyncio.Event()
     server = await loop.create_server(asyncio.Protocol, port=502)
     connect, losses = loop.create_connection, list[str]()
 
-    async def hang_at_first(make: Any, address: str, port: int) -> Any:
+    async def connecting(make: Any, address: str, port: int) -> Any:
+        if address == "fd00::1" and first == "refuses":
+            raise ConnectionRefusedError
         if address == "fd00::1":
             await accepts.wait()
         return await connect(make, address, port)
@@ -193,11 +180,11 @@ async def test_address_that_hangs_is_not_waited_for(monkeypatch: pytest.MonkeyPa
     async def found(host: str) -> list[str]:
         return ["fd00::1", "192.0.2.1"]
 
-    monkeypatch.setattr(loop, "create_connection", hang_at_first)
+    monkeypatch.setattr(loop, "create_connection", connecting)
     monkeypatch.setattr(tcp, "_addresses", found)
     began = loop.time()
     connection = await open_connection("amplifier.test", 502, lambda _: None, losses.append)
-    assert loop.time() - began == pytest.approx(0.25, abs=0.01)
+    assert loop.time() - began == pytest.approx(0.25 if first == "hangs" else 0.0, abs=0.01)
     accepts.set()
     await asyncio.sleep(1.0)
     assert losses == []
@@ -223,10 +210,10 @@ async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """RFC 4007."""
-    of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
+    of_name = ("fe80::1", 0, 0, 4000), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
     monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
-    assert await tcp._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
+    assert await tcp._addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:

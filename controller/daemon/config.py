@@ -9,6 +9,7 @@ from urllib.parse import quote
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
+from controller.daemon.socket_lock import check_socket_path
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.touch import (
@@ -98,6 +99,11 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     learn = _file(document, "learn")
     _check_folders(validation, log_file, dump_folder)
     _check_learn(validation, learn)
+    socket = _file(document, "socket") or default_socket()
+    try:
+        check_socket_path(socket)
+    except (InputError, OSError) as error:
+        validation.add(("socket",), str(error))
     section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
     return DaemonConfig(
@@ -110,7 +116,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         learn=learn,
         layout=layout,
         touch=touch,
-        socket=_file(document, "socket") or default_socket(),
+        socket=socket,
         log_file=log_file,
         dump_folder=dump_folder,
     )

@@ -24,7 +24,7 @@ from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
-from drivers.host.timing import STOP_RAMP, check_watchdog
+from drivers.host.timing import BOOT_TIME, STOP_RAMP, check_watchdog
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import (
     COMMAND,
@@ -39,7 +39,7 @@ from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s
-_STOP_INTERVAL = 0.5  # s; of stops while it is identified
+_STOP_INTERVAL = 1.0  # s; of stops while it is identified, which they cut short
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
 _UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
@@ -159,11 +159,13 @@ async def stop(url: str) -> dict[str, Any]:
 
 async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
-    cause = ""
+    cause, until = "", clock.now() + BOOT_TIME
     identifying: asyncio.Future[Any] | None = None
     while identifying is None or not identifying.done():  # for long where a board may restart
         with contextlib.suppress(DriverError):
-            await amplifier.request("Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+            if clock.now() < until:
+                values = {"ramp": amplifier.wire_ramp(STOP_RAMP)}
+                await amplifier.request("Stop", values, Priority.STOP)
         identifying = identifying or asyncio.ensure_future(amplifier.identify())
         await asyncio.wait([identifying], timeout=_STOP_INTERVAL)
     try:

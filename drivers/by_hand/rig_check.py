@@ -40,8 +40,8 @@ def check_links(
     for name, url in urls.items():
         try:
             address = address_of(url)
-            longest = address.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
-            check_watchdog(WATCHDOG, longest)
+            set_time = address.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
+            check_watchdog(WATCHDOG, set_time)
             address.check_agrees(lines.setdefault(address.line, address).settings)
         except (CommandError, LinkError) as error:
             errors[name] = str(error)

@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 
 from drivers.by_hand.cli import amp
+from drivers.by_hand.rig_check import check_links
 from drivers.errors import CommandError
 from drivers.host.timing import BOOT_TIME
 from drivers.wires.known import address_of
+from registry.limits import GuardLimits
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")
@@ -21,6 +23,21 @@ def test_example_is_the_amplifier_that_the_page_says(url: str, line: str, number
     """Its line, and its number there."""
     address = address_of(url)
     assert (address.line, address.number) == (line, int(number))
+
+
+def test_slowest_line_is_that_of_the_page() -> None:
+    """As the check has it; the next slower speed is refused."""
+    baud, bitrate = map(int, re.findall(r"at least (\d+) baud, or (\d+) kbit/s", PAGE)[0])
+    slow = {
+        "a": "serial:///dev/a?baud={}",
+        "b": "modbus+rtu:///dev/b?baud={}",
+        "c": "can+slcan:///c?bitrate={}",
+    }
+    for factor, refused in ((1, []), (2, [*slow])):
+        speeds = {"a": baud // factor, "b": baud // factor, "c": bitrate * 1000 // factor}
+        urls = {name: url.format(speeds[name]) for name, url in slow.items()}
+        errors, _ = check_links(urls, channels={}, limits=GuardLimits(40.0, 250.0, 1.0))
+        assert [*errors] == refused
 
 
 def test_page_has_every_scheme_and_the_time_of_a_board() -> None:

@@ -206,10 +206,11 @@ class ResponseReader:
                 response = _response(adu.pdu, to)
             if response is None:
                 self._counters.unexpected_frames += 1
+                number = "" if self._is_rtu else f"transaction {adu.transaction}, "
                 self._counters.remark = (
-                    f"a response of transaction {adu.transaction}, unit {adu.unit} and function "
-                    f"{adu.pdu[0]} came that is not of this request: check the unit, that a "
-                    "gateway repeats unit and transaction, and that nothing delays responses"
+                    f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
+                    "not of this request: check the unit, that a gateway repeats unit and "
+                    "transaction, and that nothing delays responses"
                 )
             else:
                 responses.append(response)

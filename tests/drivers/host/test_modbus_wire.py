@@ -173,6 +173,15 @@ def test_request_of_all_units_has_no_reply() -> None:
     assert wire.counters.unexpected_frames == 0
 
 
+def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
+    """Transactions come again after 65 535: then one is a healthy unit's."""
+    wire, peer = ModbusWire(0, is_rtu=False, number=0), Peer(is_rtu=False)
+    wire.request(1, "GetStatus", {})
+    wire.request(0, "Commit", {"session": 9, "token": 7})  # transaction 2, without a response
+    wire._number = 1
+    assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
+
+
 @in_virtual_time
 async def test_damaged_length_costs_one_attempt() -> None:
     """A write that seems to go on for 255 bytes ends with the pause before its repetition."""

@@ -51,7 +51,10 @@ from drivers.statistics import WireCounters
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames sent last, which an adapter may echo
 _READ_VERSIONS = bytes((0x40, 0x00, 0x20, 5, 0, 0, 0, 0))  # upload of 2000:5, CiA 301 7.2.4.3.5
 _VERSIONS_READ = bytes((0x4B, 0x00, 0x20, 5))  # two bytes of data follow
-_BUS = "that the amplifier is switched on and acknowledges, bit rate, wiring and termination"
+_BUS = (
+    "that the amplifier is switched on and acknowledges, bit rate, wiring, termination, and the "
+    "baud rate of a serial adapter"
+)
 _START: int = CANOPEN["nmt"]["start"]
 
 
@@ -124,7 +127,7 @@ class CanWire(Wire):
             self.counters.remark = (
                 f"the adapter cannot send, or reports errors ({frame.data.hex(' ')}): check {_BUS}"
             )
-        elif node:
+        elif node and kind not in (REQUEST, cob_id("sdo_request")):
             self._remark_other(node)
         return []  # of other devices, or an echo
 

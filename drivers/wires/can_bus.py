@@ -21,7 +21,7 @@ from drivers.codec.can_bus.adapter_text import (
     TextFormat,
     TextReader,
 )
-from drivers.codec.can_bus.canopen import BITRATE, ERROR_ID, CanFrame
+from drivers.codec.can_bus.canopen import BITRATE, BLOCK, ERROR_ID, CanFrame
 from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX, pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.hardware import Port
@@ -125,7 +125,8 @@ def _number_or_text(text: str) -> int | str:
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames, and with an error where text ends in BEL; on_other: with
+    on_data: called with packed frames, and with an error where text ends in
+    BEL or is none; on_other: with
     other text; hello: goes before frames until one has come, since an adapter may restart when its
     port is opened; cut_off: ends a line of which a port that was blocked has dropped the rest;
     goodbye: sent before it is closed.
@@ -161,8 +162,8 @@ class TextPort(PortAbove):
         if frames := pack_frames(self._reader.feed(data)):
             self._hello = b""
             self._on_data(frames)
-        if data.endswith(_BELL):
-            self._on_data(pack_frames([CanFrame(ERROR_ID, _BELL)]))
+        if data.endswith(_BELL) or not data.isascii():
+            self._on_data(pack_frames([CanFrame(ERROR_ID, data[-BLOCK:])]))
 
 
 _SLCAN_FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"

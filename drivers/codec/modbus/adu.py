@@ -180,7 +180,7 @@ class ResponseReader:
     def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
         self._is_rtu = is_rtu
         self._counters = counters
-        self._buffer = b""
+        self._buffer = self._request = b""
         self.unawaited: set[int] = set()
 
     def clear(self) -> None:
@@ -192,6 +192,7 @@ class ResponseReader:
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
         """Return the responses to a request in these bytes; to: None without a request."""
         self._buffer += data
+        self._request = b"" if to is None else to.frame
         responses = []
         for adu in self._split(to):
             if not adu.pdu:
@@ -236,10 +237,10 @@ class ResponseReader:
 
     def _count_invalid(self, data: bytes) -> None:
         self._counters.invalid_frames += 1
-        self._counters.remark = (
-            f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')}): check "
-            f"{_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
-        )
+        what = f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')})"
+        if data == self._request:
+            what = "the request itself came back, and nothing else"
+        self._counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
 
     def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
         """Return the length of a frame that begins here; 0 if none can.

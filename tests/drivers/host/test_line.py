@@ -149,6 +149,7 @@ IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "serial, echo": ("serial", lambda data: ECHO, "request itself came back"),
     "serial, late": ("serial", lambda data: LATE, "address 1 to another request.*delays"),
     "rtu, wrong speed": ("rtu", lambda data: b"\xf8\x80" * 9, "18 bytes .*f8 80.*parity"),
+    "can, text that is none": ("can", lambda data: frames((0x800, b"\xf8")), r"\(f8\).*baud rate"),
     "rtu, other unit": (
         "rtu",
         lambda data: bytes.fromhex("02 90 01 7d c0"),

@@ -133,7 +133,7 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
 def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
     """Commands go before frames until one has come: an adapter that boots has heard none of them.
 
-    BEL at the end is an error of the adapter, as frames have no such identifier.
+    Text with BEL at its end is an error of the adapter, as frames have no such identifier.
     """
 
     class Below:
@@ -151,7 +151,7 @@ def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
         port.received(came)
     sent = b"t18580102030405060708\r"
     assert below.written == 3 * (b"O\r" + sent) + sent
-    assert heard == [CanFrame(0x800, b"\x07"), FRAME]
+    assert heard == [CanFrame(0x800, b"\r\x07"), FRAME]
 
 
 async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:

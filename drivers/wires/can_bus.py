@@ -10,10 +10,12 @@ Frames come and go packed: see `drivers.codec.can_bus.segments`.
 
 import asyncio
 import contextlib
+import math
 import random
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
+from drivers import clock
 from drivers.codec.can_bus.adapter_text import (
     SLCAN,
     SLCAN_RATES,
@@ -121,15 +123,17 @@ def _number_or_text(text: str) -> int | str:
     return int(text) if text.isdecimal() else text
 
 
+_SILENCE = 1.0  # s; twenty heartbeats of an amplifier
+
+
 @final
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames, and with an error where text ends in
-    BEL or is none; on_other: with
-    other text; hello: goes before frames until one has come, since an adapter may restart when its
-    port is opened; cut_off: ends a line of which a port that was blocked has dropped the rest;
-    goodbye: sent before it is closed.
+    on_data: called with packed frames, and with an error where text ends in BEL or is none;
+    on_other: with other text; hello: goes before frames while none has come for a second, since an
+    adapter may have restarted, as by the opening of its port; cut_off: ends a line of which a port
+    that was blocked has dropped the rest; goodbye: sent before it is closed.
     """
 
     def __init__(
@@ -144,10 +148,13 @@ class TextPort(PortAbove):
     ) -> None:
         self._encode, self._reader, self._on_data = form.encode, TextReader(form, on_other), on_data
         self._hello, self._cut_off, self._goodbye = hello, cut_off, goodbye
+        self._heard_at = -math.inf
 
     def write(self, data: bytes) -> None:
         """Send frames; raises LinkError."""
-        text = self._hello + b"".join(map(self._encode, unpack_frames(data)))
+        text = b"".join(map(self._encode, unpack_frames(data)))
+        if clock.now() - self._heard_at > _SILENCE:
+            text = self._hello + text
         self.below.write(self._cut_off + text if self.below.is_blocked else text)
 
     def close(self) -> None:
@@ -160,7 +167,7 @@ class TextPort(PortAbove):
     def received(self, data: bytes) -> None:
         """Take text of the adapter."""
         if frames := pack_frames(self._reader.feed(data)):
-            self._hello = b""
+            self._heard_at = clock.now()
             self._on_data(frames)
         if data.endswith(_BELL) or not data.isascii():
             self._on_data(pack_frames([CanFrame(ERROR_ID, data[-BLOCK:])]))

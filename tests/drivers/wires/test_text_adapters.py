@@ -16,6 +16,7 @@ from drivers.wires import can_bus
 from drivers.wires.can_bus import TextPort
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits
+from virtual_loop import in_virtual_time
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
@@ -130,8 +131,9 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
     assert text == SLCAN_SPOKEN
 
 
-def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
-    """Commands go before frames until one has come: an adapter that boots has heard none of them.
+@in_virtual_time
+async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
+    """Commands go before frames until one has come, and again when none has come for a second.
 
     Text with BEL at its end is an error of the adapter, as frames have no such identifier.
     """
@@ -149,8 +151,10 @@ def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
     for came in (b"\r\nrst:0x1 (POWERON_RESET)\r\n", b"\r\x07", b"t18580102030405060708\r", b"\r"):
         port.write(pack_frames([FRAME]))
         port.received(came)
+    await asyncio.sleep(1.1)
+    port.write(pack_frames([FRAME]))
     sent = b"t18580102030405060708\r"
-    assert below.written == 3 * (b"O\r" + sent) + sent
+    assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
     assert heard == [CanFrame(0x800, b"\r\x07"), FRAME]
 
 

@@ -50,7 +50,7 @@ class Lines:
 
         A line that was lost is opened anew; amplifiers of the lost one stay lost. Raises
         CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
-        address that is taken.
+        address that is taken by one of another name; one of this name gives way.
         """
         address = address_of(url)
         async with self._changing.setdefault(address.line, asyncio.Lock()):
@@ -65,13 +65,9 @@ class Lines:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
                 self._opened[address.line] = opened
-        for setting, value in opened.settings.items():
-            if (got := address.settings.get(setting)) != value:
-                raise LinkError(
-                    f"{address.line}: {setting} must be {value} as for the other amplifiers on "
-                    f"it, got {got}"
-                )
-        if address.number in opened.line.members:
+        address.check_agrees(opened.settings)
+        former = opened.line.members.get(address.number)
+        if former is not None and former.name != name:
             raise LinkError(f"address {address.number} on {address.line} must be used once")
         return Amplifier(
             opened.line,
@@ -106,7 +102,7 @@ async def _open(address: WireAddress) -> _Opened:
         lambda data: lines[0].received(data) if lines else None,
         lambda cause: lines[0].lose(cause) if lines else losses.append(cause),
     )
-    line = Line(address.make_wire(), port, address.line)
+    line = Line(address.make_wire(), port, address.line, boot_time=address.boot_time)
     lines.append(line)
     for cause in losses:
         line.lose(cause)

@@ -92,16 +92,25 @@ class AmplifierUrl:
 
     def device(self, baud: int) -> Place:
         """Return the serial device that the path names; baud: where no option names it."""
-        if self.place or not self.path.strip("/"):
-            raise self.refused("port must be named")
+        if self.place:
+            raise self.refused(f"path of the port must follow three slashes, got {self.place!r}")
+        if not self.path.strip("/"):
+            raise self.refused("path of the port must be given")
         return Place(self.path, baud=self._baud(baud))
 
-    def server(self, *, port: int = 0, has_path: bool = False) -> Place:
-        """Return the port of the network; port: the default; has_path: of what is behind it."""
-        port = self.port or port
-        if not (self.host and port) or (self.path.strip("/") and not has_path):
-            raise self.refused("host and port must be named")
-        return Place(host=self.host, port=port, baud=self._baud(0))
+    def server(self, *, port: int = 0, number: str = "") -> Place:
+        """Return the port of the network; port: the default; number: see `check_path`."""
+        if number:
+            self.check_path(self.path, number)
+        for name, value in (("host", self.host), ("port", self.port or port)):
+            if not value:
+                raise self.refused(f"{name} must be given, got {self.place!r}")
+        return Place(host=self.host, port=self.port or port, baud=self._baud(0))
+
+    def check_path(self, rest: str, number: str) -> None:
+        """Refuse the rest of a path; number: of an amplifier, as it must be given in its place."""
+        if rest := rest.strip("/"):
+            raise self.refused(f"{number.format(rest)}, got /{rest} in the path")
 
     def _baud(self, default: int) -> int:
         return self.whole_option("baud", default, _BAUD_MAX) if "baud" in self.options else default

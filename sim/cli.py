@@ -117,7 +117,7 @@ def sim(
     with exit_on_signal():
         from model.config.points import parse_point
         from model.rig.file import load_rig
-        from sim.far_ends.wires import Wire, assign_wires
+        from sim.far_ends.wires import Wire, assign_wires, links_of
         from sim.faults.fault_window import FaultFile, load_faults
         from sim.firmware.bench import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -143,13 +143,12 @@ def sim(
         if firmware and (common is not None or wire or faults or virtual_time):
             raise InputError("--firmware has a serial line and real time; omit the other options")
         programs = find_firmware() if firmware else None
+        to_wire = {} if firmware else loaded.amplifiers
+        wires = assign_wires(to_wire, common=common, options=wire or [], defaults=defaults)
+        links = links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers))
         simulation = Simulation(
             loaded,
-            {}
-            if firmware
-            else assign_wires(
-                loaded.amplifiers, common=common, options=wire or [], defaults=defaults
-            ),
+            wires,
             faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
             fingers={
                 str(number): parse_point(text, what="--finger")
@@ -164,7 +163,7 @@ def sim(
             record=record,
             until_eof=until_eof,
             firmware=programs,
-            links=links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers)),
+            links={**links_of(wires), **links},
         )
         _run(simulation, virtual_time=virtual_time)
 

@@ -46,6 +46,8 @@ class SimulationUrl:
         file = unquote(self._url.place, errors="surrogateescape") + self._url.path
         if not file:
             raise self._url.refused("rig file must be named")
+        if self._url.number:
+            raise self._url.refused(f"amplifier must be given as ?amplifier={self._url.number}")
         if {"seed", "exact"} <= options.keys():
             raise self._url.refused("seed must not be given with exact")
         self.rig = Path(file)

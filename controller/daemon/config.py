@@ -1,6 +1,7 @@
 """Loads and validates a daemon's configuration and the files that it names; what may change."""
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from urllib.parse import quote
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
+from controller.daemon.socket_lock import check_socket_path
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.touch import (
@@ -18,8 +20,7 @@ from controller.sources.touch import (
     open_source,
     turned,
 )
-from drivers.errors import CommandError
-from drivers.wires.known import address_of
+from drivers.by_hand.rig_check import check_links
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
@@ -99,6 +100,11 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     learn = _file(document, "learn")
     _check_folders(validation, log_file, dump_folder)
     _check_learn(validation, learn)
+    socket = _file(document, "socket") or default_socket()
+    try:
+        check_socket_path(socket)
+    except (InputError, OSError) as error:
+        validation.add(("socket",), str(error))
     section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
     return DaemonConfig(
@@ -111,7 +117,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         learn=learn,
         layout=layout,
         touch=touch,
-        socket=_file(document, "socket") or default_socket(),
+        socket=socket,
         log_file=log_file,
         dump_folder=dump_folder,
     )
@@ -222,11 +228,10 @@ def _urls(
         name: f"sim://{here}?amplifier={quote(name)}" if url == "sim://" else url
         for name, url in rig.amplifiers.items()
     }
-    for name, url in urls.items():
-        try:
-            address_of(url)
-        except CommandError as error:
-            validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
+    wired = Counter(channel.amplifier for channel in rig.wiring.values())
+    errors, _ = check_links(urls, channels=wired, limits=rig.limits)
+    for name, error in errors.items():
+        validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
     if len({url.startswith("sim://") for url in urls.values()}) > 1:
         validation.add(
             ("rig",),

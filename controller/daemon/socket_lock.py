@@ -14,6 +14,17 @@ _MAX_PATH = 107 - len(_STAGED)  # bytes in sockaddr_un
 _REMEDY = "set another socket: in the daemon's file"
 
 
+def check_socket_path(path: Path) -> None:
+    """Raise InputError where no socket can be."""
+    length = len(os.fsencode(path))
+    if length > _MAX_PATH:
+        raise InputError(
+            f"{path}: socket path must have at most {_MAX_PATH} bytes, got {length}; {_REMEDY}"
+        )
+    if os.path.lexists(path) and not path.is_socket():
+        raise InputError(f"{path}: is not a socket; move it away or {_REMEDY}")
+
+
 class SocketLock:
     """Reserves a socket path for this process until `release`.
 
@@ -24,13 +35,7 @@ class SocketLock:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        length = len(os.fsencode(path))
-        if length > _MAX_PATH:
-            raise InputError(
-                f"{path}: socket path must have at most {_MAX_PATH} bytes, got {length}; {_REMEDY}"
-            )
-        if os.path.lexists(path) and not path.is_socket():
-            raise InputError(f"{path}: is not a socket; move it away or {_REMEDY}")
+        check_socket_path(path)
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             _check_folder(path.parent)

@@ -182,14 +182,18 @@ class Supervisor(Operator):
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
-        """Open all amplifiers, disarmed; none that may be armed stays open."""
+        """Open all amplifiers, disarmed; none that may be armed stays open.
+
+        Ports stay open between attempts: a board may restart whenever its own is opened.
+        """
         try:
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             self._not_opened(error)
             self.note_lost(error)
-            await self.controller.release()
+            if self.controller.group.is_open:
+                await self.controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
         return True
@@ -266,7 +270,8 @@ class Supervisor(Operator):
         cause = "all amplifiers reply again and play what they should"
         if degraded:
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
-            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
+            why = group.amplifiers[degraded[0]].silence_cause
+            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played: {why}"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
         _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)

@@ -85,6 +85,7 @@ class Controller:
         self._lines_if_open: Lines | None = None
         self._opened: dict[str, Amplifier] = {}  # last, identified or not
         self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
+        self._lines_to_use: Lines | None = None  # of another attempt to open
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -145,9 +146,12 @@ class Controller:
         An amplifier that was open before must have the serial number that it had, and keeps the
         vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
         for a wired channel that its amplifier does not have or a drive mode that one cannot play.
+        After a LinkError the lines stay open for the next attempt, until `release`: a board may
+        restart whenever its port is opened.
         """
         self._is_closed = False
-        lines = self._lines_if_open = self._make_lines()
+        lines = self._lines_to_use = self._lines_to_use or self._make_lines()
+        self._lines_if_open = lines
         try:
             async with self._sending:  # to those of before
                 self.group = Group(self._opened, watchdog=self.watchdog)
@@ -178,8 +182,9 @@ class Controller:
                 arrived=self._wake.set,
             )
             decider.prepare()
-        except BaseException:
-            await self.release()
+        except BaseException as error:
+            if not isinstance(error, LinkError):
+                await self.release()
             raise
         self._decider_if_open = decider
 
@@ -271,6 +276,7 @@ class Controller:
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
         lines = self._lines_if_open  # those of now: others may be opened meanwhile
+        self._lines_to_use = None
         try:
             await self.group.close(CLOSING_RAMP)
         finally:

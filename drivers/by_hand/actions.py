@@ -26,7 +26,7 @@ from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.stop import Stopped
-from drivers.host.timing import STOP_RAMP, check_watchdog
+from drivers.host.timing import BOOT_TIME, STOP_RAMP, check_watchdog
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import (
     COMMAND,
@@ -40,7 +40,8 @@ from drivers.protocol.table import (
 from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
-_STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
+_STOP_TIMEOUT = 2.0  # s
+_STOP_INTERVAL = 1.0  # s; of stops while it is identified, which they cut short
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
 _UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
@@ -155,11 +156,17 @@ async def stop(url: str) -> dict[str, Any]:
 
 async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
-    cause = ""
-    with contextlib.suppress(DriverError):
-        await amplifier.request("Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+    cause, until = "", clock.now() + BOOT_TIME
+    identifying: asyncio.Future[Any] | None = None
+    while identifying is None or not identifying.done():  # for long where a board may restart
+        with contextlib.suppress(DriverError):
+            if clock.now() < until:
+                values = {"ramp": amplifier.wire_ramp(STOP_RAMP)}
+                await amplifier.request("Stop", values, Priority.STOP)
+        identifying = identifying or asyncio.ensure_future(amplifier.identify())
+        await asyncio.wait([identifying], timeout=_STOP_INTERVAL)
     try:
-        await amplifier.identify()
+        identifying.result()
     except DriverError as error:  # its channels are unknown, but the stop goes on
         cause = str(error)
     stopped = await amplifier.stop(timeout=_STOP_TIMEOUT)

@@ -28,8 +28,8 @@ EXIT_STATUS: dict[type[BaseException], int] = {
 _URLS = """\b
 URLs:
   serial:///dev/ttyUSB0?baud=921600&address=1   a serial port
-  serial+tcp://HOST:PORT                        a serial server with raw TCP
-  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=19200 for a gateway
+  serial+tcp://HOST:PORT?baud=921600            a serial server with raw TCP
+  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=38400 for a gateway
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
   can+socketcan://can0#NODE                     CAN on a network interface
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter

@@ -1,5 +1,6 @@
 """What this machine can reach; only identify requests are sent, no output is driven."""
 
+import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -34,12 +35,12 @@ async def discover(
     """
     places = [with_slcan(place) if slcan else place for place in candidates()]
     probed = [
-        url
-        for place in places
-        if probes and place.remedy is None and not place.is_slcan
-        for url in place.urls
+        place.urls for place in places if probes and place.remedy is None and not place.is_slcan
     ]
-    found = await identify_all([*urls, *probed])
+    found = await identify_all(urls)
+    # Of mute places each URL takes the time in which a board may start.
+    for identified_there in await asyncio.gather(*map(identify_all, probed)):
+        found = {**found, **identified_there}
     amplifiers = [
         {"url": url, **{name: identity[name] for name in ("vendor", "product", "serial_number")}}
         for url, identity in found.items()

@@ -3,14 +3,16 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.errors import CommandError
+from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import (
     MAX_LOSS_DETECTION_TIME,
+    TAKEN_WORDS,
     check_watchdog,
     loss_detection_time,
 )
+from drivers.host.wire import request_words
 from drivers.protocol.table import QUANTITIES
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
@@ -34,11 +36,14 @@ def check_links(
     errors: dict[str, str] = {}
     addresses: dict[str, WireAddress] = {}
     by_place: dict[tuple[str, int], str] = {}
+    lines: dict[str, WireAddress] = {}
     for name, url in urls.items():
         try:
             address = address_of(url)
-            check_watchdog(WATCHDOG, address.set_time(channels.get(name, 0)))
-        except CommandError as error:
+            set_time = address.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
+            check_watchdog(WATCHDOG, set_time)
+            address.check_agrees(lines.setdefault(address.line, address).settings)
+        except (CommandError, LinkError) as error:
             errors[name] = str(error)
             continue
         other = by_place.setdefault((address.line, address.number), name)

@@ -1,13 +1,14 @@
 """Opens the line of an amplifier for its checks, by its URL."""
 
+import contextlib
 import random
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
-from drivers import trace
+from drivers import clock, trace
 from drivers.conformance.can_frames import CanClient
-from drivers.conformance.client import Client, Port
+from drivers.conformance.client import Client, Port, Violation
 from drivers.conformance.modbus_frames import ModbusClient
 from drivers.conformance.serial_frames import SerialClient
 from drivers.errors import LinkError
@@ -37,7 +38,7 @@ class _TracedPort:
 
 @asynccontextmanager
 async def opened(url: str) -> AsyncIterator[Client]:
-    """The client of an amplifier by its URL while its line is open.
+    """The client of an amplifier by its URL while its line is open, and its board has started.
 
     Raises CommandError for a URL that is none, LinkError for a line that cannot be opened.
     """
@@ -54,6 +55,10 @@ async def opened(url: str) -> AsyncIterator[Client]:
     port = await address.open_port(received, client.lost)
     client.port = _TracedPort(port, url)
     try:
+        boots_until = clock.now() + address.boot_time
+        while clock.now() < boots_until and not client.order:  # nothing was heard yet
+            with contextlib.suppress(Violation):
+                await client.hello()
         client.session = random.getrandbits(16)
         client.wire_time = address.make_wire().exchange_time
         client.transit = client.wire_time(0, MAX_WORDS)

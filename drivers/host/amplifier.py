@@ -31,7 +31,7 @@ from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
-OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
+OPEN_TIMEOUT = 0.5  # s; of each request while it is opened, on a busy machine and in a far network
 _ARM_WITHIN = 3.0  # s; from the request to arm until it is sent, on the slowest wire
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; to an amplifier that is found armed

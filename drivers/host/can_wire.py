@@ -6,7 +6,14 @@ Its bytes are packed frames (`drivers.codec.can_bus.segments`), for a port that 
 from collections import deque
 
 from drivers import clock
-from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id, frame_time
+from drivers.codec.can_bus.canopen import (
+    BLOCK,
+    CANOPEN,
+    ERROR_ID,
+    CanFrame,
+    cob_id,
+    frame_time,
+)
 from drivers.codec.can_bus.segments import (
     NODE_MAX,
     NUMBER_MAX,
@@ -44,6 +51,10 @@ from drivers.statistics import WireCounters
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames sent last, which an adapter may echo
 _READ_VERSIONS = bytes((0x40, 0x00, 0x20, 5, 0, 0, 0, 0))  # upload of 2000:5, CiA 301 7.2.4.3.5
 _VERSIONS_READ = bytes((0x4B, 0x00, 0x20, 5))  # two bytes of data follow
+_BUS = (
+    "that the amplifier is switched on and acknowledges, bit rate, wiring, termination, and the "
+    "baud rate of a serial adapter"
+)
 _START: int = CANOPEN["nmt"]["start"]
 
 
@@ -55,6 +66,7 @@ class CanWire(Wire):
 
     def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
+        self.blocked = f"the adapter takes no frames: check {_BUS}"
         self.is_kept = True
         self.delay = delay
         self._frame_time = frame_time(bitrate)
@@ -111,7 +123,21 @@ class CanWire(Wire):
             return self._from_host(node, frame.data)
         if kind == cob_id("sdo_answer") and frame.data.startswith(_VERSIONS_READ):
             return self._other_version(node, frame.data)
+        if frame.id >= ERROR_ID:
+            self.counters.remark = (
+                f"the adapter cannot send, or reports errors ({frame.data.hex(' ')}): check {_BUS}"
+            )
+        elif node and kind not in (REQUEST, cob_id("sdo_request")):
+            self._remark_other(node)
         return []  # of other devices, or an echo
+
+    def _remark_other(self, node: int) -> None:
+        """Note a frame of a node that is no reply; what its amplifier sends says the most."""
+        if node == self._requested or not self.counters.remark:
+            self.counters.remark = (
+                f"frames of node {node} came in place of a reply of node {self._requested}: check "
+                "the node and its protocol, and that nothing delays the bus"
+            )
 
     def _from_amplifier(self, node: int, data: bytes) -> list[Arrival]:
         now = clock.now()
@@ -125,6 +151,7 @@ class CanWire(Wire):
         if self._pending is None or (node, *data[:1]) != self._pending[:2]:
             self.counters.frames_in += 1
             self.counters.unexpected_frames += data[1:2] == b"\0"
+            self._remark_other(node)
             return []
         message = self._replies.add(data, now)
         if message is None:

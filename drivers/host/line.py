@@ -36,10 +36,11 @@ SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 class Line:
     """A line, open from its construction until it is lost or closed.
 
-    What its port receives goes to `received`, a loss to `lose`.
+    What its port receives goes to `received`, a loss to `lose`. boot_time [s]: for which Hello is
+    repeated until an amplifier has replied, since its board may restart when its port is opened.
     """
 
-    def __init__(self, wire: Wire, port: OpenPort, name: str) -> None:
+    def __init__(self, wire: Wire, port: OpenPort, name: str, *, boot_time: float = 0.0) -> None:
         self.wire = wire
         self.name = name
         self.loss: str | None = None
@@ -53,6 +54,7 @@ class Line:
         self._loop = asyncio.get_running_loop()
         self.time = self._loop.time
         """The clock of the line [s]."""
+        self._boot_time, self._boots_until = boot_time, self.time() + boot_time
         self._is_pumping = False
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
@@ -194,6 +196,8 @@ class Line:
         address = BROADCAST if member is None else member.address
         try:
             if not rest:
+                if job.attempts == ATTEMPTS:
+                    self.wire.counters.remark = ""
                 if job.parts:
                     job.values = job.parts[0]
                 elif job.make is not None:
@@ -356,14 +360,20 @@ class Line:
             return
         job.had_no_reply = True
         member.counts.timeouts += 1
-        cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms"
-        if self._port.is_blocked:
-            cause += "; check flow control and the adapter: the port takes no bytes"
-        if job.attempts > 0:
+        is_first = job.name == "Hello" and not any(each.status for each in self.members.values())
+        if job.attempts > 0 or (is_first and self.time() < self._boots_until):
             self._repeat(job, member)
             return
+        remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
+        came = f", but {remark}" if remark else "; check that the amplifier is switched on"
+        cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms{came}"
+        if is_first and self._boot_time:
+            cause += (
+                f". A board that restarts when its port is opened must reply within "
+                f"{self._boot_time:g} s; set one that takes longer not to restart"
+            )
         member.silence_cause = cause
-        self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))
+        self._fail(job, LinkTimeout(cause))
 
 
 def _trace(job: Job, result: "asyncio.Future[Values]") -> None:

@@ -46,7 +46,7 @@ _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
 _SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
-_GATEWAY = (10, 11)  # no path to the amplifier, or no response from it
+_GATEWAY = {10: "path to", 11: "response of"}
 
 
 @dataclass(slots=True)
@@ -137,6 +137,7 @@ class ModbusWire(Wire):
 
     def _adu(self, unit: int, address: int, transfer: int | Sequence[int]) -> RequestAdu:
         self._number = self._number % 0xFFFF + 1
+        self._reader.unawaited.discard(self._number)
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
         adu = build_adu(unit, transaction, address, transfer, is_rtu=self._is_rtu)
@@ -156,6 +157,10 @@ class ModbusWire(Wire):
     def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
         """Return what a response to the transaction on the wire means."""
         if response.exception in _GATEWAY:  # as no response
+            self.counters.remark = (
+                f"the gateway has no {_GATEWAY[response.exception]} unit {request.adu.unit} "
+                f"(exception {response.exception}): check the unit, its supply and its line"
+            )
             return None
         if response.exception:
             self._request = None
@@ -171,6 +176,7 @@ class ModbusWire(Wire):
         tag, result, *words = response.registers
         if request.name != "Hello" and tag != request.tag:
             self.counters.unexpected_frames += 1
+            self.counters.remark = "a reply to another master came: end that one"
             return None
         self._request, self._replied = None, (request.adu, response)
         try:

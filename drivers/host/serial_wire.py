@@ -36,11 +36,14 @@ _BITS = 10  # of a byte, with start and stop
 
 
 class SerialWire(Wire):
-    """A line at a speed [baud], 0 for a network; sequence: number of the last request."""
+    """A line at a speed [baud], 0 if unknown; sequence: number of the last request.
 
-    def __init__(self, baud: int, *, sequence: int) -> None:
+    delay [s]: of a network on the way to it, as there is where the speed is unknown.
+    """
+
+    def __init__(self, baud: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
-        self.delay = 0.0 if baud else NETWORK_DELAY
+        self.delay = delay if baud else NETWORK_DELAY
         self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
         self._pending: Frame | None = None
@@ -98,6 +101,12 @@ class SerialWire(Wire):
             words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
             return read_event(frame.address, EVENT, words, self.counters)
         self.counters.unexpected_frames += 1
+        self.counters.remark = (
+            f"a reply of address {frame.address} to another request came: check the address, and "
+            "that nothing delays the line"
+            if frame.is_reply
+            else "the request itself came back: check the wire from the amplifier to this machine"
+        )
         last = self._replied
         if last is None or frame == last:
             return []
@@ -107,6 +116,8 @@ class SerialWire(Wire):
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
         self._pending = None
+        if self._reader.rest:
+            self._remark_invalid(self._reader.rest)
 
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
@@ -114,3 +125,10 @@ class SerialWire(Wire):
 
     def _count_invalid(self, piece: bytes) -> None:
         self.counters.invalid_frames += 1
+        self._remark_invalid(piece)
+
+    def _remark_invalid(self, piece: bytes) -> None:
+        self.counters.remark = (
+            f"{len(piece)} bytes that are no valid frame came ({piece[:8].hex(' ')}): check baud "
+            "rate, cable and protocol; modbus+rtu:// is another one"
+        )

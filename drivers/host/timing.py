@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from drivers.errors import CommandError
 from drivers.protocol.table import REACTION
 
+BOOT_TIME = 6.0
+"""For the first reply on a line [s], of a board that restarts when its port is opened."""
 REPLY_TIMEOUT = 0.030
 """For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
 FAST = REPLY_TIMEOUT - REACTION
@@ -43,7 +45,7 @@ def check_watchdog(watchdog: float, round_trip: float) -> None:
         raise CommandError(
             f"watchdog must be at least {shortest * 1e3:.0f} ms ({_HEARTBEATS} heartbeats of "
             f"{HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms), got "
-            f"{watchdog * 1e3:g} ms; lengthen it, or use a faster line"
+            f"{watchdog * 1e3:g} ms; use a faster line"
         )
 
 

@@ -168,6 +168,8 @@ class Wire(Protocol):
     """Whether a frame is sent again until somebody takes it, as by an adapter on a CAN bus."""
     takes: float = 0.0
     """How long what was sent last takes to arrive [s]; 0 over a network."""
+    blocked: str = "the port takes no bytes: check flow control and the adapter"
+    """What a port that is blocked means, and what to check."""
     busy: float = 0.0
     """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 

@@ -79,6 +79,10 @@ def _open_device(place: Place) -> serial.Serial:
         # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)
+        # DTR stays up when it is closed: a board that it restarts does so at one opening alone.
+        settings = termios.tcgetattr(port.fileno())
+        settings[2] &= ~termios.HUPCL
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
         port.reset_input_buffer()
     except BaseException:
         port.close()  # else it stays this program's, which could not open it again

@@ -1,10 +1,11 @@
 """TCP connections as ports: of Modbus, of serial servers and of CAN adapters behind one."""
 
 import asyncio
-import contextlib
 import ipaddress
 import socket
+from asyncio.staggered import staggered_race
 from collections.abc import Callable
+from functools import partial
 from typing import cast
 
 from drivers.errors import LinkError, LinkTimeout, system_message
@@ -13,6 +14,8 @@ from drivers.host.wire import NETWORK_DELAY
 from drivers.threads import in_thread
 
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
+_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for
+_NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
 _UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
@@ -23,9 +26,7 @@ async def open_connection(
     endpoint = f"{host}:{port}"
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT):
-            return await _first_to_answer(
-                host, port, lambda: _Connection(endpoint, on_data, on_loss)
-            )
+            return await _first_to_accept(host, port, _Connection(endpoint, on_data, on_loss))
     except TimeoutError:
         raise LinkError(
             f"{endpoint}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
@@ -47,7 +48,7 @@ class _Connection(asyncio.Protocol):
         self._endpoint = endpoint
         self._on_data = on_data
         self._on_loss = on_loss
-        self._is_closed = False
+        self._is_closed = self.is_made = False
         self._transport: asyncio.Transport  # set when connected
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -56,7 +57,7 @@ class _Connection(asyncio.Protocol):
         Without it a frame waits up to 40 ms for the acknowledgement of the one before, and what a
         broken network keeps may arrive minutes later.
         """
-        self._transport = cast(asyncio.Transport, transport)
+        self._transport, self.is_made = cast(asyncio.Transport, transport), True
         connection = transport.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
@@ -96,14 +97,20 @@ class _Connection(asyncio.Protocol):
         """Return at once: abort does not block."""
 
 
-async def _first_to_answer(host: str, port: int, make: Callable[[], _Connection]) -> Port:
-    """Connect to the first address of a host that accepts; raises OSError."""
-    *others, last = await _addresses(host)
-    loop = asyncio.get_running_loop()
-    for address in others:
-        with contextlib.suppress(OSError):
-            return (await loop.create_connection(make, address, port))[1]
-    return (await loop.create_connection(make, last, port))[1]
+async def _first_to_accept(host: str, port: int, connection: _Connection) -> Port:
+    """Connect to the first address of a host that accepts (RFC 8305); raises OSError."""
+    connect = asyncio.get_running_loop().create_connection
+    take = [connection].pop  # the first address that accepts has it, any other an IndexError
+    attempts = [partial(connect, take, each, port) for each in await _addresses(host)]
+    try:
+        _, index, failures = await staggered_race(attempts, _NEXT_AFTER)
+    except BaseException:
+        if connection.is_made:  # given up just after it was accepted
+            connection.close()
+        raise
+    if index is None and failures[-1] is not None:
+        raise failures[-1]
+    return connection
 
 
 async def _addresses(host: str) -> list[str]:
@@ -115,10 +122,5 @@ async def _addresses(host: str) -> list[str]:
         found = await in_thread(
             lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
         )
-        return [_with_zone(*address) for *_, address in found]
-
-
-def _with_zone(address: str | int, *numbers: str | int | bytes) -> str:
-    """Append the zone of a link-local IPv6 address."""
-    *_, zone = numbers  # of an IPv4 address the port, 0
-    return f"{address}%{zone!s}" if zone else str(address)
+        # With the zone of a link-local address.
+        return [socket.getnameinfo(each, _NUMERIC)[0] for *_, each in found]

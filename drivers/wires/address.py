@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
+from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.timing import TAKEN_WORDS, set_words
 from drivers.host.wire import Wire
@@ -18,6 +19,8 @@ class WireAddress(ABC):
     line: str
     settings: Mapping[str, object]
     number: int
+    boot_time: float = 0.0
+    """How long what is behind the port may take to start once that is opened [s]."""
 
     @abstractmethod
     def __init__(self, url: str) -> None:
@@ -30,6 +33,15 @@ class WireAddress(ABC):
     def set_time(self, channels: int) -> float:
         """Return how long a set of these channels and its reply take [s]; 0 if unknown."""
         return self.make_wire().exchange_time(set_words(channels), TAKEN_WORDS)
+
+    def check_agrees(self, settings: Mapping[str, object]) -> None:
+        """Raise LinkError unless its settings are those of the others on its line."""
+        for setting, value in settings.items():
+            if (got := self.settings.get(setting)) != value:
+                raise LinkError(
+                    f"{self.line}: {setting} must be {value} as for the other amplifiers on it, "
+                    f"got {got}"
+                )
 
     @abstractmethod
     async def open_port(

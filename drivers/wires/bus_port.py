@@ -10,7 +10,7 @@ from typing import Any, final
 
 import can
 
-from drivers.codec.can_bus.canopen import CanFrame
+from drivers.codec.can_bus.canopen import ERROR_ID, CanFrame
 from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
 from drivers.errors import LinkError, system_message
 from drivers.ports.device_port import FAILURES, DevicePort
@@ -165,11 +165,14 @@ class BusPort(DevicePort):
 def _frames(message: can.Message) -> list[CanFrame]:
     """Return the data frame with an 11-bit identifier that a message is, if it is one.
 
-    OSError for an error frame that says that the adapter is off the bus.
+    Of an error frame its class is reported; OSError for one that says that the adapter is off the
+    bus.
     """
     if message.is_error_frame and message.arbitration_id & _BUS_OFF:
         raise OSError("the adapter went bus-off; check wiring, termination and bit rate")
-    if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+    if message.is_error_frame:
+        return [CanFrame(ERROR_ID, bytes([message.arbitration_id & 0xFF]))]
+    if message.is_remote_frame or message.is_extended_id:
         return []
     return [] if message.is_fd else [CanFrame(message.arbitration_id, bytes(message.data))]
 

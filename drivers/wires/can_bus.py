@@ -10,10 +10,12 @@ Frames come and go packed: see `drivers.codec.can_bus.segments`.
 
 import asyncio
 import contextlib
+import math
 import random
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
+from drivers import clock
 from drivers.codec.can_bus.adapter_text import (
     SLCAN,
     SLCAN_RATES,
@@ -21,17 +23,19 @@ from drivers.codec.can_bus.adapter_text import (
     TextFormat,
     TextReader,
 )
-from drivers.codec.can_bus.canopen import BITRATE
+from drivers.codec.can_bus.canopen import BITRATE, BLOCK, ERROR_ID, CanFrame
 from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX, pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.can_wire import CanWire
+from drivers.host.timing import BOOT_TIME
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress
 
 _BITRATES = 10_000, 1_000_000
+_NODE = "node must be given as #{}"
 
 
 class CanAddress(WireAddress):
@@ -83,13 +87,14 @@ class PythonCanAddress(CanAddress):
         options = _OPTIONS.get(interface, ())
         parsed = AmplifierUrl(url, _PYTHON_CAN_FORM, known=("bitrate", *options))
         if parsed.scheme == "can+socketcan":
-            interface, channel, rest = "socketcan", parsed.place, parsed.path.strip("/")
+            interface, channel = "socketcan", parsed.place
+            parsed.check_path(parsed.path, _NODE)
         else:
-            channel, rest = parsed.path.removeprefix("/"), ""
+            channel = parsed.path.removeprefix("/")
             if not interface or interface in _OTHERS:
-                raise parsed.refused("interface must be named")
-        if rest or not channel.strip("/"):
-            raise parsed.refused("bus must be named")
+                raise parsed.refused(f"interface must be one of python-can, got {interface!r}")
+        if not channel.strip("/"):
+            raise parsed.refused("bus must be given")
         chosen = {
             name: _number_or_text(parsed.options[name])
             for name in options
@@ -118,12 +123,17 @@ def _number_or_text(text: str) -> int | str:
     return int(text) if text.isdecimal() else text
 
 
+_SILENCE = 1.0  # s; twenty heartbeats of an amplifier
+
+
 @final
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames; on_other: with other text; cut_off: ends a line of which a
-    port that was blocked has dropped the rest; goodbye: sent before it is closed.
+    on_data: called with packed frames, and with an error where text ends in BEL or is none;
+    on_other: with other text; hello: goes before frames while none has come for a second, since an
+    adapter may have restarted, as by the opening of its port; cut_off: ends a line of which a port
+    that was blocked has dropped the rest; goodbye: sent before it is closed.
     """
 
     def __init__(
@@ -132,15 +142,19 @@ class TextPort(PortAbove):
         on_data: Callable[[bytes], None],
         *,
         on_other: Callable[[bytes], None] = lambda text: None,
+        hello: bytes = b"",
         cut_off: bytes = b"",
         goodbye: bytes = b"",
     ) -> None:
         self._encode, self._reader, self._on_data = form.encode, TextReader(form, on_other), on_data
-        self._cut_off, self._goodbye = cut_off, goodbye
+        self._hello, self._cut_off, self._goodbye = hello, cut_off, goodbye
+        self._heard_at = -math.inf
 
     def write(self, data: bytes) -> None:
         """Send frames; raises LinkError."""
         text = b"".join(map(self._encode, unpack_frames(data)))
+        if clock.now() - self._heard_at > _SILENCE:
+            text = self._hello + text
         self.below.write(self._cut_off + text if self.below.is_blocked else text)
 
     def close(self) -> None:
@@ -153,20 +167,25 @@ class TextPort(PortAbove):
     def received(self, data: bytes) -> None:
         """Take text of the adapter."""
         if frames := pack_frames(self._reader.feed(data)):
+            self._heard_at = clock.now()
             self._on_data(frames)
+        if data.endswith(_BELL) or not data.isascii():
+            self._on_data(pack_frames([CanFrame(ERROR_ID, data[-BLOCK:])]))
 
 
 _SLCAN_FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"
 _BAUD = 115_200  # of the adapter's serial port
-_CLOSE = b"\rC\r"
+_CLOSE, _BELL = b"\rC\r", b"\x07"
 
 
 class SlcanAddress(CanAddress):
     """A node behind a serial adapter with LAWICEL's commands, on a port or behind a TCP port."""
 
+    boot_time = BOOT_TIME
+
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SLCAN_FORM, known=("bitrate", "baud"))
-        self.place = parsed.server() if parsed.place else parsed.device(_BAUD)
+        self.place = parsed.server(number=_NODE) if parsed.place else parsed.device(_BAUD)
         super().__init__(
             parsed,
             f"can+slcan://{self.place.name}",
@@ -179,16 +198,11 @@ class SlcanAddress(CanAddress):
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
-        """Open the port, and the adapter's channel at the bit rate; raises LinkError."""
-        port = TextPort(SLCAN, on_data, cut_off=b"\r", goodbye=_CLOSE)
-        port.below = await open_port(self.place, port.received, on_loss)
+        """Open the port; the first request opens the adapter's channel. Raises LinkError."""
         # Closed first, where an earlier host has left it open.
-        try:
-            port.below.write(_CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate))
-        except LinkError:
-            port.close()
-            await port.wait_closed()
-            raise
+        hello = _CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate)
+        port = TextPort(SLCAN, on_data, hello=hello, cut_off=b"\r", goodbye=_CLOSE)
+        port.below = await open_port(self.place, port.received, on_loss)
         return port
 
 
@@ -202,9 +216,11 @@ class SocketcandAddress(CanAddress):
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SOCKETCAND_FORM, known=("bitrate",))
-        self.place, self.channel = parsed.server(has_path=True), parsed.path.strip("/")
+        self.place, path = parsed.server(), parsed.path.strip("/")
+        self.channel, _, rest = path.partition("/")
+        parsed.check_path(rest, _NODE)
         if not self.channel:
-            raise parsed.refused("bus must be named")
+            raise parsed.refused("bus must be given behind the host")
         line = f"can+socketcand://{self.place.name}/{self.channel}"
         super().__init__(parsed, line, delay=NETWORK_DELAY, settings={})
 

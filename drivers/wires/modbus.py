@@ -13,6 +13,7 @@ from typing import final
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.modbus_wire import ModbusWire
+from drivers.host.timing import BOOT_TIME
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
@@ -78,7 +79,7 @@ class SilentPort(PortAbove):
             self._send()
 
 
-_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, that of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"
 _TCP_PORT = 502
 _PARITIES = {"even": "E", "odd": "O", "none": "N"}
@@ -91,13 +92,14 @@ class ModbusAddress(WireAddress):
         self._is_rtu = url.lower().startswith("modbus+rtu")
         if self._is_rtu:
             parsed = AmplifierUrl(url, _RTU_FORM, known=("baud", "parity", "stop"))
-            place = parsed.server() if parsed.place else parsed.device(RTU_BAUD)
+            number = "unit must be given as #{}"
+            place = parsed.server(number=number) if parsed.place else parsed.device(RTU_BAUD)
             unit = parsed.number
         else:
             parsed = AmplifierUrl(url, _TCP_FORM, known=("baud",))
             if parsed.number:
-                raise parsed.refused("unit must follow the host")
-            place, unit = parsed.server(port=_TCP_PORT, has_path=True), parsed.path.strip("/")
+                raise parsed.refused(f"unit must be given as /{parsed.number} behind the host")
+            place, unit = parsed.server(port=_TCP_PORT), parsed.path.strip("/")
         parity = parsed.options.get("parity", "even")
         if parity not in _PARITIES:
             raise parsed.refused(f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}")
@@ -105,6 +107,7 @@ class ModbusAddress(WireAddress):
         self.place = replace(place, parity=_PARITIES[parity], stop=stop)
         self.number = parsed.whole(unit, "unit", ADDRESS_MAX) if unit else ADDRESS
         self.line = self.place.name
+        self.boot_time = BOOT_TIME if self._is_rtu else 0.0
         self.settings = {
             "protocol": "Modbus RTU" if self._is_rtu else "Modbus TCP",
             "baud": self.place.baud,

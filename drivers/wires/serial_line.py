@@ -1,34 +1,42 @@
-"""Serial lines: serial:///dev/ttyUSB0?baud=921600&address=1 and serial+tcp://HOST:PORT."""
+"""Serial lines: serial:///dev/ttyUSB0?baud=921600&address=1, on a server serial+tcp://HOST:PORT."""
 
 import random
 from collections.abc import Callable
 
 from drivers.hardware import Port
 from drivers.host.serial_wire import SerialWire
+from drivers.host.timing import BOOT_TIME
+from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
 
-_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a serial server)"
+_FORM = (
+    "serial:///dev/ttyUSB0?baud=921600&address=1, or serial+tcp://HOST:PORT?baud=921600&address=1 "
+    "for a serial server"
+)
 
 
 class SerialAddress(WireAddress):
     """An amplifier on a serial port of this machine, or behind a serial server."""
+
+    boot_time = BOOT_TIME
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _FORM, known=("baud", "address"))
         if parsed.number:
             raise parsed.refused(f"address must be given as ?address={parsed.number}")
         is_server = parsed.scheme == "serial+tcp"
-        self.place = parsed.server() if is_server else parsed.device(BAUD)
+        number = "address must be given as ?address={}"
+        self.place = parsed.server(number=number) if is_server else parsed.device(BAUD)
         self.number = parsed.whole_option("address", ADDRESS, ADDRESS_MAX)
         self.line = self.place.name
         self.settings = {"protocol": "serial", "baud": self.place.baud}
 
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
-        baud = self.place.baud if self.place.device else 0
-        return SerialWire(baud, sequence=random.getrandbits(16))
+        delay = 0.0 if self.place.device else NETWORK_DELAY
+        return SerialWire(self.place.baud, sequence=random.getrandbits(16), delay=delay)
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]

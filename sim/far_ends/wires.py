@@ -13,6 +13,7 @@ from contextlib import (
 )
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 from drivers.codec.can_bus.canopen import BITRATE
 from drivers.errors import CommandError
@@ -204,6 +205,19 @@ def assign_wires(
         if name not in assigned:
             assigned[name] = common or _wire_of_url(name, url, defaults)
     return {name: assigned[name] for name in amplifiers}
+
+
+def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:
+    """Paths of the rig's URLs at which terminals are placed, by one of the amplifiers on each.
+
+    Those in /dev are of real ports.
+    """
+    names = {
+        wire.line: name
+        for name, wire in wires.items()
+        if wire.line.startswith("/") and not wire.line.startswith("/dev/")
+    }
+    return {name: Path(path) for path, name in names.items()}
 
 
 def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:

@@ -152,4 +152,4 @@ async def test_motion_and_output_are_not_taken_for_each_other(
         for each in (controller, player):
             with pytest.raises(LinkError, match="full level must be"):
                 await each.open()
-        await player.close()
+            await each.close()

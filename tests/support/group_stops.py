@@ -31,6 +31,7 @@ from drivers.by_hand import actions
 from drivers.errors import DriverError
 from drivers.host.dialogue import SILENCING
 from drivers.host.stop import Stopped
+from drivers.host.timing import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each
 from sim.far_ends.wires import Wire
@@ -287,7 +288,7 @@ async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) 
     if not is_early:
         chain.lose_some()
     name = rng.choice([*chain.far.urls])
-    async with asyncio.timeout(LONGEST):
+    async with asyncio.timeout(BOOT_TIME + LONGEST):
         rows = await actions.stop(chain.far.urls[name])
     is_confirmed = rows["silence"] == "confirmed_silent"
     tally.counts[wire, "stops"] += 1

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from drivers import clock
 from drivers.errors import LinkError
 from drivers.hardware import PORT_OPENER
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
@@ -16,6 +17,7 @@ from virtual_loop import VirtualLoop
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter
 _SPLIT = 0.1  # share of pieces that arrive in two
+_BOOT_TEXT = b"\r\nrst:0x1 (POWERON_RESET)\r\n"
 _NOTICED = 0.002  # s; until the host notices a hang-up
 
 
@@ -23,13 +25,15 @@ class MemoryMachine:
     """Ports by name; `make_terminal` is for far ends, the rest for hosts.
 
     passing [s]: shortest and longest time of bytes on their way; late [s]: how much later what goes
-    to the host leaves the far end, by port; attempts: how often each port was to be opened.
+    to the host leaves the far end, by port; attempts: how often each port was to be opened; boots
+    [s]: for which a board that restarts whenever its port is opened prints text, and hears nothing.
     """
 
     def __init__(self, loop: VirtualLoop) -> None:
         self.passing = _PASSING
         self.late: dict[str, float] = {}
         self.attempts = Counter[str]()
+        self.boots = 0.0
         self._loop = loop
         self._terminals: dict[str, MemoryTerminal] = {}
         self._open: dict[str, MemoryPort] = {}
@@ -53,6 +57,9 @@ class MemoryMachine:
         if name in self._open:
             raise LinkError(f"serial port {name} cannot be opened: in use by another program")
         port = self._open[name] = MemoryPort(self, terminal, on_data, on_loss)
+        if self.boots:
+            port.hears_from = self._loop.time() + self.boots
+            self.later(_NOTICED, port.outward.take, _BOOT_TEXT)  # which no witness judges
         return port
 
     def kill_host(self) -> None:
@@ -172,6 +179,7 @@ class MemoryPort:
         self._on_loss = on_loss
         self._is_closed = self._is_hung_up = False
         self.outward = _Direction(on_data)
+        self.hears_from = 0.0
 
     @property
     def is_blocked(self) -> bool:
@@ -183,6 +191,8 @@ class MemoryPort:
     def write(self, data: bytes) -> None:
         if self._is_closed or self._is_hung_up:
             raise LinkError(f"serial line {self._terminal.port} was lost")
+        if clock.now() < self.hears_from:
+            return
         self._machine.deliver(self._terminal.port, "amplifier", data, self._terminal.inward)
 
     def hang_up(self) -> None:

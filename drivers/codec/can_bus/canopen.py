@@ -8,6 +8,8 @@ BLOCK: Final = 8
 _FRAME_BITS = 47 + 8 * BLOCK
 _STUFFED_MAX = (33 + 8 * BLOCK) // 4  # one stuff bit per four at worst
 
+ERROR_ID: Final = 0x800
+"""Above all identifiers of frames: what an adapter reports in place of one, its code as data."""
 BITRATE: Final = 500_000
 """Of a bus whose URL names none [bit/s]."""
 

@@ -24,6 +24,8 @@ _LENGTH_MAX = 254  # unit and PDU
 _RTU_MIN = 4  # unit, function, CRC
 _WITH_TWO_WORDS, _TWO_WORDS_SIZE = range(1, 7), 8  # functions, and the size of their requests
 _WRITE_SIZE, _COUNT_AT = 9, 6  # without the registers that the byte there counts
+_RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
+_TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
 _COUNTED, _ECHOING = (3, 4, 23), (5, 6, 15, 16)  # functions by the form of their responses
 
 
@@ -178,21 +180,23 @@ class ResponseReader:
     def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
         self._is_rtu = is_rtu
         self._counters = counters
-        self._buffer = b""
+        self._buffer = self._request = b""
         self.unawaited: set[int] = set()
 
     def clear(self) -> None:
         """Discard partial data."""
-        self._counters.invalid_frames += bool(self._buffer)
+        if self._buffer:
+            self._count_invalid(self._buffer)
         self._buffer = b""
 
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
         """Return the responses to a request in these bytes; to: None without a request."""
         self._buffer += data
+        self._request = b"" if to is None else to.frame
         responses = []
         for adu in self._split(to):
             if not adu.pdu:
-                self._counters.invalid_frames += 1
+                self._count_invalid(adu.raw)
                 continue
             self._counters.frames_in += 1
             if adu.transaction in self.unawaited:
@@ -203,6 +207,12 @@ class ResponseReader:
                 response = _response(adu.pdu, to)
             if response is None:
                 self._counters.unexpected_frames += 1
+                number = "" if self._is_rtu else f"transaction {adu.transaction}, "
+                self._counters.remark = (
+                    f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
+                    "not of this request: check the unit, that a gateway repeats unit and "
+                    "transaction, and that nothing delays responses"
+                )
             else:
                 responses.append(response)
         return responses
@@ -217,12 +227,20 @@ class ResponseReader:
         for start in range(len(self._buffer) - 4):
             adu = checked(self._buffer, start, self._rtu_size(start, to))
             if adu is not None:
-                self._counters.invalid_frames += start > 0
+                if start:
+                    self._count_invalid(self._buffer[:start])
                 self._buffer = self._buffer[start + len(adu.raw) :]
                 return adu
         if len(self._buffer) > 2 * RTU_MAX:
             self.clear()
         return None
+
+    def _count_invalid(self, data: bytes) -> None:
+        self._counters.invalid_frames += 1
+        what = f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')})"
+        if data == self._request:
+            what = "the request itself came back, and nothing else"
+        self._counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
 
     def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
         """Return the length of a frame that begins here; 0 if none can.

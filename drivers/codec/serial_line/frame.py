@@ -86,6 +86,11 @@ class FrameReader:
         self._rest = b""
         self._is_skipping = False  # to the end of an overlong piece
 
+    @property
+    def rest(self) -> bytes:
+        """What may be the beginning of a frame."""
+        return self._rest
+
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete, in order."""
         frames = []

@@ -20,7 +20,6 @@ from sim.memory_line import SimulationUrl
 
 RUNNER = CliRunner()
 EXAMPLES = Path(__file__).parents[3] / "examples"
-SERIAL = 'side: {url: "serial:///dev/ttyUSB0"}'
 
 
 @pytest.fixture
@@ -86,7 +85,9 @@ def test_config_paths_are_relative_to_its_folder(
     [
         (r'"a\0b"', "", [(1, "rig")]),
         ("[1]", "", [(1, "rig")]),
-        ("rig.yaml", f"socket: {'a' * 4097}", [(2, "socket")]),
+        ("rig.yaml", f"socket: {'a' * 4097}", [(2, "socket"), (2, "socket")]),
+        ("rig.yaml", f"socket: {'a' * 107}", [(2, "socket")]),
+        ("rig.yaml", "socket: rig.yaml", [(2, "socket")]),
         (
             "rig.yaml",
             "log: {file: none/log}\ndumps: {folder: rig.yaml/dumps}\n",
@@ -150,10 +151,15 @@ def test_example_with_several_simulated_amplifiers_is_accepted(name: str) -> Non
     assert config.layout is not None
 
 
-def test_config_refuses_simulated_amplifiers_beside_others(tmp_path: Path) -> None:
-    """A plate is simulated as a whole or not at all."""
-    write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS, ('side: {url: "sim://"}', SERIAL))
-    assert problems(written(tmp_path)) == [(1, "rig")]
+@pytest.mark.parametrize("of_main", ["sim://", "serial:///dev/x?baud=9600", "serial:///dev/x"])
+def test_config_refuses_amplifiers_with_which_no_daemon_starts(
+    of_main: str, tmp_path: Path
+) -> None:
+    """A plate is simulated as a whole or not at all; a line is fast enough; an address has one."""
+    changes = ('main: {url: "sim://"}', f'main: {{url: "{of_main}"}}')
+    side = ('side: {url: "sim://"}', 'side: {url: "serial:///dev/x"}')
+    write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS, changes, side)
+    assert set(problems(written(tmp_path))) == {(1, "rig")}
 
 
 def test_calibrations_map_sensor_to_plate(folder: Path) -> None:

@@ -153,6 +153,18 @@ async def test_error_of_opening_names_the_amplifier_that_cannot_be_reached() -> 
 
 
 @in_virtual_time
+async def test_error_of_opening_names_the_amplifiers_of_a_line() -> None:
+    """All that share a line which cannot be opened, as a CAN bus; not one on another line."""
+    async with set_chain("a", "b", "c") as chain:
+        line = chain.controller.urls["b"]
+        chain.far_ends[1].fault("unplug")
+        chain.controller.urls["c"] = f"{line}&address=2"
+        with pytest.raises(LinkError) as gone:
+            await chain.controller.open()
+    assert gone.value.lost == ("b", "c")
+
+
+@in_virtual_time
 async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     """Other names, or fewer channels; nothing stays open."""
     async with set_chain() as chain:

@@ -34,12 +34,14 @@ def test_check_links_warns_of_limits_beyond_the_ceilings(frequencies: tuple[floa
         ("serial:///dev/ttyUSB0?baud=fast", "baud must be.*'fast'"),
         ("modbus+tcp://host/999", "unit must be.*'999'"),
         (f"{BUS}#300", "node must be.*'300'"),
-        # A write and a read of 22 and 3 words: 86 bytes of 11 bits at 9600 baud are 99 ms.
-        ("modbus+rtu:///dev/ttyS1?baud=9600#1", "at least 26. ms.*got 250 ms"),
+        # The longest part of a set, of 120 words, and its reply: 282 bytes of 11 bits and four
+        # silences of 3.5 of them at 19200 baud are 170 ms, beside three heartbeats of 50 ms.
+        ("modbus+rtu:///dev/ttyS1?baud=19200#1", "at least 320 ms.*got 250 ms; use a faster"),
+        ("serial:///dev/ttyUSB9?baud=115200&address=2", "baud must be 921600 .*got 115200"),
     ],
 )
 def test_check_links_names_an_unusable_url(url: str, message: str) -> None:
-    """Unknown scheme, invalid part of a URL, wire too slow for the watchdog."""
+    """Unknown scheme, invalid part of a URL, too slow for the watchdog, another speed of a line."""
     wrong, warnings = checked("serial:///dev/ttyUSB9", url)
     assert list(wrong) == ["b"]
     with pytest.raises(AssertionError, match=message):
@@ -68,8 +70,8 @@ def test_check_links_warns_of_eras_on_several_links() -> None:
 @pytest.mark.parametrize(
     ("urls", "times"),
     [
-        # 86 bytes of 11 bits, four silences of 3.5 characters, 10 ms for the amplifier: twice.
-        (["modbus+rtu:///dev/ttyS1?baud=19200#1"], ["185 ms"]),
+        # 86 bytes of 11 bits, four silences of 1.75 ms, 10 ms for the amplifier: twice each.
+        ([f"modbus+rtu:///dev/ttyS1?baud=38400#{unit}" for unit in (1, 2)], ["217 ms"]),
         (["serial:///dev/ttyUSB0"], []),
         # Three times 30 ms each, after a heartbeat of 50 ms.
         (["serial:///dev/ttyUSB0?address=1", "serial:///dev/ttyUSB0?address=2"], ["230 ms"]),

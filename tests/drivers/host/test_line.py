@@ -1,9 +1,15 @@
 """One line: which request goes when, how often, and what callers learn."""
 
 import asyncio
+import re
+from collections.abc import Callable, Mapping
+from itertools import starmap
 
 import pytest
 
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.codec.can_bus.segments import pack_frames
+from drivers.codec.serial_line.frame import Frame, encode_frame
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
@@ -130,6 +136,87 @@ async def test_statistics_are_those_of_the_amplifier_and_of_its_line() -> None:
     assert one.frames_out == other.frames_out == 8
     assert one.frames_in == 7
     assert one.last_round_trip == pytest.approx(0.0004)
+
+
+IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    # What stands in place of each reply, by hand, and what the error must name.
+    "serial, wrong speed": ("serial", lambda data: b"\xf8\x80" * 9, "bytes .*f8 80.*baud rate"),
+    "serial, damaged": (
+        "serial",
+        lambda data: data[:-5] + b"\1" + data[-4:],
+        "no valid frame.*cable",
+    ),
+    "serial, echo": ("serial", lambda data: ECHO, "request itself came back"),
+    "serial, late": ("serial", lambda data: LATE, "address 1 to another request.*delays"),
+    "rtu, wrong speed": ("rtu", lambda data: b"\xf8\x80" * 9, "18 bytes .*f8 80.*parity"),
+    "can, text that is none": ("can", lambda data: frames((0x800, b"\xf8")), r"\(f8\).*baud rate"),
+    "rtu, other unit": (
+        "rtu",
+        lambda data: bytes.fromhex("02 90 01 7d c0"),
+        "unit 2.*check the unit",
+    ),
+    "tcp, transaction 0": (
+        "tcp",
+        lambda data: b"\0\0" + data[2:],
+        "transaction 0, unit 1.*gateway",
+    ),
+    "tcp, unit 255": (
+        "tcp",
+        lambda data: data[:6] + b"\xff" + data[7:],
+        "unit 255.*check the unit",
+    ),
+    "tcp, exception 10": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0a", "no path to unit 1"),
+    "tcp, exception 11": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0b", "no response of unit 1"),
+    "tcp, RTU in it": ("tcp", lambda data: b"\1\x10\x09\0\0\1\2\x55", r"Modbus TCP.*modbus\+rtu"),
+    "can, other node": ("can", lambda data: frames((0x705, b"\5")), "node 5 came .* of node 1:"),
+    "can, heartbeat": (
+        "can",
+        lambda data: frames((0x701, b"\5"), (0x702, b"\5")),
+        "node 1 came in place of .* of node 1:",
+    ),
+    "can, BEL": ("can", lambda data: frames((0x800, b"\7")), r"adapter .*\(07\).*termination"),
+}
+
+
+def frames(*given: tuple[int, bytes]) -> bytes:
+    """Frames by identifier and data, as a port of frames has them."""
+    return pack_frames(starmap(CanFrame, given))
+
+
+ECHO = encode_frame(Frame(9, 1, 4, b"", 3))
+LATE = encode_frame(Frame(0x89, 1, 3, b"", 3))
+
+
+@pytest.mark.parametrize("case", IN_PLACE)
+@in_virtual_time
+async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None:
+    """And what to check, which differs; as does the reason why nothing new is played."""
+    wire, in_place, named = IN_PLACE[case]
+    end = MemoryLine(wire, "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    end.outward = lambda name, data: [(0.0002, in_place(data))]
+    with pytest.raises(LinkTimeout, match=f"no reply within 30 ms, but .*{named}"):
+        await host.read_status()
+    assert re.search(named, host.silence_cause or "")
+    end.outward = unaltered
+    await host.read_status()
+    end.outward = lambda name, data: []
+    with pytest.raises(LinkTimeout, match="30 ms; check that the amplifier is switched on"):
+        await host.read_status()
+
+
+@pytest.mark.parametrize(("wire", "named"), [("serial", "flow control"), ("can", "acknowledges")])
+@in_virtual_time
+async def test_error_of_a_port_that_takes_nothing_names_what_to_check(
+    wire: str, named: str
+) -> None:
+    """A bus on which no node acknowledges fills the queue of its adapter."""
+    end = MemoryLine(wire, "a")
+    end.is_blocked = True
+    end.inward = lambda name, data: []
+    with pytest.raises(LinkTimeout, match=named):
+        await end.hosts["a"].open()
 
 
 async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:

@@ -173,6 +173,26 @@ def test_request_of_all_units_has_no_reply() -> None:
     assert wire.counters.unexpected_frames == 0
 
 
+def test_echo_without_a_response_is_named() -> None:
+    """Of the write and of the read that follows it; an adapter of RS-485 may hear itself."""
+    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
+    frame = wire.request(1, "GetStatus", {})
+    (more,) = wire.received(frame + peer.reply(frame))
+    assert isinstance(more, More)
+    assert wire.received(more.data) == []
+    wire.withdraw()
+    assert "request itself came back" in wire.counters.remark
+
+
+def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
+    """Transactions come again after 65 535: then one is a healthy unit's."""
+    wire, peer = ModbusWire(0, is_rtu=False, number=0), Peer(is_rtu=False)
+    wire.request(1, "GetStatus", {})
+    wire.request(0, "Commit", {"session": 9, "token": 7})  # transaction 2, without a response
+    wire._number = 1
+    assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
+
+
 @in_virtual_time
 async def test_damaged_length_costs_one_attempt() -> None:
     """A write that seems to go on for 255 bytes ends with the pause before its repetition."""

@@ -7,8 +7,10 @@ import pty
 import socket
 import subprocess
 import sys
+import termios
 import tty
 from collections.abc import Iterator
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -20,6 +22,7 @@ from drivers.ports import serial_port, tcp
 from drivers.ports.serial_port import SerialPort
 from drivers.ports.tcp import open_connection
 from drivers.urls import Place
+from virtual_loop import in_virtual_time
 
 
 @pytest.mark.parametrize(
@@ -28,14 +31,19 @@ from drivers.urls import Place
 def test_device_is_opened_alone_with_low_latency_and_its_settings(
     monkeypatch: pytest.MonkeyPatch, device: str, parity: str
 ) -> None:
-    """A pseudo-terminal has no parity."""
+    """A pseudo-terminal has no parity. DTR stays up afterwards: it restarts boards."""
+    far, near = os.openpty()
     made = Mock()
+    made.return_value.fileno.return_value = near
     monkeypatch.setattr(serial_port.serial, "Serial", made)
     serial_port._open_device(Place(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
     assert made.call_args.kwargs["exclusive"]
+    assert not termios.tcgetattr(near)[2] & termios.HUPCL
+    os.close(near)
+    os.close(far)
 
 
 async def test_port_that_fails_amid_its_opening_is_released(
@@ -154,20 +162,34 @@ async def test_connection_timeout_has_a_remedy(
             await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
 
 
-async def test_first_address_that_accepts_is_used(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The amplifier listens on the second address only, such as IPv4."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
-        monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
-        connection = await open_connection("amplifier.test", port, lambda _: None, lambda _: None)
-        taken, _ = listening.accept()
-        taken.close()
-        connection.close()
-        await connection.wait_closed()
-        await asyncio.sleep(0)
+@pytest.mark.parametrize("first", ["hangs", "refuses"])
+@in_virtual_time
+async def test_next_address_of_a_host_is_tried(first: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 250 ms (RFC 8305), or at once where the first refuses; that one then has no effect."""
+    loop, accepts = asyncio.get_running_loop(), asyncio.Event()
+    server = await loop.create_server(asyncio.Protocol, port=502)
+    connect, losses = loop.create_connection, list[str]()
+
+    async def connecting(make: Any, address: str, port: int) -> Any:
+        if address == "fd00::1" and first == "refuses":
+            raise ConnectionRefusedError
+        if address == "fd00::1":
+            await accepts.wait()
+        return await connect(make, address, port)
+
+    async def found(host: str) -> list[str]:
+        return ["fd00::1", "192.0.2.1"]
+
+    monkeypatch.setattr(loop, "create_connection", connecting)
+    monkeypatch.setattr(tcp, "_addresses", found)
+    began = loop.time()
+    connection = await open_connection("amplifier.test", 502, lambda _: None, losses.append)
+    assert loop.time() - began == pytest.approx(0.25 if first == "hangs" else 0.0, abs=0.01)
+    accepts.set()
+    await asyncio.sleep(1.0)
+    assert losses == []
+    connection.close()
+    server.close()
 
 
 async def test_connection_gives_up_what_is_not_taken_within_a_second() -> None:
@@ -188,10 +210,10 @@ async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """RFC 4007."""
-    of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
+    of_name = ("fe80::1", 0, 0, 4000), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
     monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
-    assert await tcp._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
+    assert await tcp._addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:

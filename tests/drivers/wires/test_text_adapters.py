@@ -12,11 +12,11 @@ from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.opening import Lines
-from drivers.ports.serial_port import SerialPort
 from drivers.wires import can_bus
 from drivers.wires.can_bus import TextPort
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits
+from virtual_loop import in_virtual_time
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
@@ -131,25 +131,31 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
     assert text == SLCAN_SPOKEN
 
 
-async def test_slcan_port_that_does_not_take_its_commands_is_closed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """It was opened for this program alone: else it could not be opened again."""
-    master, slave = os.openpty()
-    url = f"can+slcan://{os.ttyname(slave)}#5"
+@in_virtual_time
+async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
+    """Commands go before frames until one has come, and again when none has come for a second.
 
-    def fail(port: SerialPort, data: bytes) -> None:
-        raise LinkError("gone")
+    Text with BEL at its end is an error of the adapter, as frames have no such identifier.
+    """
 
-    with monkeypatch.context() as patch:
-        patch.setattr(SerialPort, "write", fail)
-        with pytest.raises(LinkError, match="gone"):
-            await address_of(url).open_port(lambda data: None, lambda cause: None)
-    port = await address_of(url).open_port(lambda data: None, lambda cause: None)
-    port.close()
-    await port.wait_closed()
-    os.close(master)
-    os.close(slave)
+    class Below:
+        is_blocked = False
+        written = b""
+
+        def write(self, data: bytes) -> None:
+            self.written += data
+
+    heard: list[CanFrame] = []
+    port = TextPort(SLCAN, lambda data: heard.extend(unpack_frames(data)), hello=b"O\r")
+    port.below = below = Below()  # type: ignore[assignment]
+    for came in (b"\r\nrst:0x1 (POWERON_RESET)\r\n", b"\r\x07", b"t18580102030405060708\r", b"\r"):
+        port.write(pack_frames([FRAME]))
+        port.received(came)
+    await asyncio.sleep(1.1)
+    port.write(pack_frames([FRAME]))
+    sent = b"t18580102030405060708\r"
+    assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
+    assert heard == [CanFrame(0x800, b"\r\x07"), FRAME]
 
 
 async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from drivers.protocol.table import FAULTS, STATES
 from model.errors import InputError
 from model.rig.rig import Rig
 from rig_on_wire import SHARED_WIRES, WIRES, layer, on_two_amplifiers, rig_on_wire
-from sim.far_ends.wires import Wire, assign_wires
+from sim.far_ends.wires import Wire, assign_wires, links_of
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 
@@ -40,6 +41,18 @@ def test_assign_wires_follows_the_urls() -> None:
     ]
     assert assigned["a"] == assigned["b"]
     assert assigned["a"].shared
+
+
+def test_terminals_are_placed_where_urls_outside_dev_have_them() -> None:
+    """One a line; not of a device, of a network, or where an option chooses the wire."""
+    urls = {
+        **URLS,
+        "g": "serial:///tmp/g",
+        "h": "serial:///tmp/g?address=2",
+        "i": "serial:///tmp/i",
+    }
+    wires = assign_wires(urls, common=None, options=["i=serial"], defaults=DEFAULTS)
+    assert links_of(wires) in ({"g": Path("/tmp/g")}, {"h": Path("/tmp/g")})
 
 
 def test_assign_wires_prefers_own_option_to_common_to_url() -> None:

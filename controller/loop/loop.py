@@ -4,6 +4,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Coroutine, Mapping
+from contextlib import suppress
 from typing import Any
 
 from controller.loop.capabilities import playback_capabilities
@@ -259,20 +260,17 @@ class Controller:
         decision = decider.decide(now)
         try:
             async with self._sending:
-                is_armed, is_degraded = self.group.is_armed, self.group.degraded
-                if is_armed and decision is not None and decision.started and is_degraded:
-                    await self._end_only(decider, decision)
-                elif is_armed and decision is not None:
-                    await self._execute(decider, decision)
-                elif is_armed and now >= decider.playing.due:
-                    await self._go_on(decider, now)
+                with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed
+                    await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     began = clock.now()
-                    await self.group.beat()
-                    # From its beginning: the watchdog has run since its request was sent.
-                    rest = HEARTBEAT / 2  # on a slow wire
-                    self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
+                    try:
+                        await self.group.beat()
+                    finally:
+                        # From its beginning: the watchdog has run since its request was sent.
+                        rest = HEARTBEAT / 2  # on a slow wire
+                        self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
         except LinkError as error:
@@ -286,6 +284,21 @@ class Controller:
                 self._report(lambda each: each.contacts_changed(self._tracker.contacts, expired))
             if not self._wake.is_set():
                 self._changed_at = -math.inf
+
+    async def _send(self, decider: Decider, decision: Decision | None, now: float) -> None:
+        """Send what a decision at a time [s] changes, or what is due by itself; raises DriverError.
+
+        Sends nothing unless the amplifiers are armed.
+        """
+        if not self.group.is_armed:
+            return
+        if decision is None:
+            if now >= decider.playing.due:
+                await self._go_on(decider, now)
+        elif decision.started and self.group.degraded:
+            await self._end_only(decider, decision)
+        else:
+            await self._execute(decider, decision)
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""

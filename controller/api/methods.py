@@ -77,6 +77,9 @@ class StatusResult(Playing, Explained):
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
     rejected_touches: dict[str, Count] = Field(description="number by reason")
+    clicks_too_late: Count = Field(
+        0, description="short vibrations that came too late to be felt; the plate plays on"
+    )
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"
     )

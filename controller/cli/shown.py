@@ -45,6 +45,7 @@ def show_status(status: StatusResult) -> str:
         )
     for reason, count in status.rejected_touches.items():
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
+    lines += _given(("  clicks that came too late: {}", status.clicks_too_late or None))
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
 
 

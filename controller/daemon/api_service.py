@@ -132,6 +132,7 @@ class ApiService:
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
             rejected_touches=dict(self._controller.rejected_touches),
+            clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
             uptime_s=now - self._started,
         )

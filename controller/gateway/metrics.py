@@ -87,6 +87,8 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)
     yield rejected
+    text = "Short vibrations that came too late to be felt."
+    yield CounterMetricFamily("era_clicks_too_late", text, value=status.clicks_too_late)
     yield _histogram(
         "era_touch_to_wire_seconds",
         "From a touch to the last byte of the command.",

@@ -30,6 +30,7 @@ from drivers.host.members import Played
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines
+from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -98,6 +99,8 @@ class Controller:
         self._drive_mode = drive_mode
         self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
         self._rejects = RejectCounter(_logger)
+        self.clicks_too_late = 0
+        """Short vibrations that came too late to be felt, since the start."""
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._changed_at = -math.inf  # s; of the last change, until all are decided
@@ -258,6 +261,10 @@ class Controller:
         if (expired := self._tracker.expire(now)).up:
             decider.note(now)
         decision = decider.decide(now)
+        late, decider.clicks_too_late = decider.clicks_too_late, 0
+        if late and self.group.is_armed:
+            self.clicks_too_late += late
+            _logger.warning("%s came too late to be felt: replies are late", counted(late, "click"))
         try:
             async with self._sending:
                 with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed

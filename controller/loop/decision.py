@@ -6,7 +6,7 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
@@ -99,8 +99,10 @@ class Decider:
         self.clicks_too_late = 0
         """Pulses that were over, or had lost their touch, before the amplifiers were to play them.
 
-        What a ledger refuses, or neighbours do not allow, is not among them.
+        With fingers that had left before they were looked at; not what a ledger refuses, or
+        neighbours do not allow.
         """
+        self._seen: frozenset[ContactKey] = frozenset()  # fingers, when it was last decided
         self._awaited: dict[int, Pulse] = {}  # by identity: decided, and not known to have started
         self._played_until = -math.inf  # s; as far as known
         self._fades_until = -math.inf  # s; what was ended or replaced
@@ -154,9 +156,10 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self.playing.is_silent
 
-    def note(self, time: float) -> None:
-        """Note that contacts have changed, by what arrived at a time [s]."""
+    def note(self, time: float, up: Sequence[Contact]) -> None:
+        """Note that contacts have changed, by what arrived at a time [s]; up: those that left."""
         self._is_new = True
+        self.clicks_too_late += sum(each.key not in self._seen for each in up)
         self._triggered_at = min(self._triggered_at, time)
 
     def look_again(self) -> None:
@@ -291,6 +294,7 @@ class Decider:
         contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)
         self._triggered_at = math.inf
         self._is_new, is_retry = False, now >= self._retry_at
+        self._seen = frozenset([each.key for each in contacts])
         from_rest = now - self._played_until >= _RING_DOWN
         before, decision, has_failed = self._decided, None, False
         try:

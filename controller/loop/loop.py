@@ -259,7 +259,7 @@ class Controller:
             self._is_armed_anew = False
             decider.forget()
         if (expired := self._tracker.expire(now)).up:
-            decider.note(now)
+            decider.note(now, expired.up)
         decision = decider.decide(now)
         late, decider.clicks_too_late = decider.clicks_too_late, 0
         if late and self.group.is_armed:
@@ -349,7 +349,7 @@ class Controller:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
         decider = self._decider_if_open
         if decider is not None:  # else the amplifiers were never open
-            decider.note(time)
+            decider.note(time, change.up)
         self._wake.set()
         if self.group.is_armed:
             self._changed_at = clock.now()

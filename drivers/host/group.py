@@ -157,9 +157,8 @@ class Group(Members):
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
-        self._feed_together()
+        lines = self._feed_together()
         feeding: list[Awaitable[Values]] = []
-        lines = set[Line]()
         for name in self.by_need:
             each = self.amplifiers[name]
             if each.silence_cause is None:
@@ -171,13 +170,19 @@ class Group(Members):
                 if is_due and each.feeding.tells(now):
                     pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
                     self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
-                    feeding.append(each.read_status(Priority.HEARTBEAT))
-                feeding.append(each.ping())
+                    feeding.append(self._read_and_feed(each, self.epoch))
+                else:
+                    feeding.append(each.ping())
             elif name not in self._readings or self._readings[name].done():
                 reading = each.read_status(Priority.READING)
                 reading.add_done_callback(_seen)
                 self._readings[name] = reading
         return self.all(feeding)
+
+    async def _read_and_feed(self, amplifier: Amplifier, before: int) -> Values:
+        await amplifier.read_status(Priority.HEARTBEAT)
+        self.check_none_since(before)
+        return await amplifier.ping()
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.

@@ -245,7 +245,8 @@ class Line:
             # A slow wire: as long as on others until it counts as degraded.
             job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
         # Each of the two responses on Modbus may begin late.
-        job.due = max(job.due, begins + job.longer + job.timeout + self.late)
+        late = self.late if self.late > GRACE else 0.0
+        job.due = max(job.due, begins + job.longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self._current = job
         if self._timer is None:

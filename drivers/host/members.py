@@ -348,17 +348,24 @@ class Members:
         for name, status in zip(requests, statuses, strict=False):
             await _check_plays(self.amplifiers[name], status, token)
 
-    def _feed_together(self) -> None:
+    def _feed_together(self) -> set[Line]:
         """Feed all amplifiers of a line at once whose replies come late, before each in its turn.
 
-        By a commit of the set that all have committed last, which changes nothing.
+        By a commit of the set that all have committed last, which changes nothing. Returns the
+        lines of which they have not committed the same.
         """
+        unfed = set[Line]()
         for line in {each.line for each in self.amplifiers.values()}:
             members = [each for each in self.amplifiers.values() if each.line is line]
             tokens = {each.committed for each in members}
-            if line.late > GRACE and len(members) > 1 and len(tokens) == 1 and tokens != {0}:
-                make = partial(_commit_of, members, tokens.pop(), "Ping")
-                line.submit(None, Priority.HEARTBEAT, "Commit", {}, make=make)
+            if line.late <= GRACE or len(members) == 1:
+                continue
+            if len(tokens) > 1 or 0 in tokens:
+                unfed.add(line)
+                continue
+            make = partial(_commit_of, members, tokens.pop(), "Ping")
+            line.submit(None, Priority.HEARTBEAT, "Commit", {}, make=make)
+        return unfed
 
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""

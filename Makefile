@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test desk-test qt-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
 	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -39,7 +39,7 @@ test: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test kill-test soak desk-test qt-test estimate-test smoke-lowest
+NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test smoke-lowest
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -94,6 +94,11 @@ fault-test: .venv/installed-test
 # their way, and two thousand by command after a killed host; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
 stop-test: .venv/installed-test
 	$(BIN)/python tests/support/group_stops.py $(STOPS)
+
+# Ten thousand taps while every frame is late by up to 16 ms, with one and three amplifiers on a line;
+# `make test` takes some. Others: make late-test LATE='--taps 100000'
+late-test: .venv/installed-test
+	$(BIN)/python tests/support/late_taps.py $(LATE)
 
 # A plate without hardware, measured, calibrated, played and verified by real processes through
 # JACK (jackd2): three minutes. Others: make desk-test DESK='--plates 10 --promises 20'

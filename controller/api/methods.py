@@ -84,6 +84,9 @@ class StatusResult(Playing, Explained):
     inputs: list[TouchInputStatus] = Field(
         default_factory=list, description="touch inputs of the configuration"
     )
+    clicks_too_late: Count = Field(
+        0, description="short vibrations that came too late to be felt; the plate plays on"
+    )
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"
     )

@@ -54,6 +54,7 @@ def show_status(status: StatusResult) -> str:
         example = status.rejected_examples.get(reason)
         newest = f" ({example})" if example else ""
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}{newest}")
+    lines += _given(("  clicks that came too late: {}", status.clicks_too_late or None))
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
 
 

@@ -134,6 +134,7 @@ class ApiService:
             rejected_touches=dict(self._controller.rejects.counts),
             rejected_examples=dict(self._controller.rejects.examples),
             inputs=self._publisher.inputs().inputs,
+            clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
             uptime_s=now - self._started,
         )

@@ -96,6 +96,8 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     for each in status.inputs:
         inputs.add_metric([each.name], float(each.state == "open"))
     yield inputs
+    text = "Short vibrations that came too late to be felt."
+    yield CounterMetricFamily("era_clicks_too_late", text, value=status.clicks_too_late)
     yield _histogram(
         "era_touch_to_wire_seconds",
         "From a touch to the last byte of the command.",

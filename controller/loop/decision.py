@@ -6,13 +6,13 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.choice import Chooser
 from controller.loop.content import Selection, no_layer_free
-from controller.loop.intent import FADED_AFTER, IntentSource
+from controller.loop.intent import FADED_AFTER, IntentSource, Pulse
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.playing import PlayedContent, Playing, all_left
 from controller.loop.selection import Selector
@@ -96,6 +96,14 @@ class Decider:
         self._is_new = True  # something has come that is not decided yet
         self._arrived = arrived
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
+        self.clicks_too_late = 0
+        """Pulses that were over, or had lost their touch, before the amplifiers were to play them.
+
+        With fingers that had left before they were looked at; not what a ledger refuses, or
+        neighbours do not allow.
+        """
+        self._seen: frozenset[ContactKey] = frozenset()  # fingers, when it was last decided
+        self._awaited: dict[int, Pulse] = {}  # by identity: decided, and not known to have started
         self._played_until = -math.inf  # s; as far as known
         self._fades_until = -math.inf  # s; what was ended or replaced
 
@@ -148,9 +156,10 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self.playing.is_silent
 
-    def note(self, time: float) -> None:
-        """Note that contacts have changed, by what arrived at a time [s]."""
+    def note(self, time: float, up: Sequence[Contact]) -> None:
+        """Note that contacts have changed, by what arrived at a time [s]; up: those that left."""
         self._is_new = True
+        self.clicks_too_late += sum(each.key not in self._seen for each in up)
         self._triggered_at = min(self._triggered_at, time)
 
     def look_again(self) -> None:
@@ -178,6 +187,7 @@ class Decider:
         for number in decision.started:
             for _, target in playing.contents[number].content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
+                    self.clicks_too_late += played.sent_at > target.pulse.end
                     target.pulse.started_at = played.sent_at
                     self._intent_due = min(self._intent_due, target.pulse.end)
             playing.confirm_start(number, played, now)
@@ -200,6 +210,8 @@ class Decider:
         what is left out is decided again when a pulse or a layer beside it has ended, or what it
         replaces has faded.
         """
+        if error.until is None or error.until > now:  # not of a wire that is too slow or too busy
+            self._awaited.clear()
         if any(each.is_shaped for each in decision.sets.values()):
             _logger.info("loop: plain ramps instead of envelopes: %s", error)
             return self._without_shapes(decision)
@@ -273,11 +285,16 @@ class Decider:
         for each in self.playing.contents.values():
             if each.drive:
                 self._played_until = now
+        for number, pulse in [*self._awaited.items()]:
+            if pulse.started_at is not None or now >= pulse.end:
+                self.clicks_too_late += pulse.started_at is None
+                del self._awaited[number]
         if not self._is_new and now < self.due:
             return None
         contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)
         self._triggered_at = math.inf
         self._is_new, is_retry = False, now >= self._retry_at
+        self._seen = frozenset([each.key for each in contacts])
         from_rest = now - self._played_until >= _RING_DOWN
         before, decision, has_failed = self._decided, None, False
         try:
@@ -361,6 +378,8 @@ class Decider:
         if sets.keys() - started or any(before[n].drive for n in started & before.keys()):
             self._fades_until = now + FADED_AFTER
         playing.start(contents, started)
+        pulses = [one.pulse for number in started for _, one in numbers[number].targets]
+        self._awaited |= {id(each): each for each in pulses if each is not None}
         return replace(draft, sets=sets, started=started)
 
     def _ended(self, draft: Decision, now: float, *, has_failed: bool) -> Decision:

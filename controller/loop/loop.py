@@ -4,6 +4,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextlib import suppress
 from typing import Any
 
 from controller.loop.capabilities import playback_capabilities
@@ -29,6 +30,7 @@ from drivers.host.members import Played
 from drivers.host.stop import UNREACHED, Stopped, what_may_play
 from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
+from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -101,6 +103,8 @@ class Controller:
         self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
         self.rejects = RejectCounter(_logger)
         """What of touches was rejected, at the sources and as contacts: the only such counter."""
+        self.clicks_too_late = 0
+        """Short vibrations that came too late to be felt, since the start."""
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._changed_at = -math.inf  # s; of the last change, until all are decided
@@ -309,24 +313,25 @@ class Controller:
             self._is_armed_anew = False
             decider.forget()
         if (expired := self._tracker.expire(now)).up:
-            decider.note(now)
+            decider.note(now, expired.up)
         decision = decider.decide(now)
+        late, decider.clicks_too_late = decider.clicks_too_late, 0
+        if late and self.group.is_armed:
+            self.clicks_too_late += late
+            _logger.warning("%s came too late to be felt: replies are late", counted(late, "click"))
         try:
             async with self._sending:
-                is_armed, is_degraded = self.group.is_armed, self.group.degraded
-                if is_armed and decision is not None and decision.started and is_degraded:
-                    await self._end_only(decider, decision)
-                elif is_armed and decision is not None:
-                    await self._execute(decider, decision)
-                elif is_armed and now >= decider.playing.due:
-                    await self._go_on(decider, now)
+                with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed
+                    await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     began = clock.now()
-                    await self.group.beat()
-                    # From its beginning: the watchdog has run since its request was sent.
-                    rest = HEARTBEAT / 2  # on a slow wire
-                    self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
+                    try:
+                        await self.group.beat()
+                    finally:
+                        # From its beginning: the watchdog has run since its request was sent.
+                        rest = HEARTBEAT / 2  # on a slow wire
+                        self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
         except LinkError as error:
@@ -340,6 +345,21 @@ class Controller:
                 self._report(lambda each: each.contacts_changed(self._tracker.contacts, expired))
             if not self._wake.is_set():
                 self._changed_at = -math.inf
+
+    async def _send(self, decider: Decider, decision: Decision | None, now: float) -> None:
+        """Send what a decision at a time [s] changes, or what is due by itself; raises DriverError.
+
+        Sends nothing unless the amplifiers are armed.
+        """
+        if not self.group.is_armed:
+            return
+        if decision is None:
+            if now >= decider.playing.due:
+                await self._go_on(decider, now)
+        elif decision.started and self.group.degraded:
+            await self._end_only(decider, decision)
+        else:
+            await self._execute(decider, decision)
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
@@ -383,7 +403,7 @@ class Controller:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
         decider = self._decider_if_open
         if decider is not None:  # else the amplifiers were never open
-            decider.note(time)
+            decider.note(time, change.up)
         self._wake.set()
         if self.group.is_armed:
             self._changed_at = clock.now()

@@ -345,6 +345,7 @@ class Dialogue:
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
+            self.committed = reply["token"]
             return
         if ledger is not None and (
             ledger.doubt or self._admitted or reply["token"] != self.committed

@@ -20,7 +20,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
-from drivers.host.line import Line
+from drivers.host.line import GRACE, Line
 from drivers.host.members import GroupState, Members, is_lost
 from drivers.host.stop import Stopped, what_may_play
 from drivers.host.timing import STOP_RAMP, check_watchdog
@@ -151,7 +151,7 @@ class Group(Members):
         Of one that does not reply the status is read meanwhile; one that replies again must still
         play its set. A watchdog that runs down, and starts anew with each heartbeat, shows that it
         would silence the amplifier: so its status is read just before it is fed, five times a
-        second, and less often on a slow wire.
+        second, and less often on a slow wire or where replies come late.
         """
         return self._exchange(self._beat)
 
@@ -159,11 +159,17 @@ class Group(Members):
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
+        lines = self._feed_together()
         feeding: list[Awaitable[Values]] = []
-        for name, each in self.amplifiers.items():
+        for name in self.by_need:
+            each = self.amplifiers[name]
             if each.silence_cause is None:
                 now = each.line.time()
-                if now >= self._running_due.get(name, 0.0) and each.feeding.tells(now):
+                # Where replies come late one of a line alone: none waits for long to be fed.
+                may_read = each.line not in lines or each.line.late <= GRACE
+                lines.add(each.line)
+                is_due = may_read and now >= self._running_due.get(name, 0.0)
+                if is_due and each.feeding.tells(now):
                     pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
                     self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
                     feeding.append(self._read_and_feed(each, self.epoch))

@@ -65,6 +65,7 @@ class Ledger:
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""
+        self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
 
     def go_on_from(self, earlier: "Ledger") -> None:
         """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
@@ -100,16 +101,19 @@ class Ledger:
     def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt.
 
-        Again, where its commit is repeated: it may have played since the first time.
+        Again, where its commit is repeated: it may have played since the first time, also where a
+        status said that it did not, which may have overtaken the commit.
         """
         if self.doubt is not None and self.doubt.token == token:
             return
+        if self._first_sent[0] != token:
+            self._first_sent = token, now
         before: Vibration | None = None
         if is_vibrating(*layers):
             is_timed = not self._budget.is_unlimited
             lasts = max(map(_lasts, layers)) if is_timed else 0.0
             before = self._budget.sent(now, lasts=lasts)
-        self.doubt = Doubt(token, layers, now, before)
+        self.doubt = Doubt(token, layers, self._first_sent[1], before)
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt at a time [s] by the token that the amplifier says it committed last.
@@ -168,12 +172,15 @@ class Ledger:
             return f"levels must be {playback.channels}, got {len(status['levels'])}"
         if len(status["tokens"]) != self.capabilities["layers"]:
             return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
-        is_steady = playback.next_due - 2 * self.lag > now
-        if is_steady:  # else a layer may have ended, or not yet
-            expected = playback.tokens
-            for layer, token in enumerate(status["tokens"]):
-                if token != expected.get(layer, 0):
-                    return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
+        is_steady, unsure = playback.next_due - 2 * self.lag > now, set[int]()
+        if not is_steady:  # a layer may have ended, or started what waits, or not yet
+            unsure = {layer for due, layer in playback.dues if due - 2 * self.lag <= now}
+        expected = playback.tokens
+        for layer, token in enumerate(status["tokens"]):
+            if token != expected.get(layer, 0) and not (
+                layer in unsure and token in playback.next_tokens(layer)
+            ):
+                return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
         late, tolerance = sent_at - self.lag, _STEPS * max(self.capabilities["level_step"], 1)
         for channel, level in enumerate(status["levels"]):
             highest, is_settled = 0.0, is_steady

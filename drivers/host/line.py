@@ -27,6 +27,12 @@ GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
 _LOOK_INTERVAL = 0.01  # s; in which a delay of this process is noticed
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
+MAX_LATE = 0.032
+"""By so much longer [s] than on a prompt wire a reply is awaited where replies have come late.
+
+An adapter may keep what passes for 16 ms, each way.
+"""
+_LATE_DECAY = 0.9  # with each reply
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
@@ -58,6 +64,8 @@ class Line:
         self._is_pumping = False
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
+        self.late = 0.0
+        """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
 
     def submit(
         self,
@@ -121,6 +129,8 @@ class Line:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
+            late = self.time() - job.sent_at - member.exchange_time(job.name)
+            self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
             if not isinstance(arrival, Reply):
@@ -239,7 +249,8 @@ class Line:
             # A slow wire: as long as on others until it counts as degraded.
             job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
         # Each of the two responses on Modbus may begin late.
-        job.due = max(job.due, begins + job.longer + job.timeout)
+        late = self.late if self.late > GRACE else 0.0
+        job.due = max(job.due, begins + job.longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self._current = job
         if self._timer is None:

@@ -27,12 +27,12 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
-from drivers.host.line import Line
+from drivers.host.line import GRACE, Line
 from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
-from drivers.protocol.table import ENABLED, STATES, name_of
+from drivers.protocol.table import LATCHED, STATES, name_of
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
@@ -122,6 +122,11 @@ class Members:
         """Whether layers may be played."""
         return self.state is GroupState.ARMED
 
+    @property
+    def by_need(self) -> list[str]:
+        """All names, first that of the one that was fed longest ago: replies may come late."""
+        return sorted(self.amplifiers, key=lambda name: self.amplifiers[name].feeding.since)
+
     def lose(self) -> None:
         """Enter the state LOST, in which nothing is played."""
         if self.state is not GroupState.CLOSED:
@@ -200,11 +205,15 @@ class Members:
 
         Returns when [s] the last request went out. Raises as `apply`.
         """
-        # On a line that they share none waits for one that does not reply: that comes last.
-        members = sorted(self.amplifiers.values(), key=lambda each: each.silence_cause is not None)
-        await self._exchange(lambda: self.all([each.silence(ramp) for each in members]))
-        self.is_set_incomplete = False
+        await self._exchange(lambda: self._silence(ramp))
         return self.last_sent_at
+
+    async def _silence(self, ramp: float) -> None:
+        # On a line that they share none waits for one that does not reply: that comes last.
+        members = [self.amplifiers[name] for name in self.by_need]
+        members.sort(key=lambda each: each.silence_cause is not None)
+        await self.all([each.silence(ramp) for each in members])
+        self.is_set_incomplete = False
 
     def abort_exchange(self) -> None:
         """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
@@ -214,10 +223,10 @@ class Members:
         if self._limit is not None and not self._limit.expired():
             self._limit.reschedule(clock.now())
 
-    async def _exchange(self, exchange: Callable[[], Awaitable[_T | CommandRefused]]) -> _T:
+    async def _exchange(self, exchange: Callable[[], Awaitable[_T | DriverError]]) -> _T:
         """Run an exchange of the control loop; any unexplained failure stops all amplifiers.
 
-        A refusal that it returns has changed nothing.
+        An error that it returns stops none.
         """
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
@@ -244,18 +253,23 @@ class Members:
             if is_lost:  # also where it was degraded when this began
                 raise LinkTimeout(next(iter(self.lost_by.values()), str(error))) from error
             raise
-        if isinstance(done, CommandRefused):
+        if isinstance(done, DriverError):
             raise done
         return done
 
-    async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
-        """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
+    async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
+        """Stage and commit layers by amplifier; a refusal before the first commit is returned.
+
+        Preempted where a commit that was lost is too late to be repeated: then all are silent.
+        """
         before = self.epoch
+        self._feed_together()
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
         is_silent = all(map(is_silence, layers.values()))
         staging: list[Awaitable[Staged]] = []
+        layers = {name: layers[name] for name in self.by_need if name in layers}
         for name, of_one in layers.items():
             staging.append(self.amplifiers[name].stage(token, of_one, now=is_silent))
         results: list[Staged | BaseException]
@@ -284,11 +298,14 @@ class Members:
             try:
                 await self._commit(staged)
             except CommandRefused as refusal:
-                is_sent = any(self.amplifiers[name].played_at >= began for name in staged)
-                if is_sent or refusal.until is None or self.epoch != before:
+                if refusal.until is None or self.epoch != before:
                     raise
+                # Too late for what the ledgers have admitted.
+                if any(self.amplifiers[name].played_at >= began for name in staged):
+                    await self._silence(STOP_RAMP)
+                    return Preempted(str(refusal))
                 self.is_set_incomplete = False
-                return refusal  # too late for what the ledgers have admitted: none was sent
+                return refusal
         self.is_set_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         inexact: list[str] = []
@@ -329,7 +346,26 @@ class Members:
         # With the broadcasts: one that waits is not sent where this is given up.
         statuses = await self.all([*requests.values(), *broadcasts])
         for name, status in zip(requests, statuses, strict=False):
-            _check_plays(name, status, staged[name])
+            await _check_plays(self.amplifiers[name], status, token)
+
+    def _feed_together(self) -> set[Line]:
+        """Feed all amplifiers of a line at once whose replies come late, before each in its turn.
+
+        By a commit of the set that all have committed last, which changes nothing. Returns the
+        lines of which they have not committed the same.
+        """
+        unfed = set[Line]()
+        for line in {each.line for each in self.amplifiers.values()}:
+            members = [each for each in self.amplifiers.values() if each.line is line]
+            tokens = {each.committed for each in members}
+            if line.late <= GRACE or len(members) == 1:
+                continue
+            if len(tokens) > 1 or 0 in tokens:
+                unfed.add(line)
+                continue
+            make = partial(_commit_of, members, tokens.pop(), "Ping")
+            line.submit(None, Priority.HEARTBEAT, "Commit", {}, make=make)
+        return unfed
 
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""
@@ -361,29 +397,28 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
-def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
-    """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
+def _commit_of(several: Sequence[Amplifier], token: int, like: str = "Commit") -> Values:
+    """Return the commit of all amplifiers of a line.
+
+    Raises unless each may have it now; like: "Ping" where it only feeds.
+    """
     values = {"session": several[0].session, "token": token}
     for amplifier in several:
-        amplifier.next_request("Commit", values, Priority.SET)
+        amplifier.next_request(like, values, Priority.SET)
     return values
 
 
-def _check_plays(name: str, status: Values, staged: Staged) -> None:
-    """Raise CommandRefused unless a status shows that a set plays, in each of its layers."""
-    for one in staged.layers:
-        is_lasting = False
-        for command in one.commands:
-            is_lasting = is_lasting or (command.level > 0 and not one.after)
-        got = dict(enumerate(status["tokens"])).get(one.layer)
-        if is_lasting and got != staged.token:
-            raise CommandRefused(
-                f"amplifier {name}: token of layer {one.layer} must be {staged.token}, got {got}"
-            )
-    if status["token"] != staged.token or status["state"] != ENABLED:
+async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
+    """Raise CommandRefused unless a status shows the token of a set, or the next one does.
+
+    What its layers play is compared with every status.
+    """
+    if status["token"] != token and status["state"] not in LATCHED:
+        status = await amplifier.commit(token)
+    if status["token"] != token or status["state"] in LATCHED:
         raise CommandRefused(
-            f"amplifier {name}: token must be {staged.token} while armed, got {status['token']} in "
-            f"state {name_of(STATES, status['state'])}"
+            f"amplifier {amplifier.name}: token must be {token} while armed, got "
+            f"{status['token']} in state {name_of(STATES, status['state'])}"
         )
 
 
@@ -393,8 +428,11 @@ async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...
 
 
 async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) -> Values:
-    """Read the status after a broadcast that was sent, and commit again where that was lost."""
-    status = await amplifier.read_status(Priority.SET)
+    """Read the status after a broadcast that was sent, and commit again where that was lost.
+
+    By a heartbeat: where replies are late the watchdogs run meanwhile.
+    """
+    status = await amplifier.ping()
     if status["token"] == token:
         return status
     await sent

@@ -437,17 +437,28 @@ async def test_silence_that_one_does_not_hear_is_repeated(
 async def test_set_that_would_be_committed_too_late_is_not(
     group: Group, ends: list[MemoryLine]
 ) -> None:
-    """The ledger admitted it for a tenth of a second; its commit is lost until after that."""
+    """The ledger admitted it for a tenth of a second; its commit is lost until after that.
+
+    The other amplifier played it: both are silenced, and stay armed for the next.
+    """
+    await group.apply({name: [layer(1, Tone(1, 150.0, 0.1))] for name in "ab"})
     ends[0].inward = losing("Commit", count=2)
     ends[1].inward = losing("Set", count=2)
-    with pytest.raises(CommandRefused):
+    with pytest.raises(Preempted):
         await group.apply({name: [layer(0, tone())] for name in "ab"})
-    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
+    await asyncio.sleep(0.005)
+    assert [ends[0].levels("a"), ends[1].levels("b")] == [[0.0, 0.0]] * 2
+    assert (group.is_armed, group.is_set_incomplete) == (True, False)
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    await group.beat()
 
 
 @grouped(("a",), wire="serial")
 async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]) -> None:
-    """An amplifier that commits one of two layers says the token of the set all the same."""
+    """An amplifier that commits one of two layers says the token of the set all the same.
+
+    The status that its commit returns is the first that contradicts, the next heartbeat's the last.
+    """
     far = ends[0].far["a"].playback
     commit = far.commit
 
@@ -455,8 +466,10 @@ async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]
         commit(layers[:1], token, time)
 
     far.commit = first_alone  # type: ignore[method-assign]
+    await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+    await asyncio.sleep(0.05)
     with pytest.raises(CommandRefused):
-        await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+        await group.beat()
     assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
 
 

@@ -315,6 +315,7 @@ function connect(token) {
     closed,
     failed,
     lifted: () => fingers.clear(),
+    disarmed: showButtons,
     stopped: (result) => { epoch = Math.max(epoch, result.epoch); },
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => fieldView.show(decodeField(buffer)),

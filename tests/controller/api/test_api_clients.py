@@ -25,7 +25,15 @@ from controller.api.jsonrpc import ErrorCode, RpcError, event_line
 from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
-from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
+from daemon_bench import (
+    PLACE,
+    daemon_at,
+    far_end,
+    next_event,
+    ready_daemon,
+    running_daemon,
+    until_state,
+)
 from model.errors import InputError
 from served_api import request
 from virtual_loop import in_virtual_time
@@ -88,6 +96,51 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
             events.append(await next_event(era, "state"))
         results = await asyncio.gather(*(era.status() for _ in range(50)))
         assert {status.state for status in results} == {READY}
+
+
+@in_virtual_time
+async def test_lease_outlives_a_loss_of_the_connection_that_is_shorter(tmp_path: Path) -> None:
+    """Out of reach for 3 s of 5 it is renewed after them; for longer it is lost, for good."""
+    async with ready_daemon(tmp_path) as (bench, other):
+        away = bench.socket.with_name("away")
+        era = await bench.client("study")
+
+        async def lose(duration: float) -> None:
+            bench.socket.rename(away)
+            for connection in list(bench.daemon._server._admission.admitted):
+                connection.abort()
+            await asyncio.sleep(duration)
+            away.rename(bench.socket)
+
+        await era.begin_armed("study", lease_s=5)
+        await lose(3.0)
+        await asyncio.sleep(3.0)
+        assert (await other.status()).armed_by == "study"
+        await era.touch([PLACE])
+        await lose(6.0)
+        for use in (era.next_event(timeout=9), era.touch([PLACE]), era.end_armed()):
+            with pytest.raises(LeaseLost, match="no daemon runs"):
+                await use
+        assert (await other.status()).state == READY
+
+
+@in_virtual_time
+async def test_lease_is_lost_with_the_daemon_that_gave_it(tmp_path: Path) -> None:
+    """Another one at the same socket is not armed; who waits for events is told, as who calls."""
+    async with far_end(tmp_path) as far, contextlib.AsyncExitStack() as armed:
+        async with daemon_at(far, tmp_path) as bench, await bench.client() as first:
+            await until_state(first, READY)
+            era = await bench.client("study")
+            await armed.enter_async_context(era.armed("study", lease_s=60))
+        async with daemon_at(far, tmp_path) as bench, await bench.client() as second:
+            waiting = asyncio.create_task(era.next_event(timeout=9))
+            await until_state(second, READY)
+            with pytest.raises(LeaseLost):
+                await waiting
+            with pytest.raises(LeaseLost):
+                await armed.aclose()
+            assert (await second.status()).armed_by is None
+            await era.close()
 
 
 async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(

@@ -16,13 +16,13 @@ from typing import Any, Literal, TypeVar
 from controller.daemon.deferred_calls import DeferredCalls, call_guarded
 from controller.daemon.read_back import READ_BACK_INTERVAL, find_problem, is_any_armed
 from controller.daemon.states import (
-    ACKNOWLEDGE,
     Action,
     DaemonEvent,
     DaemonState,
     Lease,
     Operation,
     Trigger,
+    acknowledge,
     check_lease,
     failed,
     step,
@@ -38,7 +38,8 @@ _MAX_READ_BACKS = 15
 _WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
 _NOT_CONNECTED = Stopped(False, -math.inf, "the amplifier is not connected")
-SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
+_TRYING = "the daemon reconnects by itself and stays disarmed"
+SEARCHING = f"check cables and supply; {_TRYING}"
 
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
 StateObserver = Callable[[Operation, Operation], None]
@@ -111,11 +112,14 @@ class Operator:
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
 
-    def note_lost(self, names: tuple[str, ...]) -> None:
-        """Note which amplifiers are lost now, where that is known."""
+    def note_lost(self, names: tuple[str, ...], error: Exception) -> None:
+        """Note why amplifiers cannot be reached now, and which, where that is known."""
         lost = self.operation.lost
-        if names and lost is not None:
-            self.operation = replace(self.operation, lost=lost._replace(names=names))
+        if lost is not None:
+            lost = lost._replace(names=names or lost.names)
+            cause = _loss_cause(names, error)
+            remedy = _TRYING if "; " in cause else SEARCHING  # unless the cause has its own
+            self.operation = replace(self.operation, lost=lost, cause=cause, remedy=remedy)
 
     def tick(self) -> None:
         """End the lease if it has expired, else look again when it will have."""
@@ -197,7 +201,7 @@ class Operator:
         try:
             return asyncio.ensure_future(self.controller.group.stop())
         finally:
-            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
+            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, acknowledge(cause))))
 
     def assume_energised(self, now: float) -> bool:
         """Whether a lost amplifier may still be playing at a time [s].
@@ -262,7 +266,7 @@ class Operator:
         except DriverError as error:
             is_stopping = isinstance(error, Preempted) and self.operation.is_latched
             if epoch == self.operation.epoch and not is_stopping:
-                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error), acknowledge(str(error))))
             raise
 
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
@@ -305,7 +309,7 @@ class Operator:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
             await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
         else:
-            await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+            await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
 
     async def _clear(self, epoch: int) -> None:
         self._clears.append(epoch)
@@ -317,7 +321,7 @@ class Operator:
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
-        await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+        await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     def _check_none_since(self, epoch: int) -> None:
@@ -351,12 +355,15 @@ class Operator:
         async with self._loss_lock:
             group = self.controller.group
             lost = *group.lost_by, *group.degraded
-            text = str(error)
             if self.operation.state is not DaemonState.COMM_LOST:
-                self._link_changed("lost", lost, text)
-            cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
+                self._link_changed("lost", lost, str(error))
+            cause = _loss_cause(lost, error)
             event = DaemonEvent(Trigger.LINK_LOST, cause, SEARCHING, amplifiers=lost)
             await self.handle(event)
+
+
+def _loss_cause(lost: Sequence[str], error: Exception) -> str:
+    return f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
 
 
 def _log_transition(before: Operation, after: Operation) -> None:

@@ -16,7 +16,6 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
-    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
@@ -83,17 +82,18 @@ class EventPublisher:
         )
 
     def state_changed(self, old: Operation, new: Operation) -> None:
-        """Publish a transition; outside OPERATION_ENABLED nothing plays."""
+        """Publish a transition; outside OPERATION_ENABLED nothing plays, because of the state."""
         self.hub.publish("state", lambda: _state_event(old, new))
-        if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
-            # The control loop does not report the end of what others have silenced.
-            self.view.applied = None
-            silence = SilenceEvent(
-                contacts=self.view.contact_statuses(),
-                reason=new.cause,
-                latency_ms=None,
-            )
-            self.hub.publish("silence", lambda: silence)
+        view = self.view
+        if new.state is DaemonState.OPERATION_ENABLED:
+            return
+        # The control loop does not report the end of what others have silenced.
+        was_playing, view.applied = view.applied is not None, None
+        view.silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
+        if new.state is DaemonState.SWITCHED_ON:  # the loop decides next
+            view.silenced = None
+        if was_playing:
+            self.hub.publish("silence", view.silence_event)
 
     def layout_changed(self, layout: SurfaceLayout | None) -> None:
         """Publish another surface layout; None for the same effect everywhere."""

@@ -8,9 +8,11 @@ from controller.daemon.states import (
     DaemonState,
     Operation,
     Trigger,
+    acknowledge,
     failed,
     step,
 )
+from drivers.protocol.table import FAULTS
 
 # The whole table by hand, from the states and the fault table of the wire protocol: the next state
 # (= for the same) and the actions in order. A dot: nothing changes. Conditions have tests of their
@@ -108,7 +110,7 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
         energised_until=ENERGISED_UNTIL,
     )
     lost, _ = step(before, unplugged, LOST_AT)
-    assert lost.lost == (LOST_AT, ENERGISED_UNTIL, ("main",))
+    assert lost.lost == (LOST_AT, ENERGISED_UNTIL, ("main",), "unplugged")
     back, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
     assert back.state is DaemonState.FAULT
     assert back.cause.endswith("unplugged")
@@ -150,3 +152,10 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
         assert after.state is state
     else:
         assert (after.state, after.cause) == (DaemonState.FAULT, "a bug")
+
+
+def test_remedy_of_every_fault_of_an_amplifier_is_its_own() -> None:
+    """In whatever words it is reported; of any other cause it is to find it."""
+    remedies = {acknowledge(f"amplifier main: got FAULT with fault {name}") for name in FAULTS}
+    assert len(remedies) == len(FAULTS)
+    assert acknowledge("a bug") == acknowledge("fault NONE")

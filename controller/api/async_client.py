@@ -10,6 +10,7 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -68,7 +69,8 @@ class AsyncClient(AsyncCalls):
         self._connecting = asyncio.Lock()
         self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._events: deque[tuple[int, Notification]] = deque(maxlen=MAX_QUEUED_EVENTS)
+        self._events: deque[tuple[int, Notification]] = deque()
+        self._lost = 0  # events that were dropped here before the next one
         self._connections = 0
         self._changed = asyncio.Event()  # an event arrived, or the connection was lost
         self._lease: ArmResult | None = None  # of `armed`
@@ -189,7 +191,8 @@ class AsyncClient(AsyncCalls):
     async def next_event(self, *, timeout: float | None = None) -> Notification | None:
         """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
 
-        A lost connection is made again, for which the client's timeout holds. Raises LeaseLost,
+        A lost connection is made again, for which the client's timeout holds. Of those that are not
+        taken the oldest are dropped, and counted in `lost` of the next one. Raises LeaseLost,
         after the notifications that have arrived, once the lease of `armed` is lost.
         """
         with suppress(TimeoutError):
@@ -211,7 +214,8 @@ class AsyncClient(AsyncCalls):
             return None
         connection, event = self._events.popleft()
         self._see(connection, event.data.get("epoch"))
-        return event
+        lost, self._lost = self._lost, 0
+        return replace(event, lost=event.lost + lost)
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result.
@@ -301,6 +305,8 @@ class AsyncClient(AsyncCalls):
             return self._link
 
     def _received(self, connection: int, event: Notification) -> None:
+        if len(self._events) == MAX_QUEUED_EVENTS:
+            self._lost += 1 + self._events.popleft()[1].lost
         self._events.append((connection, event))
         self._changed.set()
 

@@ -50,7 +50,8 @@ class EventPublisher:
         learning: Callable[[], LearningStatus | None],
     ) -> None:
         self.view = PlateView(effect_of)
-        self.latencies = LatencyStatistics()
+        self.latencies = LatencyStatistics()  # of touches alone
+        self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
         self.amplifiers = amplifiers
@@ -162,15 +163,19 @@ class EventPublisher:
 
     def _pattern_applied(self, applied: Applied) -> None:
         self.view.applied, self.view.silenced = applied, None
-        if applied.latency is not None:
-            self.latencies.add(applied.latency)
+        self._count(applied)
         self.hub.publish("pattern", self.view.pattern_event)
 
     def _silenced(self, silenced: Silenced) -> None:
         self.view.applied, self.view.silenced = None, silenced
-        if silenced.latency is not None:
-            self.latencies.add(silenced.latency)
+        self._count(silenced)
         self.hub.publish("silence", self.view.silence_event)
+
+    def _count(self, report: Applied | Silenced) -> None:
+        """Add the latency of a command to those of touches, or of all other changes."""
+        if report.latency is not None:
+            latencies = self.latencies if report.is_touch else self.lift_latencies
+            latencies.add(report.latency)
 
 
 def _state_event(old: Operation, new: Operation) -> StateEvent:

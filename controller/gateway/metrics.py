@@ -81,17 +81,20 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     ):
         if value is not None:
             yield _gauge(f"era_{name}", text, float(value))
-    rejected = CounterMetricFamily(
-        "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
-    )
-    for reason, count in status.rejected_touches.items():
-        rejected.add_metric([reason], count)
-    yield rejected
-    yield _histogram(
-        "era_touch_to_wire_seconds",
-        "From a touch to the last byte of the command.",
-        status.latency_ms,
-    )
+    for name, text, label, counts in (
+        ("rejected_touches", "Touches rejected as contacts.", "reason", status.rejected_touches),
+        ("lost_events", "Events that clients read too slowly.", "topic", status.lost_events),
+    ):
+        counter = CounterMetricFamily(f"era_{name}", text, labels=[label])
+        for key, count in counts.items():
+            counter.add_metric([key], count)
+        yield counter
+    for name, text, latency in (
+        ("touch", "From a touch to the last byte of the command.", status.latency_ms),
+        ("lift", "From a lift, or an end without a touch, likewise.", status.lift_latency_ms),
+    ):
+        if latency is not None:
+            yield _histogram(f"era_{name}_to_wire_seconds", text, latency)
     if status.learning is not None:
         yield from _learning(status.learning)
     yield from _amplifiers(status.amplifiers)

@@ -43,7 +43,8 @@ class Decision:
     selection: what is felt, or why not; requested: what was selected before limits of time and
     ledgers left contents out, None to decide it again.
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
-    triggered_at [s]: when the change arrived.
+    triggered_at [s]: when the change arrived; is_touch: whether a finger came, moved or pressed
+    since, instead of lifts alone or none.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
     content; silence: ramp [s] along which all layers fall silent instead. Neither if nothing is to
     be sent. refusal: why a ledger refused a content, which is left out.
@@ -55,6 +56,7 @@ class Decision:
     triggered_at: float
     requested: Selection | None
     sets: Mapping[int, PlateSet] = field(default_factory=dict)
+    is_touch: bool = False
     started: frozenset[int] = frozenset()
     silence: float | None = None
     refusal: str | None = None
@@ -96,6 +98,7 @@ class Decider:
         self._is_new = True  # something has come that is not decided yet
         self._arrived = arrived
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
+        self._touched_at = -math.inf  # s; when a finger came, moved or pressed last
         self._played_until = -math.inf  # s; as far as known
         self._fades_until = -math.inf  # s; what was ended or replaced
 
@@ -148,9 +151,13 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self.playing.is_silent
 
-    def note(self, time: float) -> None:
-        """Note that contacts have changed, by what arrived at a time [s]."""
+    def note(self, time: float, *, is_touch: bool = False) -> None:
+        """Note that contacts have changed, by what arrived at a time [s].
+
+        is_touch: not by lifts alone.
+        """
         self._is_new = True
+        self._touched_at = time if is_touch else self._touched_at
         self._triggered_at = min(self._triggered_at, time)
 
     def look_again(self) -> None:
@@ -291,7 +298,12 @@ class Decider:
                 return None
             triggered_at = min(triggered_at, self._selector.triggered_at)
             draft = Decision(
-                contacts, self._playable(requested), from_rest, triggered_at, requested
+                contacts,
+                self._playable(requested),
+                from_rest,
+                triggered_at,
+                requested,
+                is_touch=self._touched_at >= triggered_at,
             )
             if draft.selection.contents:
                 decision = self._with_sets(draft, now)

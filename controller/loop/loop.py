@@ -329,7 +329,8 @@ class Controller:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
         decider = self._decider_if_open
         if decider is not None:  # else the amplifiers were never open
-            decider.note(time)
+            is_touch = bool(change.down or change.moved or change.pressed)
+            decider.note(time, is_touch=is_touch)
         self._wake.set()
         if self.group.is_armed:
             self._changed_at = clock.now()

@@ -18,13 +18,14 @@ from typing import cast
 import pytest
 
 import controller
-from controller.api.async_client import AsyncClient
+from controller.api.async_client import MAX_QUEUED_EVENTS, AsyncClient
 from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, event_line
 from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
+from controller.api.topics import LogEvent
 from daemon_bench import (
     PLACE,
     daemon_at,
@@ -191,6 +192,25 @@ async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
         await era.status()
     await era.close()
     assert [event async for event in era.events()] == []
+
+
+@in_virtual_time
+async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) -> None:
+    """Dropped by the daemon, or by the client as they were not taken: each event is had or lost."""
+    async with ready_daemon(tmp_path) as (bench, other), await bench.client() as era:
+        await era.subscribe("log")
+        hub = bench.daemon._publisher.hub
+        line = LogEvent(level="info", message="x" * 900, cause=None, remedy=None)
+        for count in (*[100] * 20, 1000, 1):  # at once
+            for _ in range(count):
+                hub.publish("log", lambda: line)
+            await asyncio.sleep(0.1)
+        events = []
+        while (event := await era.next_event(timeout=0.1)) is not None:
+            events.append(event)
+        assert len(events) == MAX_QUEUED_EVENTS
+        assert len(events) + sum(each.lost for each in events) == 3001
+        assert 0 < (await other.status()).lost_events["log"] < 1000
 
 
 async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Path) -> None:

@@ -209,6 +209,22 @@ async def test_reasons_are_those_of_now(tmp_path: Path) -> None:
         assert any("before: " in each["cause"] and "no reply" in each["cause"] for each in seen)
 
 
+@in_virtual_time
+async def test_latency_of_touches_is_counted_apart_from_that_of_lifts(tmp_path: Path) -> None:
+    """Three fingers come, one is moved across the plate, and all lift one after the other."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        statistics = bench.daemon._publisher
+        await era.arm("me", lease_s=60)
+        await until(lambda: statistics.lift_latencies.summary().count == 1)  # as it is armed
+        for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
+            for _ in range(4):
+                await era.touch(places)
+                await asyncio.sleep(0.05)
+        status = await era.status()
+        assert status.lift_latency_ms is not None
+        assert (status.latency_ms.count, status.lift_latency_ms.count) == (4, 1 + 3)
+
+
 LAYOUT = """\
 effects:
   hum: {kind: buzz, level: 14}

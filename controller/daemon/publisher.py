@@ -5,6 +5,7 @@ import contextlib
 import logging
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -90,9 +91,8 @@ class EventPublisher:
             return
         # The control loop does not report the end of what others have silenced.
         was_playing, view.applied = view.applied is not None, None
-        view.silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
-        if new.state is DaemonState.SWITCHED_ON:  # the loop decides next
-            view.silenced = None
+        because = Silenced(view.contacts, (), new.cause, None, clock.now())
+        view.silenced = None if new.state is DaemonState.SWITCHED_ON else because  # decided next
         if was_playing:
             self.hub.publish("silence", view.silence_event)
 
@@ -132,11 +132,9 @@ class EventPublisher:
             "remedy": getattr(record, "remedy", None),
         }
 
-        def publish() -> None:
-            self.hub.publish("log", lambda: LogEvent.model_validate(event))
-
+        make = partial(LogEvent.model_validate, event)
         with contextlib.suppress(RuntimeError):  # the loop may be closed
-            self._loop.call_soon_threadsafe(publish)
+            self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
 
     def layout_event(self) -> LayoutEvent:
         """The surface layout as an event."""

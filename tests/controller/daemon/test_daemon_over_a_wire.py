@@ -182,12 +182,22 @@ async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Pat
 
 
 @in_virtual_time
-async def test_reasons_are_those_of_now(tmp_path: Path) -> None:
-    """Why nothing plays, before and after arming; why a lost amplifier stays so, and why it was."""
+async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_path: Path) -> None:
+    """Why nothing plays, before and after arming; why a lost amplifier stays so, and why it was.
+
+    Of four touches, one of them a move, and of three lifts the latencies are counted apart.
+    """
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=60)
         await until(lambda: bench.daemon._publisher.view.silenced is not None)
         assert "no contact" in ((await era.status()).silence_reason or "")
+        for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
+            for _ in range(4):
+                await era.touch(places)
+                await asyncio.sleep(0.05)
+        status = await era.status()
+        assert status.lift_latency_ms is not None
+        assert (status.latency_ms.count, status.lift_latency_ms.count) == (4, 1 + 3)  # and to arm
         await era.disarm()
         await asyncio.sleep(0.1)
         await era.subscribe("silence")
@@ -207,22 +217,6 @@ async def test_reasons_are_those_of_now(tmp_path: Path) -> None:
         while not seen or seen[-1]["new"] != READY:
             seen.append((await next_event(era, "state")).data)
         assert any("before: " in each["cause"] and "no reply" in each["cause"] for each in seen)
-
-
-@in_virtual_time
-async def test_latency_of_touches_is_counted_apart_from_that_of_lifts(tmp_path: Path) -> None:
-    """Three fingers come, one is moved across the plate, and all lift one after the other."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        statistics = bench.daemon._publisher
-        await era.arm("me", lease_s=60)
-        await until(lambda: statistics.lift_latencies.summary().count == 1)  # as it is armed
-        for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
-            for _ in range(4):
-                await era.touch(places)
-                await asyncio.sleep(0.05)
-        status = await era.status()
-        assert status.lift_latency_ms is not None
-        assert (status.latency_ms.count, status.lift_latency_ms.count) == (4, 1 + 3)
 
 
 LAYOUT = """\

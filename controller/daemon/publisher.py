@@ -91,8 +91,8 @@ class EventPublisher:
             return
         # The control loop does not report the end of what others have silenced.
         was_playing, view.applied = view.applied is not None, None
-        because = Silenced(view.contacts, (), new.cause, None, clock.now())
-        view.silenced = None if new.state is DaemonState.SWITCHED_ON else because  # decided next
+        silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
+        view.silenced = None if new.state is DaemonState.SWITCHED_ON else silenced  # decided next
         if was_playing:
             self.hub.publish("silence", view.silence_event)
 

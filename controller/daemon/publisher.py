@@ -56,13 +56,12 @@ class EventPublisher:
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
         self.amplifiers = amplifiers
-        self._operation = operation
         self._layout = layout
         self._last_link_message = ""
         self._loop = asyncio.get_running_loop()
         self.hub = Hub(
             {
-                "state": self._state_event,
+                "state": lambda: _state_event(operation(), operation()),
                 "contacts": self.view.contacts_event,
                 "pattern": self.view.pattern_event,
                 "silence": self.view.silence_event,
@@ -150,10 +149,6 @@ class EventPublisher:
     def _plate_event(self) -> PlateEvent | None:
         status = self._learning()
         return None if status is None else plate_event(status)
-
-    def _state_event(self) -> StateEvent:
-        now = self._operation()
-        return _state_event(now, now)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts

@@ -10,6 +10,7 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -68,7 +69,8 @@ class AsyncClient(AsyncCalls):
         self._connecting = asyncio.Lock()
         self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._events: deque[tuple[int, Notification]] = deque(maxlen=MAX_QUEUED_EVENTS)
+        self._events: deque[tuple[int, Notification]] = deque()
+        self._lost = 0  # events that were dropped here before the next one
         self._connections = 0
         self._changed = asyncio.Event()  # an event arrived, or the connection was lost
         self._lease: ArmResult | None = None  # of `armed`
@@ -189,11 +191,14 @@ class AsyncClient(AsyncCalls):
     async def next_event(self, *, timeout: float | None = None) -> Notification | None:
         """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
 
-        A lost connection is made again, for which the client's timeout holds.
+        A lost connection is made again, for which the client's timeout holds. Of those that are not
+        taken the oldest are dropped, and counted in `lost` of the next one. Raises LeaseLost,
+        after the notifications that have arrived, once the lease of `armed` is lost.
         """
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while not self._events and not self._is_closed:
+                    self._check_lease()
                     self._changed.clear()
                     if self._link is None or not self._link.is_open:
                         await self._within_timeout(
@@ -209,7 +214,8 @@ class AsyncClient(AsyncCalls):
             return None
         connection, event = self._events.popleft()
         self._see(connection, event.data.get("epoch"))
-        return event
+        lost, self._lost = self._lost, 0
+        return replace(event, lost=event.lost + lost)
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result.
@@ -217,8 +223,8 @@ class AsyncClient(AsyncCalls):
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
         state event.
         """
-        if self._lease_lost is not None and method not in SILENCING:
-            raise self._lease_lost.with_traceback(None)
+        if method not in SILENCING:
+            self._check_lease()
         if isinstance(params, ClearParams) and params.epoch is None and self._seen is not None:
             params = params.model_copy(update={"epoch": self._seen[1]})
         if method == "stop":
@@ -299,6 +305,8 @@ class AsyncClient(AsyncCalls):
             return self._link
 
     def _received(self, connection: int, event: Notification) -> None:
+        if len(self._events) == MAX_QUEUED_EVENTS:
+            self._lost += 1 + self._events.popleft()[1].lost
         self._events.append((connection, event))
         self._changed.set()
 
@@ -306,6 +314,11 @@ class AsyncClient(AsyncCalls):
         """Note an epoch seen, unless a later one was: another connection may begin lower."""
         if epoch is not None:
             self._seen = max(self._seen or (0, 0), (connection, epoch))
+
+    def _check_lease(self) -> None:
+        """Raise LeaseLost once the lease of `armed` is lost."""
+        if self._lease_lost is not None:
+            raise self._lease_lost.with_traceback(None)
 
     def _release(self) -> None:
         """Stop renewing the lease."""
@@ -315,7 +328,11 @@ class AsyncClient(AsyncCalls):
             self._renewing = None
 
     async def _keep_renewing(self, lease: ArmResult) -> None:
-        """Renew a lease until it is lost, over a new connection if need be."""
+        """Renew a lease until it is lost, over a new connection if need be.
+
+        While no daemon responds it is tried again for as long as the lease lasts. Nothing arms
+        again: a lease that the daemon has ended is lost.
+        """
         loop = asyncio.get_running_loop()
         params = make_params("renew", lease=lease.lease)
         expires_at = loop.time() + lease.lease_s
@@ -327,9 +344,10 @@ class AsyncClient(AsyncCalls):
             try:
                 async with asyncio.timeout_at(expires_at):
                     await self._send("renew", params)
+            except Unreachable as error:
+                reason, pause = error, _MIN_RETRY_INTERVAL
             except TimeoutError as error:
                 reason = reason or Unreachable.at(self.path, error)
-                pause = _MIN_RETRY_INTERVAL
             except RpcError as error:
                 reason = error
                 if error.code is not ErrorCode.BUSY:
@@ -337,13 +355,15 @@ class AsyncClient(AsyncCalls):
                 pause = _MAX_RETRY_INTERVAL
             else:
                 expires_at, pause = sent_at + lease.lease_s, _RENEWAL_INTERVAL
+                reason = None
         if self._lease is lease:
             self._lease_lost = await self._why_lost(reason)
+            self._changed.set()
 
     async def _why_lost(self, reason: RpcError | Unreachable | None) -> LeaseLost:
-        """The loss of the lease with the daemon's cause, if available."""
-        try:
-            status = await self.status()
-        except (RpcError, Unreachable):
-            return LeaseLost(str(reason))
-        return LeaseLost(headline(status.state, status.cause))
+        """The loss of the lease with the daemon's cause, where the daemon has refused it."""
+        if isinstance(reason, RpcError):
+            with suppress(RpcError, Unreachable):
+                status = await self.status()
+                return LeaseLost(headline(status.state, status.cause))
+        return LeaseLost(str(reason))

@@ -188,20 +188,24 @@ class Connection(asyncio.BufferedProtocol):
             return
         self._transport.write(line)
 
-    def notify(self, make_line: Callable[[int], bytes]) -> None:
-        """Send a notification, made with the number of those dropped before it, or drop it too."""
+    def notify(self, make_line: Callable[[int], bytes]) -> bool:
+        """Send a notification, made with the number of those dropped before it, or drop it too.
+
+        Returns whether it was dropped because the client reads too slowly.
+        """
         if self._transport is None or self._transport.is_closing():
-            return
+            return False
         if self._transport.get_write_buffer_size() < _MAX_UNREAD_NOTIFICATIONS:
             self._transport.write(make_line(self._lost))
             self._lost, self._losing_since = 0, None
-            return
+            return False
         self._lost += 1
         now = self._clock()
         if self._losing_since is None:
             self._losing_since = now
         elif now - self._losing_since > UNREAD_TIMEOUT:
             self._transport.abort()
+        return True
 
     def refuse(self, error: RpcError) -> None:
         """Send an error and close."""

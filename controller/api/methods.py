@@ -76,7 +76,12 @@ class StatusResult(Playing, Explained):
     lease_left_s: float | None
     silence_reason: str | None = Field(None, description="why nothing plays although armed")
     amplifiers: list[AmplifierStatus]
-    latency_ms: LatencySummary
+    latency_ms: LatencySummary = Field(
+        description="of touches: a finger came, moved or pressed harder or less"
+    )
+    lift_latency_ms: LatencySummary | None = Field(
+        None, description="of lifts, and of all that changes without a touch, as an effect's end"
+    )
     rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
     rejected_examples: dict[str, str] = Field(
         default_factory=dict, description="the newest of each reason: what came, and from where"
@@ -86,6 +91,9 @@ class StatusResult(Playing, Explained):
     )
     clicks_too_late: Count = Field(
         0, description="short vibrations that came too late to be felt; the plate plays on"
+    )
+    lost_events: dict[str, Count] = Field(
+        default={}, description="notifications that clients were too slow to read, by topic"
     )
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"

@@ -160,13 +160,13 @@ class ApiServer:
             return
         try:
             result = self._call(connection, call)
+            if isinstance(result, Message):
+                self._respond(connection, call, result)
+                return
         except Exception as error:
             if call.method == "stop":
                 self._stop_all()
             self._respond(connection, call, error)
-            return
-        if isinstance(result, Message):
-            self._respond(connection, call, result)
             return
         task = asyncio.ensure_future(self._finish(connection, call, result))
         connection.pending.add(task)

@@ -5,6 +5,7 @@
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -175,6 +176,8 @@ class Hub:
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
         self._failing: set[Topic] = set()
+        self.lost = Counter[str]()
+        """Notifications that were dropped, as their clients read too slowly, by topic."""
 
     def subscribe(
         self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
@@ -256,7 +259,9 @@ class Hub:
             return
         now = self._clock()
         for connection in subscribers:
-            connection.notify(lambda lost: event_line(topic, time=now, lost=lost, data=data))
+            self.lost[topic] += connection.notify(
+                lambda lost: event_line(topic, time=now, lost=lost, data=data)
+            )
 
     def _start_timer(self, connection: Connection, topic: Topic, period: float) -> None:
         """Send a topic every period [s]."""

@@ -35,7 +35,6 @@ DASHBOARD = "127.0.0.1:8137"
 _DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate", "inputs"]
 """Topics of `era watch`: all but amplifiers and latency, which are published without end."""
 
-_LEASE_CHECK_INTERVAL = 0.5  # s
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
@@ -117,9 +116,8 @@ def arm(
         try:
             with era.armed(owner, lease_s=lease) as granted:
                 _print_lease(granted, "until Ctrl-C", as_json=as_json)
-                while True:
-                    time.sleep(_LEASE_CHECK_INTERVAL)
-                    era.status()  # raises LeaseLost
+                for _ in era.events():  # of none; raises LeaseLost
+                    pass
         except KeyboardInterrupt:
             if not as_json:
                 typer.echo("ready: disarmed")

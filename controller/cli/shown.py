@@ -47,14 +47,18 @@ def show_status(status: StatusResult) -> str:
     latency = status.latency_ms
     if latency.median is not None:
         lines.append(
-            f"  latency of {counted(latency.count, 'command')}: median {latency.median:.2f} ms, "
-            f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
+            f"  latency of {counted(latency.count, 'touch', plural='touches')}: "
+            f"median {latency.median:.2f} ms, 99 % {latency.p99:.2f} ms, "
+            f"99.9 % {latency.p999:.2f} ms"
         )
     for reason, count in status.rejected_touches.items():
         example = status.rejected_examples.get(reason)
         newest = f" ({example})" if example else ""
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}{newest}")
-    lines += _given(("  clicks that came too late: {}", status.clicks_too_late or None))
+    lines += _given(
+        ("  clicks that came too late: {}", status.clicks_too_late or None),
+        ("  lost events: {}", sum(status.lost_events.values()) or None),
+    )
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
 
 

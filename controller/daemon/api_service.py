@@ -131,6 +131,8 @@ class ApiService:
             **playing_of(view.applied if operation.state is _ENABLED else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
+            lift_latency_ms=self._publisher.lift_latencies.summary(),
+            lost_events=dict(self._publisher.hub.lost),
             rejected_touches=dict(self._controller.rejects.counts),
             rejected_examples=dict(self._controller.rejects.examples),
             inputs=self._publisher.inputs().inputs,

@@ -110,6 +110,7 @@ class LogThread(logging.Handler):
         """Queue the line of a record; never blocks."""
         with contextlib.suppress(Exception):  # a full queue, or a failing log, stops nothing
             self.lines.put_nowait(self.format(record))
+        with contextlib.suppress(Exception):  # which is told all the same
             if self.listener is not None and record.levelno >= logging.INFO:
                 self.listener(record)
 

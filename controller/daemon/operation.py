@@ -15,13 +15,13 @@ from typing import Any, Literal, TypeVar
 from controller.daemon.deferred_calls import DeferredCalls, call_guarded
 from controller.daemon.read_back import READ_BACK_INTERVAL, find_problem, is_any_armed
 from controller.daemon.states import (
-    ACKNOWLEDGE,
     Action,
     DaemonEvent,
     DaemonState,
     Lease,
     Operation,
     Trigger,
+    acknowledge,
     check_lease,
     failed,
     step,
@@ -202,7 +202,7 @@ class Operator:
         try:
             return asyncio.ensure_future(self.controller.group.stop())
         finally:
-            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
+            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, acknowledge(cause))))
 
     def assume_energised(self, now: float) -> bool:
         """Whether a lost amplifier may still be playing at a time [s], as a stop would say."""
@@ -258,7 +258,7 @@ class Operator:
         except DriverError as error:
             is_stopping = isinstance(error, Preempted) and self.operation.is_latched
             if epoch == self.operation.epoch and not is_stopping:
-                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error), acknowledge(str(error))))
             raise
 
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
@@ -300,7 +300,7 @@ class Operator:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
             await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
         else:
-            await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+            await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
 
     async def _clear(self, epoch: int) -> None:
         self._clears.append(epoch)
@@ -312,7 +312,7 @@ class Operator:
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
-        await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+        await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     def _check_none_since(self, epoch: int) -> None:
@@ -346,10 +346,9 @@ class Operator:
         async with self._loss_lock:
             group = self.controller.group
             lost = *group.lost_by, *group.degraded
-            text = str(error)
             if self.operation.state is not DaemonState.COMM_LOST:
-                self._link_changed("lost", lost, text)
-            cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
+                self._link_changed("lost", lost, str(error))
+            cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
             event = DaemonEvent(Trigger.LINK_LOST, cause, remedy_of(error), amplifiers=lost)
             await self.handle(event)
 

@@ -5,6 +5,7 @@ import contextlib
 import logging
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
-    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
@@ -53,7 +53,8 @@ class EventPublisher:
         learning: Callable[[], LearningStatus | None],
     ) -> None:
         self.view = PlateView(effect_of)
-        self.latencies = LatencyStatistics()
+        self.latencies = LatencyStatistics()  # of touches alone
+        self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
         self.amplifiers = amplifiers
@@ -64,7 +65,7 @@ class EventPublisher:
         self._loop = asyncio.get_running_loop()
         self.hub = Hub(
             {
-                "state": self._state_event,
+                "state": lambda: _state_event(operation(), operation()),
                 "contacts": self.view.contacts_event,
                 "pattern": self.view.pattern_event,
                 "silence": self.view.silence_event,
@@ -87,17 +88,17 @@ class EventPublisher:
         )
 
     def state_changed(self, old: Operation, new: Operation) -> None:
-        """Publish a transition; outside OPERATION_ENABLED nothing plays."""
+        """Publish a transition; outside OPERATION_ENABLED nothing plays, because of the state."""
         self.hub.publish("state", lambda: _state_event(old, new))
-        if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
-            # The control loop does not report the end of what others have silenced.
-            self.view.applied = None
-            silence = SilenceEvent(
-                contacts=self.view.contact_statuses(),
-                reason=new.cause,
-                latency_ms=None,
-            )
-            self.hub.publish("silence", lambda: silence)
+        view = self.view
+        if new.state is DaemonState.OPERATION_ENABLED:
+            return
+        # The control loop does not report the end of what others have silenced.
+        was_playing, view.applied = view.applied is not None, None
+        silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
+        view.silenced = None if new.state is DaemonState.SWITCHED_ON else silenced  # decided next
+        if was_playing:
+            self.hub.publish("silence", view.silence_event)
 
     def layout_changed(self, layout: SurfaceLayout | None) -> None:
         """Publish another surface layout; None for the same effect everywhere."""
@@ -135,11 +136,9 @@ class EventPublisher:
             "remedy": getattr(record, "remedy", None),
         }
 
-        def publish() -> None:
-            self.hub.publish("log", lambda: LogEvent.model_validate(event))
-
+        make = partial(LogEvent.model_validate, event)
         with contextlib.suppress(RuntimeError):  # the loop may be closed
-            self._loop.call_soon_threadsafe(publish)
+            self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
 
     def layout_event(self) -> LayoutEvent:
         """The surface layout as an event."""
@@ -156,25 +155,25 @@ class EventPublisher:
         status = self._learning()
         return None if status is None else plate_event(status)
 
-    def _state_event(self) -> StateEvent:
-        now = self._operation()
-        return _state_event(now, now)
-
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _pattern_applied(self, applied: Applied) -> None:
         self.view.applied, self.view.silenced = applied, None
-        if applied.latency is not None:
-            self.latencies.add(applied.latency)
+        self._count(applied)
         self.hub.publish("pattern", self.view.pattern_event)
 
     def _silenced(self, silenced: Silenced) -> None:
         self.view.applied, self.view.silenced = None, silenced
-        if silenced.latency is not None:
-            self.latencies.add(silenced.latency)
+        self._count(silenced)
         self.hub.publish("silence", self.view.silence_event)
+
+    def _count(self, report: Applied | Silenced) -> None:
+        """Add the latency of a command to those of touches, or of all other changes."""
+        if report.latency is not None:
+            latencies = self.latencies if report.is_touch else self.lift_latencies
+            latencies.add(report.latency)
 
 
 def _state_event(old: Operation, new: Operation) -> StateEvent:

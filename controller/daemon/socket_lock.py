@@ -57,9 +57,12 @@ class SocketLock:
             raise InputError(
                 f"{path}: its file system does not lock files ({error.strerror}); {_REMEDY}"
             ) from error
-        self._lock.truncate(0)
-        self._lock.write(f"{os.getpid()}\n")
-        self._lock.flush()
+        try:
+            self._lock.truncate(0)
+            os.write(self._lock.fileno(), f"{os.getpid()}\n".encode())
+        except OSError as error:
+            self._lock.close()
+            raise InputError(f"{path}.lock: not written: {error.strerror}; {_REMEDY}") from error
         _remove(path)  # left behind by a killed daemon
 
     def bind(self) -> socket.socket:

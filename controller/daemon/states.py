@@ -12,6 +12,7 @@ State names follow CiA 402.
 """
 
 import math
+import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -20,8 +21,24 @@ from typing import NamedTuple, Self
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 
-ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
-"""Remedy of every fault."""
+_REMEDIES = {
+    "WATCHDOG": "end programs that take the processor, or check the wire: it received nothing in "
+    "time",
+    "OVER_TEMPERATURE": "let it cool, check its ventilation",
+    "OVER_VOLTAGE": "check its supply",
+    "ARC": "switch it off, then look for moisture and damaged insulation at ERAs and cables",
+    "CHANNEL": "check the ERA and the cable of the channel",
+    "INTERNAL": "switch it off and on, see its manual",
+    "INTERLOCK": "close its interlock",
+    "OVER_CURRENT": "check ERAs and cables for a short circuit",
+}
+"""What to do about the faults that an amplifier reports."""
+
+
+def acknowledge(cause: str) -> str:
+    """The remedy of a fault, by the names in its cause."""
+    named = (_REMEDIES[name] for name in re.findall("[A-Z_]+", cause) if name in _REMEDIES)
+    return f"{next(named, 'find the cause')}, then clear (era clear) and arm again"
 
 
 class DaemonState(StrEnum):
@@ -230,7 +247,7 @@ def failed(operation: Operation, cause: str) -> Operation:
     epoch = operation.epoch + 1
     if operation.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         return replace(operation, is_latched=True, epoch=epoch)
-    return Operation(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, epoch=epoch)
+    return Operation(DaemonState.FAULT, cause, acknowledge(cause), is_latched=True, epoch=epoch)
 
 
 def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operation:
@@ -264,10 +281,9 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
     is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
     cause, remedy = event.cause or before.cause, event.remedy
     is_back = to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED)
-    if before.state is DaemonState.COMM_LOST and is_back:
-        was = cause if before.lost is None else before.lost.cause
-        cause = f"all amplifiers reply again and are disarmed; before: {was}"
-        remedy = ACKNOWLEDGE if to is DaemonState.FAULT else None
+    if before.lost is not None and is_back:
+        cause = f"all amplifiers reply again and are disarmed; before: {before.lost.cause}"
+        remedy = acknowledge(cause) if to is DaemonState.FAULT else None
     return replace(
         updated,
         state=to,

@@ -13,12 +13,12 @@ from controller.daemon.deferred_calls import call_guarded
 from controller.daemon.operation import LinkChange, Operator, StateObserver, remedy_of
 from controller.daemon.read_back import are_silent, find_problem
 from controller.daemon.states import (
-    ACKNOWLEDGE,
     ENERGISED,
     Action,
     DaemonEvent,
     DaemonState,
     Trigger,
+    acknowledge,
 )
 from controller.loop.observer import Observer
 from drivers import clock
@@ -242,7 +242,7 @@ class Supervisor(Operator):
             return  # they may have been read before, or during a ramp
         problem, state = find_problem(statuses, group.amplifiers), self.operation.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
-            fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
+            fault = DaemonEvent(Trigger.FAULT, problem, acknowledge(problem))
             await self._in_background(self.handle(fault))
         elif (
             not are_silent(statuses, group.amplifiers)
@@ -256,7 +256,7 @@ class Supervisor(Operator):
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
         if is_armed and self.controller.group.state in _SILENT:
-            self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
+            self.post(DaemonEvent(Trigger.FAULT, cause, acknowledge(cause)))
 
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""
@@ -282,4 +282,4 @@ class Supervisor(Operator):
             return
         channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
         cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
-        self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
+        self.post(DaemonEvent(Trigger.FAULT, cause, acknowledge(cause)))

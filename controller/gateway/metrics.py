@@ -82,14 +82,6 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     ):
         if value is not None:
             yield _gauge(f"era_{name}", text, float(value))
-    rejected = CounterMetricFamily(
-        "era_rejected_touches",
-        "Rejected touches and messages of touch sources.",
-        labels=["reason"],
-    )
-    for reason, count in status.rejected_touches.items():
-        rejected.add_metric([reason], count)
-    yield rejected
     inputs = GaugeMetricFamily(
         "era_touch_input_open", "Whether touches can come from an input.", labels=["input"]
     )
@@ -98,11 +90,21 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     yield inputs
     text = "Short vibrations that came too late to be felt."
     yield CounterMetricFamily("era_clicks_too_late", text, value=status.clicks_too_late)
-    yield _histogram(
-        "era_touch_to_wire_seconds",
-        "From a touch to the last byte of the command.",
-        status.latency_ms,
-    )
+    rejected = "Rejected touches and messages of touch sources."
+    for name, text, label, counts in (
+        ("rejected_touches", rejected, "reason", status.rejected_touches),
+        ("lost_events", "Events that clients read too slowly.", "topic", status.lost_events),
+    ):
+        counter = CounterMetricFamily(f"era_{name}", text, labels=[label])
+        for key, count in counts.items():
+            counter.add_metric([key], count)
+        yield counter
+    for name, text, latency in (
+        ("touch", "From a touch to the last byte of the command.", status.latency_ms),
+        ("lift", "From a lift, or an end without a touch, likewise.", status.lift_latency_ms),
+    ):
+        if latency is not None:
+            yield _histogram(f"era_{name}_to_wire_seconds", text, latency)
     if status.learning is not None:
         yield from _learning(status.learning)
     yield from _amplifiers(status.amplifiers)

@@ -76,11 +76,15 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     logging.getLogger("uvicorn.error").addFilter(
         lambda record: not (record.exc_info and record.exc_info[0] is UnicodeDecodeError)
     )
+    server = _Server(config)
     own = asyncio.create_task(gateway.run())
+    # It never ends by itself: one that fails ends the process, which then says why.
+    own.add_done_callback(lambda _: server.handle_exit(signal.SIGTERM, None))
     announce(listening.getsockname()[1])
-    await _Server(config).serve(sockets=[listening])
+    await server.serve(sockets=[listening])
     own.cancel()
-    await asyncio.wait({own})
+    with contextlib.suppress(asyncio.CancelledError):
+        await own
 
 
 def check_certificate(settings: Settings) -> None:

@@ -6,7 +6,7 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
@@ -16,7 +16,7 @@ from controller.loop.intent import FADED_AFTER, IntentSource, Pulse
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.playing import PlayedContent, Playing, all_left
 from controller.loop.selection import Selector
-from controller.sources.contacts import Contact, ContactKey, ContactTracker
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.rig.rig import Rig
@@ -43,7 +43,8 @@ class Decision:
     selection: what is felt, or why not; requested: what was selected before limits of time and
     ledgers left contents out, None to decide it again.
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
-    triggered_at [s]: when the change arrived.
+    triggered_at [s]: when the change arrived; is_touch: whether a finger came, moved or pressed
+    since, instead of lifts alone or none.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
     content; silence: ramp [s] along which all layers fall silent instead. Neither if nothing is to
     be sent. refusal: why a ledger refused a content, which is left out.
@@ -55,6 +56,7 @@ class Decision:
     triggered_at: float
     requested: Selection | None
     sets: Mapping[int, PlateSet] = field(default_factory=dict)
+    is_touch: bool = False
     started: frozenset[int] = frozenset()
     silence: float | None = None
     refusal: str | None = None
@@ -104,6 +106,7 @@ class Decider:
         """
         self._seen: frozenset[ContactKey] = frozenset()  # fingers, when it was last decided
         self._awaited: dict[int, Pulse] = {}  # by identity: decided, and not known to have started
+        self._touched_at = -math.inf  # s; when a finger came, moved or pressed last
         self._played_until = -math.inf  # s; as far as known
         self._fades_until = -math.inf  # s; what was ended or replaced
 
@@ -156,10 +159,12 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self.playing.is_silent
 
-    def note(self, time: float, up: Sequence[Contact]) -> None:
-        """Note that contacts have changed, by what arrived at a time [s]; up: those that left."""
+    def note(self, time: float, change: Change) -> None:
+        """Note that contacts have changed, by what arrived at a time [s]."""
         self._is_new = True
-        self.clicks_too_late += sum(each.key not in self._seen for each in up)
+        self.clicks_too_late += sum(each.key not in self._seen for each in change.up)
+        if change.down or change.moved or change.pressed:
+            self._touched_at = time
         self._triggered_at = min(self._triggered_at, time)
 
     def look_again(self) -> None:
@@ -308,7 +313,12 @@ class Decider:
                 return None
             triggered_at = min(triggered_at, self._selector.triggered_at)
             draft = Decision(
-                contacts, self._playable(requested), from_rest, triggered_at, requested
+                contacts,
+                self._playable(requested),
+                from_rest,
+                triggered_at,
+                requested,
+                is_touch=self._touched_at >= triggered_at,
             )
             if draft.selection.contents:
                 decision = self._with_sets(draft, now)

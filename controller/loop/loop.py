@@ -313,7 +313,7 @@ class Controller:
             self._is_armed_anew = False
             decider.forget()
         if (expired := self._tracker.expire(now)).up:
-            decider.note(now, expired.up)
+            decider.note(now, expired)
         decision = decider.decide(now)
         late, decider.clicks_too_late = decider.clicks_too_late, 0
         if late and self.group.is_armed:
@@ -403,7 +403,7 @@ class Controller:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
         decider = self._decider_if_open
         if decider is not None:  # else the amplifiers were never open
-            decider.note(time, change.up)
+            decider.note(time, change)
         self._wake.set()
         if self.group.is_armed:
             self._changed_at = clock.now()

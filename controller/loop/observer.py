@@ -24,7 +24,7 @@ class Applied:
     to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
     of the report; from_rest: whether the plate
     was at rest; settled_after [s]: when the last fade or envelope has ended; lasts: whether all
-    play until their contacts change.
+    play until their contacts change; is_touch: as of the decision.
     """
 
     contacts: tuple[Contact, ...]
@@ -37,6 +37,7 @@ class Applied:
     from_rest: bool
     settled_after: float
     lasts: bool
+    is_touch: bool
     timing: Timing = field(repr=False, compare=False)
 
     @property
@@ -87,6 +88,7 @@ class Silenced:
     reason: str
     latency: float | None
     time: float
+    is_touch: bool = False
 
 
 def applied_by(
@@ -114,6 +116,7 @@ def applied_by(
         from_rest=decision.from_rest,
         settled_after=max((each.settled_after for each in decision.sets.values()), default=0.0),
         lasts=all(target.pulse is None for each in selected for _, target in each.targets),
+        is_touch=decision.is_touch,
         timing=timing,
     )
 
@@ -132,6 +135,7 @@ def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Sil
         reason=reason,
         latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now,
+        is_touch=decision.is_touch,
     )
 
 

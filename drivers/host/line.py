@@ -36,6 +36,7 @@ _LATE_DECAY = 0.9  # with each reply
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
+_REMEDIES = {"WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew"}
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
@@ -273,7 +274,8 @@ class Line:
             return
         channel = "" if arrival.channel is None else f", channel {arrival.channel}"
         refusal = CommandRefused(
-            f"{self.name}: the amplifier refused the request: {arrival.code}{channel}",
+            f"{self.name}: the amplifier refused the request: {arrival.code}{channel}"
+            + _REMEDIES.get(arrival.code, ""),
             channel=arrival.channel,
             may_play=job.had_no_reply,
             is_disarmed=arrival.code in _NOT_ARMED,

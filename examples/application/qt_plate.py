@@ -8,6 +8,7 @@ It needs PySide6 (`pip install 'era-haptics[qt]'`).
 import itertools
 import json
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,7 @@ class Plate(QObject):
             int, tuple[Callable[[Any], None], object]
         ] = {}  # with the lease renewed
         self._lease: str | None = None
+        self._lease_ends = 0.0  # s
         self._touches: list[dict[str, Any]] = []
         self._is_open = False
         self._silent = 0  # s
@@ -79,7 +81,7 @@ class Plate(QObject):
         self._send(method, params, id=number)
 
     def arm(self, owner: str) -> None:
-        """Switch the high voltage on; the lease is renewed until `disarm`, or until refused."""
+        """Switch the high voltage on; the lease is renewed until `disarm`, or until it is lost."""
         self.call("arm", self._armed, owner=owner, lease_s=LEASE)
 
     def disarm(self) -> None:
@@ -136,6 +138,7 @@ class Plate(QObject):
             self._is_open = True
             self.opened.emit(message["result"])
             self.call("subscribe", topics=self._topics)
+            self._renew()
         elif message["id"] in self._pending:
             done, lease = self._pending.pop(message["id"])
             if "error" in message:
@@ -171,10 +174,19 @@ class Plate(QObject):
 
     def _armed(self, result: dict[str, Any]) -> None:
         self._lease = result["lease"]
+        self._lease_ends = time.monotonic() + LEASE
 
     def _renew(self) -> None:
-        if self._lease is not None and self._is_open:
-            self.call("renew", lease=self._lease)
+        """Renew the lease, after a loss too; nothing arms again."""
+        now = time.monotonic()
+        if self._lease is not None and now >= self._lease_ends:
+            self._lease = None
+            self.refused.emit("the lease was lost; arm again")
+        elif self._lease is not None and self._is_open:
+            self.call("renew", lambda _: self._renewed(now + LEASE), lease=self._lease)
+
+    def _renewed(self, ends: float) -> None:
+        self._lease_ends = ends
 
     def _repeat(self) -> None:
         if self._touches and self._is_open:

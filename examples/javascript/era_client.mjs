@@ -9,6 +9,9 @@ import { createInterface } from "node:readline";
 
 const API_MAJOR = "1";
 const PATIENCE_MS = 5000;
+const RETRY_MS = 200; // between attempts to connect again, for PATIENCE_MS
+const RENEWAL_MS = 500;
+const BUSY = 1005; // code of the API
 
 /** The socket of this user's daemon, as `era status` finds it. */
 export function defaultSocket(environment = process.env) {
@@ -28,44 +31,46 @@ export class Refused extends Error {
 
 /**
  * A connection to the daemon. Emits an event named after each subscribed topic, with its data, and
- * "lost" with an Error when the connection or the lease ends unasked.
+ * "lost" with an Error when the connection or the lease ends unasked. A connection that the daemon
+ * closes is made again, with its subscriptions and its lease; what was pending is rejected and not
+ * sent again, and nothing arms again.
  */
 export class EraClient extends EventEmitter {
-  #socket;
+  #path;
+  #socket = null;
   #name;
+  #topics = new Set();
   #waiting = new Map(); // by id: [resolve, reject, timer]
   #id = 0;
   #lease = null;
+  #leaseEnds = 0; // ms
   #renewal = null;
   #repeat = null;
   #isClosed = false;
 
-  constructor(socket, name) {
+  constructor(path, name) {
     super();
-    this.#socket = socket;
+    this.#path = path;
     this.#name = name;
-    createInterface({ input: socket }).on("line", (line) => this.#received(JSON.parse(line)));
-    socket.on("error", () => {}); // "close" follows
-    socket.on("close", () => this.#ended());
   }
 
   /** Connect and introduce the client by a name; rejects if the daemon speaks another API. */
   static async connect(path = defaultSocket(), name = "javascript") {
-    const socket = connect(path);
-    await new Promise((resolve, reject) => socket.once("connect", resolve).once("error", reject));
-    const client = new EraClient(socket, name);
-    client.hello = await client.call("hello", { client: name });
-    if (client.hello.api_version.split(".")[0] !== API_MAJOR) {
+    const client = new EraClient(path, name);
+    try {
+      await client.#open();
+    } catch (error) {
       client.close();
-      throw new Error(`api_version must be ${API_MAJOR}.x, got ${client.hello.api_version}`);
+      throw error;
     }
+    client.#socket.on("close", () => client.#ended());
     return client;
   }
 
   /** Send a request and return its result; rejects with Refused, or without a reply in 5 s. */
   call(method, params = {}) {
     return new Promise((resolve, reject) => {
-      if (this.#isClosed) return reject(new Error("the connection to the daemon is closed"));
+      if (!this.#socket?.writable) return reject(new Error("the connection to the daemon is closed"));
       const id = ++this.#id;
       const late = () => {
         this.#waiting.delete(id);
@@ -80,17 +85,17 @@ export class EraClient extends EventEmitter {
     return this.call("status");
   }
 
-  subscribe(...topics) {
-    return this.call("subscribe", { topics });
+  async subscribe(...topics) {
+    await this.call("subscribe", { topics });
+    for (const topic of topics) this.#topics.add(topic);
   }
 
   /** Switch the high voltage on and renew the lease until `disarm`, `stop` or "lost". */
   async arm(lease_s = 5) {
     const { lease } = await this.call("arm", { owner: this.#name, lease_s });
     this.#lease = lease;
-    this.#renewal = setInterval(() => {
-      this.call("renew", { lease }).catch((error) => this.#leaseLost(error));
-    }, lease_s * 500);
+    this.#leaseEnds = performance.now() + 1000 * lease_s;
+    this.#renewal = setInterval(() => this.#renew(lease, lease_s), RENEWAL_MS);
   }
 
   /** Ramp to silence and switch the high voltage off. */
@@ -118,7 +123,24 @@ export class EraClient extends EventEmitter {
   /** Close the connection; fingers are lifted, and a lease runs out. */
   close() {
     this.#isClosed = true;
-    this.#socket.destroy();
+    this.#forgetLease();
+    clearInterval(this.#repeat);
+    this.#socket?.destroy();
+    this.#rejectPending();
+  }
+
+  async #open() {
+    const socket = connect(this.#path);
+    await new Promise((resolve, reject) => socket.once("connect", resolve).once("error", reject));
+    this.#socket = socket;
+    createInterface({ input: socket }).on("line", (line) => this.#received(JSON.parse(line)));
+    socket.on("error", () => {}); // "close" follows
+    socket.on("close", () => this.#rejectPending());
+    this.hello = await this.call("hello", { client: this.#name });
+    if (this.hello.api_version.split(".")[0] !== API_MAJOR) {
+      throw new Error(`api_version must be ${API_MAJOR}.x, got ${this.hello.api_version}`);
+    }
+    if (this.#topics.size) await this.call("subscribe", { topics: [...this.#topics] });
   }
 
   #received(message) {
@@ -135,24 +157,46 @@ export class EraClient extends EventEmitter {
     else resolve(message.result);
   }
 
-  #ended() {
-    const wasAsked = this.#isClosed;
-    this.#isClosed = true;
-    this.#forgetLease();
-    clearInterval(this.#repeat);
-    const error = new Error("the connection to the daemon is closed");
-    for (const [, reject, timer] of this.#waiting.values()) {
-      clearTimeout(timer);
-      reject(error);
+  /** Connect again after a loss; give up after a while, or with the lease. */
+  async #ended() {
+    const end = performance.now() + PATIENCE_MS;
+    while (!this.#isClosed && performance.now() < end) {
+      try {
+        await this.#open();
+        this.#socket.on("close", () => this.#ended());
+        return;
+      } catch {
+        this.#socket.destroy();
+        await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+      }
     }
-    this.#waiting.clear();
-    if (!wasAsked) this.emit("lost", error);
+    if (this.#isClosed) return;
+    this.close();
+    this.emit("lost", new Error("the connection to the daemon is closed"));
   }
 
-  #leaseLost(error) {
-    if (this.#lease === null || this.#isClosed) return;
-    this.#forgetLease();
-    this.emit("lost", error);
+  #rejectPending() {
+    for (const [, reject, timer] of this.#waiting.values()) {
+      clearTimeout(timer);
+      reject(new Error("the connection to the daemon is closed"));
+    }
+    this.#waiting.clear();
+  }
+
+  #renew(lease, lease_s) {
+    const sent = performance.now();
+    const lost = (error) => {
+      if (lease !== this.#lease) return;
+      this.#forgetLease();
+      this.emit("lost", error);
+    };
+    if (sent >= this.#leaseEnds) lost(new Error("the lease was not renewed in time"));
+    else this.call("renew", { lease }).then(
+      () => { this.#leaseEnds = sent + 1000 * lease_s; },
+      (error) => { // without a response it is tried again
+        if (error instanceof Refused && error.code !== BUSY) lost(error);
+      },
+    );
   }
 
   #forgetLease() {

@@ -122,10 +122,10 @@ def check_own(path: Path, *, sticky: bool = False) -> None:
     """
     if sys.platform == "win32":  # its cache folders are the user's own
         return
-    status = path.stat()
+    status, owners = path.stat(), {path.stat().st_uid, path.lstat().st_uid}
     remedy = f"chown it to {os.geteuid()}, chmod go-w it, or set XDG_CACHE_HOME"
-    if status.st_uid not in (0, os.geteuid()):
-        raise PermissionError(f"{path} must belong to the user, got {status.st_uid}; {remedy}")
+    if not owners <= {0, os.geteuid()}:
+        raise PermissionError(f"{path} must belong to the user, got {max(owners)}; {remedy}")
     if sticky and status.st_mode & stat.S_ISVTX:
         return
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -134,13 +134,19 @@ def check_own(path: Path, *, sticky: bool = False) -> None:
 
 
 def _own_folder(folder: Path) -> Path:
-    """Make a folder, checked with its parents; returns it without links in its path."""
+    """Make a folder, checked with its parents and all links on its way; returns it without these.
+
+    Who owns a link, or writes where it is, could lead to a library that the user only keeps.
+    """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    folder = folder.resolve()
     check_own(folder)
-    for parent in folder.parents:
-        check_own(parent, sticky=True)
-    return folder
+    ways = [folder.absolute()]
+    for way in ways:  # and where each link leads to
+        for each in (way, *way.parents):
+            check_own(each, sticky=True)
+            if each.is_symlink():
+                ways.append(each.parent / each.readlink())
+    return folder.resolve()
 
 
 def _load(path: Path) -> ctypes.CDLL:

@@ -15,6 +15,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
+from registry.suggestions import did_you_mean
 
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
@@ -78,11 +79,12 @@ class Rig:
                     )
 
     def era(self, name: str) -> Era:
-        """The ERA of a name; raises KeyError for an unknown one."""
-        for era in self.eras:
-            if era.name == name:
-                return era
-        raise KeyError(name)
+        """The ERA of a name; raises InputError for an unknown one."""
+        eras = {era.name: era for era in self.eras}
+        if name not in eras:
+            meant = did_you_mean(str(name), eras)
+            raise InputError(f"unknown ERA {name!r}; {meant}choose from {', '.join(eras)}")
+        return eras[name]
 
     @property
     def fingerprint(self) -> str:

@@ -73,8 +73,8 @@ async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:
     }
     learning = learning_summary(LearningStatus(last_at=1.0), status.latency_ms, now=2.0)
     panel = TouchInputStatus(name="panel", url="tuio:", state="open")
-    touches = {"rejected_touches": {"off_plate": 1}, "inputs": [panel]}
-    touched = status.model_copy(update={**playing, **touches, "learning": learning})
+    counts = {"rejected_touches": {"off_plate": 1}, "lost_events": {"log": 1}, "inputs": [panel]}
+    touched = status.model_copy(update={**playing, **counts, "learning": learning})
     served = []
     for family in text_string_to_metric_families(exposition(touched).decode()):
         name = family.name + ("_total" if family.type == "counter" else "")

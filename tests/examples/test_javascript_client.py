@@ -1,6 +1,7 @@
 """The example client in JavaScript, under Node.js against a daemon on a serial line."""
 
 import asyncio
+import json
 import os
 import re
 from pathlib import Path
@@ -30,12 +31,14 @@ def resting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
 
 
-async def started(bench: DaemonBench | None, *places: str) -> asyncio.subprocess.Process:
+async def started(
+    bench: DaemonBench | None, *places: str, program: Path = BUTTON
+) -> asyncio.subprocess.Process:
     """The program with fingers at places, at a daemon if there is one."""
     socket = "nosuch.sock" if bench is None else str(bench.socket)
     return await asyncio.create_subprocess_exec(
         installed_program("node", "nodejs", package="nodejs"),
-        str(BUTTON),
+        str(program),
         *places,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -86,6 +89,31 @@ async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
         await ended(process)
         await next_event(era, "silence")
         assert not (await era.status()).contacts
+
+
+async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) -> None:
+    """It comes back armed, for longer than a lease; another daemon has not given its lease."""
+    program = f"""
+        import {{ EraClient }} from {json.dumps(str(BUTTON.with_name("era_client.mjs")))};
+        const era = await EraClient.connect();
+        era.on("state", ({{ new: state }}) => console.log(state));
+        era.on("lost", ({{ message }}) => {{ console.log("lost", message); process.exit(0); }});
+        await era.subscribe("state");
+        await era.arm(1);
+    """
+    (tmp_path / "kept.mjs").write_text(program, encoding="utf-8")
+    async with ready_daemon(tmp_path) as (bench, era):
+        process = await started(bench, program=tmp_path / "kept.mjs")
+        await until_state(era, ENABLED)
+        for connection in list(bench.daemon._server._admission.admitted):
+            connection.abort()
+        await asyncio.sleep(1.5)  # longer than the lease
+        assert (await era.status()).armed_by == "javascript"
+    async with ready_daemon(tmp_path) as (bench, era):
+        *states, lost = (await ended(process))[1].splitlines()
+        assert (await era.status()).armed_by is None
+    assert states.count(ENABLED) == 2
+    assert lost.startswith("lost ")
 
 
 async def test_without_a_daemon_it_says_so() -> None:

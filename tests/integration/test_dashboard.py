@@ -638,6 +638,23 @@ async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client)
     await page.until("document.querySelector('#problem').innerText")
 
 
+async def test_effects_and_events_are_seen_on_a_laptop(page: Page) -> None:
+    """Of 1280 by 800 pixels, without scrolling; the scale of the field is a short figure."""
+    await show_on(page, Screen("laptop", 1280, 800))
+    for shown in ("#effects button:last-child", "#log li:first-child"):
+        place = f"document.querySelector('{shown}').getBoundingClientRect().bottom"
+        assert 0 < await page.evaluate(place) < 800
+    scale = (
+        "import('./field.js').then(({ FieldView }) => {"
+        " const shown = [], canvas = () => document.createElement('canvas');"
+        " const view = new FieldView(canvas(), canvas(), (low, high) => shown.push(high));"
+        " view.scale = 2.2185265624999997;"
+        " view.drawScale();"
+        " return shown.at(-1); })"
+    )
+    assert await page.evaluate(scale) == "2.2 m/s²"
+
+
 @pytest.mark.long
 async def test_repeated_event_takes_one_line(page: Page) -> None:
     """So that retries do not push out why a link was lost."""

@@ -11,8 +11,8 @@ import pytest
 import dashboard_pictures
 from chromium import Page
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.schema import DaemonStateName
-from controller.api.topics import Hub, LayoutEvent, StateEvent
+from controller.api.schema import ContactStatus, DaemonStateName
+from controller.api.topics import Hub, LayoutEvent, PatternEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
@@ -70,7 +70,7 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
     """Which amplifiers a stop did not silence: beside the button and in the list of events.
 
     Until a stop is confirmed. The end of the daemon after a loss is an event of its own. Regions
-    are those of the layout in use.
+    are those of the layout in use, and the level is that at the finger.
     """
     problem = "document.querySelector('#problem').innerText"
     states: list[tuple[DaemonStateName, str]] = [
@@ -83,6 +83,16 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         knob = {"name": "knob", "shape": "circle", "x_m": 0.1, "y_m": 0.1, "radius_m": 0.03}
         daemon.publish("layout", LayoutEvent(layout={"regions": [knob]}))
         await tab.until("document.querySelectorAll('.region').length === 1")
+        finger = ContactStatus(source="a", id=1, x_m=0.1, y_m=0.1, role="target", level_db_sl=18.0)
+        pattern = PatternEvent(
+            contacts=[finger],
+            drive={},
+            latency_ms=2.0,
+            predicted_level_db_sl=22.0,
+            predicted_contrast_db=None,
+        )
+        daemon.publish("pattern", pattern)
+        await tab.until("document.querySelector('#summary').textContent.includes('18 dB SL')")
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
         shown = await tab.until(problem, lambda text: "side" in text)

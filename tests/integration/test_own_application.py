@@ -133,7 +133,9 @@ def url(origin: str) -> str:
 
 
 async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
-    """Armed and touched over a cut network; after a new daemon and gateway it follows, disarmed."""
+    """Armed and touched over a cut network; after a new daemon and gateway it follows, disarmed,
+    and says that its lease was lost.
+    """
     async with shown(tmp_path) as (tab, network, ended, origin):
 
         async def until_said(start: str) -> None:
@@ -168,6 +170,7 @@ async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> Non
             with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
                 await until_said("ready: ")
                 await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+                await tab.until(FELT, lambda text: "lease" in text)
                 assert era.status().armed_by is None
                 gateway.terminate()
                 await until_said("no connection: unreachable")

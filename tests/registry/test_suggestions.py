@@ -18,6 +18,7 @@ from registry.suggestions import did_you_mean
             "did you mean soda-lime-glass or gorilla-glass? ",
         ),
         ("lass", ["soda-lime-glass"], ""),
+        ("level", ["rig", "level_db_sl", "log"], "did you mean level_db_sl? "),
         ("", ["steel"], ""),
         ("x", [], ""),
     ],

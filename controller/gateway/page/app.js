@@ -190,10 +190,11 @@ function summarise(pattern) {
     summariseContents(pattern);
     return;
   }
-  const { contacts, predicted_level_db_sl, latency_ms } = pattern;
+  const { contacts, latency_ms } = pattern;
+  const level = contacts.filter(({ role }) => role === "target").at(-1)?.level_db_sl;  // as at the finger
   const { robust_felt_contrast_db: promised, predicted_felt_contrast_db: modelled } = pattern;
   const parts = [];
-  if (predicted_level_db_sl !== null) parts.push(`target: ${fixed(predicted_level_db_sl)} dB SL`);
+  if (level != null) parts.push(`target: ${fixed(level)} dB SL`);
   if (promised != null) parts.push(`at least ${fixed(promised)} dB over the other fingers (${fixed(modelled)} as modelled)`);
   parts.push(`${fixed(latency_ms, 1)} ms from touch to wire`);
   at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
@@ -331,6 +332,7 @@ function connect(token) {
     closed,
     failed,
     lifted: () => fingers.clear(),
+    disarmed: showButtons,
     stopped: (result) => { epoch = Math.max(epoch, result.epoch); },
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => fieldView.show(decodeField(buffer)),

@@ -27,7 +27,7 @@ const noResponse = () => new RpcError({ code: 0, message: "the gateway does not 
 export class Connection {
   // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded,
   // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
-  // disarmed() when the daemon refuses to renew the lease, stopped(result) of each stop, lifted() when all fingers were lifted because
+  // disarmed() when the lease is lost: refused by the daemon, or not renewed in time, stopped(result) of each stop, lifted() when all fingers were lifted because
   // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
   // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
   // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL.
@@ -41,7 +41,8 @@ export class Connection {
     this.attempts = 0;
     this.wasEverAccepted = false;
     this.wasOpen = false;  // since the last attempt to connect
-    this.lease = null;  // while armed by `arm`; it outlives a short loss
+    this.lease = null;  // while armed by `arm`; it outlives a shorter loss
+    this.leaseEnds = 0;  // ms
     this.isArming = false;
     this.touches = [];
     this.connect();
@@ -79,6 +80,7 @@ export class Connection {
       this.wasOpen = false;  // the daemon has too many clients: connected later
       socket.close();
     });
+    this.renew();
     this.handlers.opened?.(result, id);
   }
 
@@ -150,25 +152,40 @@ export class Connection {
     });
   }
 
-  // Switch the high voltage on, and renew the lease until `disarm` or `stop`, or until it is refused.
+  // Switch the high voltage on, and renew the lease until `disarm` or `stop`, or until it is lost.
   async arm(owner) {
     this.isArming = true;
+    const sent = performance.now();
     try {
       const { lease } = await this.call("arm", { owner, lease_s: LEASE_S });
-      this.lease = lease;
+      this.keepLease(lease, sent);
     } finally {
       this.isArming = false;
     }
   }
 
+  keepLease(lease, sent) {
+    this.lease = lease;
+    this.leaseEnds = sent + 1000 * LEASE_S;
+  }
+
+  // Renew the lease, after a loss too; nothing arms again.
   renew() {
     const { lease } = this;
-    if (!lease || !this.isOpen) return;
-    this.call("renew", { lease }).catch(({ code }) => {
-      if (code !== NO_LEASE || lease !== this.lease) return;
+    const now = performance.now();
+    const isHeld = () => lease && lease === this.lease;
+    const lose = () => {
       this.lease = null;
       this.handlers.disarmed?.();
-    });
+    };
+    if (!isHeld()) return;
+    if (now >= this.leaseEnds) lose();
+    else if (this.isOpen) {
+      this.call("renew", { lease }).then(
+        () => isHeld() && this.keepLease(lease, now),
+        ({ code }) => code === NO_LEASE && isHeld() && lose(),
+      );
+    }
   }
 
   // Ramp to silence and switch the high voltage off; over HTTP while there is no WebSocket.

@@ -195,7 +195,10 @@ export class FieldView {
     new Uint32Array(image.data.buffer).set(RAMPS[name]);
     context.putImageData(image, 0, 0);
     if (name === "felt") this.onScale(0, `${BRIGHTEST_DB} dB above threshold`);
-    else this.onScale(this.inMotion ? -this.scale : 0, `${this.scale} m/s²`);
+    else {
+      const shown = Number(this.scale.toPrecision(2));  // it decays in small steps
+      this.onScale(this.inMotion ? -shown : 0, `${shown} m/s²`);
+    }
   }
 }
 

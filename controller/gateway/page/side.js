@@ -69,8 +69,8 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
   // Percentiles need enough commands.
   const percentiles = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , min]) => count >= min);
   numbers.textContent = count
-    ? [`median ${threeDigits(median)} ms`, ...percentiles.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "command" : "commands"}`].join(", ")
-    : "no commands yet";
+    ? [`median ${threeDigits(median)} ms`, ...percentiles.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "touch" : "touches"}`].join(", ")
+    : "no touches yet";
   const max = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);
   const parts = [];

@@ -18,14 +18,23 @@ from typing import cast
 import pytest
 
 import controller
-from controller.api.async_client import AsyncClient
+from controller.api.async_client import MAX_QUEUED_EVENTS, AsyncClient
 from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, event_line
 from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
-from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
+from controller.api.topics import LogEvent
+from daemon_bench import (
+    PLACE,
+    daemon_at,
+    far_end,
+    next_event,
+    ready_daemon,
+    running_daemon,
+    until_state,
+)
 from model.errors import InputError
 from served_api import request
 from virtual_loop import in_virtual_time
@@ -68,26 +77,53 @@ async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> Non
 
 @in_virtual_time
 async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path) -> None:
-    """The server drops its connections twice: a call, `events` and the lease outlive it."""
+    """A lease of 5 s outlives a loss of 3 s; one of 6 s ends it for good, for calls and waiting."""
     async with ready_daemon(tmp_path) as (bench, era):
+        away, events = bench.socket.with_name("away"), []
 
-        async def drop() -> None:
+        async def lose(duration: float) -> None:
+            bench.socket.rename(away)
             for connection in list(bench.daemon._server._admission.admitted):
                 connection.abort()
-            await asyncio.sleep(0)
+            await asyncio.sleep(duration)
+            away.rename(bench.socket)
 
         await era.subscribe("state")
-        async with era.armed("me", lease_s=1):
-            await drop()
-            assert (await era.status()).state == ENABLED
-            await drop()
-            await asyncio.sleep(1.3)  # the lease was renewed over a third connection
+        await era.begin_armed("me", lease_s=5)
+        for duration in (0.0, 3.0):
+            await lose(duration)
+            await asyncio.sleep(duration)
             assert (await era.status()).armed_by == "me"
-        events = []
+        await era.touch([PLACE])
+        await lose(6.0)
+        with pytest.raises(LeaseLost, match="no daemon runs"):
+            events += [event async for event in era.events()]
+        for use in (era.touch([PLACE]), era.end_armed()):
+            with pytest.raises(LeaseLost):
+                await use
         while not events or events[-1].data["new"] != READY:
             events.append(await next_event(era, "state"))
         results = await asyncio.gather(*(era.status() for _ in range(50)))
         assert {status.state for status in results} == {READY}
+
+
+@in_virtual_time
+async def test_lease_is_lost_with_the_daemon_that_gave_it(tmp_path: Path) -> None:
+    """Another one at the same socket is not armed; who waits for events is told, as who calls."""
+    async with far_end(tmp_path) as far, contextlib.AsyncExitStack() as armed:
+        async with daemon_at(far, tmp_path) as bench, await bench.client() as first:
+            await until_state(first, READY)
+            era = await bench.client("study")
+            await armed.enter_async_context(era.armed("study", lease_s=60))
+        async with daemon_at(far, tmp_path) as bench, await bench.client() as second:
+            waiting = asyncio.create_task(era.next_event(timeout=9))
+            await until_state(second, READY)
+            with pytest.raises(LeaseLost):
+                await waiting
+            with pytest.raises(LeaseLost):
+                await armed.aclose()
+            assert (await second.status()).armed_by is None
+            await era.close()
 
 
 async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
@@ -138,6 +174,25 @@ async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
         await era.status()
     await era.close()
     assert [event async for event in era.events()] == []
+
+
+@in_virtual_time
+async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) -> None:
+    """Dropped by the daemon, or by the client as they were not taken: each event is had or lost."""
+    async with ready_daemon(tmp_path) as (bench, other), await bench.client() as era:
+        await era.subscribe("log")
+        hub = bench.daemon._publisher.hub
+        line = LogEvent(level="info", message="x" * 900, cause=None, remedy=None)
+        for count in (*[100] * 20, 1000, 1):  # at once
+            for _ in range(count):
+                hub.publish("log", lambda: line)
+            await asyncio.sleep(0.1)
+        events = []
+        while (event := await era.next_event(timeout=0.1)) is not None:
+            events.append(event)
+        assert len(events) == MAX_QUEUED_EVENTS
+        assert len(events) + sum(each.lost for each in events) == 3001
+        assert 0 < (await other.status()).lost_events["log"] < 1000
 
 
 async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Path) -> None:

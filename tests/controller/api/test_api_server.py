@@ -2,12 +2,14 @@
 
 import asyncio
 import json
+from unittest.mock import Mock
 
 import pytest
 
 from controller.api import turns
 from controller.api.jsonrpc import ErrorCode
-from controller.api.methods import TouchParams
+from controller.api.methods import StatusResult, TouchParams
+from daemon_bench import PATIENCE
 from served_api import ServedApi, feed, request, serving
 
 ARM = '{"owner":"me","lease_s":5}'
@@ -60,6 +62,17 @@ async def test_bug_in_a_method_is_reported_without_details(
     assert "-32603" in response
     assert "/a/path" not in response
     assert "/a/path" in caplog.text
+
+
+async def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a text that is not Unicode; the next line is served in the same turn."""
+    served, client, wire = serving()
+    monkeypatch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
+    async with asyncio.timeout(PATIENCE / 6):
+        await served.takes(client, request("status", id=1) + request("disarm", id=2))
+    failed, done = wire.lines()
+    assert (failed["id"], failed["error"]["code"]) == (1, ErrorCode.INTERNAL)
+    assert done == {"jsonrpc": "2.0", "id": 2, "result": {}}
 
 
 @pytest.mark.parametrize("where", ["the line", "the method"])

@@ -80,7 +80,7 @@ def logger() -> Iterator[logging.Logger]:
 def test_log_does_not_block_while_disk_hangs(
     logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """During a write that does not return, lines are queued up to a bound."""
+    """During a write that does not return, lines are queued up to a bound; clients get them all."""
     hangs, released = threading.Event(), threading.Event()
 
     class Hanging(io.StringIO):
@@ -90,13 +90,15 @@ def test_log_does_not_block_while_disk_hangs(
             return len(text)
 
     monkeypatch.setattr(sys, "stderr", Hanging())
-    thread = LogThread(None)
+    thread, heard = LogThread(None), Mock()
+    thread.listener = heard
     logger.addHandler(thread)
     logger.warning("first")
     assert hangs.wait(20)
     for _ in range(3000):
         logger.warning("more")
     assert thread.lines.qsize() == 2000
+    assert heard.call_count == 3001
     thread.close()
     released.set()
 

@@ -182,6 +182,44 @@ async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Pat
         assert re.search(r"A1.*SIM-main", (await era.status()).cause)
 
 
+@in_virtual_time
+async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_path: Path) -> None:
+    """Why nothing plays, before and after arming; why a lost amplifier stays so, and why it was.
+
+    Of four touches, one of them a move, and of three lifts the latencies are counted apart.
+    """
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.arm("me", lease_s=60)
+        await until(lambda: bench.daemon._publisher.view.silenced is not None)
+        assert "no contact" in ((await era.status()).silence_reason or "")
+        for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
+            for _ in range(4):
+                await era.touch(places)
+                await asyncio.sleep(0.05)
+        status = await era.status()
+        assert status.lift_latency_ms is not None
+        assert (status.latency_ms.count, status.lift_latency_ms.count) == (4, 1 + 3)  # and to arm
+        await era.disarm()
+        await asyncio.sleep(0.1)
+        await era.subscribe("silence")
+        told = (await next_event(era, "silence")).data["reason"]
+        assert told == (await era.status()).cause
+        expected = bench.daemon._controller._serial_numbers
+        expected["main"] = "A1"  # another one is connected in its place
+        bench.far.device.inject_fault(FaultWindow("hang"))
+        await until_state(era, "COMM_LOST")
+        assert "no reply" in (await era.status()).cause
+        bench.far.device.recover()
+        await until(lambda: "A1" in bench.daemon._supervisor.operation.cause)
+        assert "cables" not in ((await era.status()).remedy or "")
+        expected["main"] = "SIM-main"
+        seen = []
+        await era.subscribe("state")
+        while not seen or seen[-1]["new"] != READY:
+            seen.append((await next_event(era, "state")).data)
+        assert any("before: " in each["cause"] and "no reply" in each["cause"] for each in seen)
+
+
 LAYOUT = """\
 effects:
   hum: {kind: buzz, level: 14}

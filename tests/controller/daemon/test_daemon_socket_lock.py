@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from controller.daemon.children import gateway_options
 from controller.daemon.socket_lock import SocketLock
+from full_disk import full_disk
 from model.errors import InputError
 
 
@@ -99,6 +101,17 @@ def test_socket_lock_says_that_a_file_system_has_no_locks(
     monkeypatch.setattr("fcntl.flock", no_locks)
     with pytest.raises(InputError, match=os.strerror(errno.ENOLCK)):
         SocketLock(tmp_path / "era.sock")
+
+
+def test_full_disk_is_named_by_the_file_that_has_no_room(tmp_path: Path) -> None:
+    """Under the socket, and under the dashboard's token."""
+    path = tmp_path / "era.sock"
+    with full_disk(at=0):
+        with pytest.raises(InputError, match=f"{path}.lock"):
+            SocketLock(path)
+        with pytest.raises(InputError, match="dashboard-token"):
+            gateway_options("127.0.0.1:0", path)
+    SocketLock(path).release()
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe", "foreign"])

@@ -8,9 +8,11 @@ from controller.daemon.states import (
     DaemonState,
     Operation,
     Trigger,
+    acknowledge,
     failed,
     step,
 )
+from drivers.protocol.table import FAULTS
 
 # The whole table by hand, from the states and the fault table of the wire protocol: the next state
 # (= for the same) and the actions in order. A dot: nothing changes. Conditions have tests of their
@@ -149,3 +151,10 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
         assert after.state is state
     else:
         assert (after.state, after.cause) == (DaemonState.FAULT, "a bug")
+
+
+def test_remedy_of_every_fault_of_an_amplifier_is_its_own() -> None:
+    """In whatever words it is reported; of any other cause it is to find it."""
+    remedies = {acknowledge(f"amplifier main: got FAULT with fault {name}") for name in FAULTS}
+    assert len(remedies) == len(FAULTS)
+    assert acknowledge("a bug") == acknowledge("fault NONE")

@@ -54,12 +54,16 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
     assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 0
     histogram = [(1.0, 2), (5.0, 3), (100.0, 4)]
     latency = status.latency_ms.model_copy(update={"count": 9, "histogram": histogram})
-    later = status.model_copy(update={"latency_ms": latency, "rejected_touches": {"off_plate": 3}})
+    counts = {"rejected_touches": {"off_plate": 3}, "lost_events": {"log": 5}}
+    lifts = {"lift_latency_ms": latency.model_copy(update={"histogram": [(1.0, 4), (2.0, 0)]})}
+    later = status.model_copy(update={"latency_ms": latency, **lifts, **counts})
     read = scraped(later)
     assert read["era_touch_to_wire_seconds_bucket", "0.001"] == 2
     assert read["era_touch_to_wire_seconds_bucket", "0.005"] == 5
     assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 9
+    assert read["era_lift_to_wire_seconds_bucket", "+Inf"] == 4
     assert read["era_rejected_touches_total", "off_plate"] == 3
+    assert read["era_lost_events_total", "log"] == 5
 
 
 async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:

@@ -8,11 +8,14 @@ import socket
 import ssl
 import subprocess
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import pytest
 
+from controller.gateway.app import Gateway
 from controller.gateway.serving import check_certificate, listen, serve
 from controller.gateway.settings import Settings, read_token
+from daemon_bench import PATIENCE
 from gateway_bench import (
     TOKEN,
     RawWebSocket,
@@ -266,6 +269,17 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
     monkeypatch.setattr("controller.gateway.serving.check_certificate", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
+
+
+async def test_gateway_ends_with_what_it_keeps_of_the_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A failure there is raised: a process that went on would have no connection for a stop."""
+    monkeypatch.setattr(Gateway, "_keep_connected", AsyncMock(side_effect=ZeroDivisionError))
+    with pytest.raises(ExceptionGroup) as raised:
+        async with asyncio.timeout(PATIENCE / 6):
+            await serve(Settings(socket=tmp_path / "era.sock"), announce=lambda port: None)
+    assert raised.group_contains(ZeroDivisionError)
 
 
 def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:

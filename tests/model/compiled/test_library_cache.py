@@ -105,6 +105,23 @@ def test_folder_in_which_others_write_is_not_used(folder: Path) -> None:
     assert seven(folder) == 8
 
 
+def test_link_in_a_folder_of_others_is_not_followed(folder: Path) -> None:
+    """They could lead it to any library that the user keeps; one of the user's own is followed."""
+    kept = folder.parents[1] / "kept"
+    kept.mkdir(mode=0o700)
+    folder.parent.symlink_to(kept)
+    assert seven(folder) == 7
+    (path,) = folder.glob("*.so")
+    forge(path)
+    assert seven(folder) == 8
+    shared = folder.parents[1] / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    folder.parent.rename(shared / "link")
+    folder.parent.symlink_to(shared / "link")
+    assert seven(folder) == 7
+
+
 def test_files_of_another_user_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Root's are not: who could write them need not."""
     path = tmp_path / "library.so"

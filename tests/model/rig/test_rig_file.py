@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from model.config.document import ConfigError, read_document
+from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.kind import RIG
 from model.rig.meshes import parse_mesh
@@ -194,6 +195,8 @@ def test_load_rig_reads_units_defaults_wiring_and_limits(tmp_path: Path) -> None
     assert (north_east.x, north_east.y) == (0.3048, 0.2286)
     assert (north_east.stiffness, north_east.bolt_mass, north_east.stroke) == (17000, 0, 1e-4)
     assert rig.era("SW").damping == 2.0
+    with pytest.raises(InputError, match=r"'sww'; did you mean SW\? choose from SW, NE"):
+        rig.era("sww")
     assert rig.wiring == {"SW": Channel("main", 0), "NE": Channel("main", 1)}
     assert rig.amplifiers == {"main": "sim://"}
     assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 0.5)

@@ -9,14 +9,17 @@ import logging
 import threading
 import weakref
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import Executor, Future, InvalidStateError
 from contextlib import suppress
-from typing import Any, TypeVar
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, ParamSpec, TypeVar
 
 CLOSE_TIMEOUT = 0.7
 """Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
 
 _logger = logging.getLogger(__name__)
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
@@ -29,21 +32,7 @@ async def in_thread(
     opened.
     """
     done: Future[_T] = Future()
-
-    def run() -> None:
-        try:
-            result = work()
-        except Exception as error:
-            with suppress(InvalidStateError):  # cancelled
-                done.set_exception(error)
-            return
-        try:
-            done.set_result(result)
-        except InvalidStateError:
-            if undo is not None:
-                undo(result)
-
-    threading.Thread(target=run, name=name, daemon=True).start()
+    threading.Thread(target=_run, args=(work, done, undo), name=name, daemon=True).start()
     try:
         return await asyncio.wrap_future(done)
     except asyncio.CancelledError:
@@ -51,6 +40,49 @@ async def in_thread(
         if undo is not None and not done.cancelled() and done.exception() is None:
             threading.Thread(target=undo, args=(done.result(),), name=name, daemon=True).start()
         raise
+
+
+def _run(
+    work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
+) -> None:
+    """Note the result of work, or its error; undo: called with that of work that was cancelled."""
+    try:
+        result = work()
+    except Exception as error:
+        with suppress(InvalidStateError):  # cancelled
+            done.set_exception(error)
+        return
+    try:
+        done.set_result(result)
+    except InvalidStateError:
+        if undo is not None:
+            undo(result)
+
+
+class WorkerThread(Executor):
+    """A daemon thread of a name that does one work after another, until nothing refers to this.
+
+    For an event loop's `run_in_executor`. It starts with the first work; work that hangs is left
+    behind with it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._waiting = waiting = SimpleQueue[Callable[[], None] | None]()
+        self._thread = threading.Thread(target=_run_all, args=(waiting,), name=name, daemon=True)
+        weakref.finalize(self, waiting.put, None)
+
+    def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
+        """Do work after all before it."""
+        done: Future[_T] = Future()
+        self._waiting.put(partial(_run, partial(work, *args, **named), done))
+        if self._thread.ident is None:
+            self._thread.start()
+        return done
+
+
+def _run_all(waiting: "SimpleQueue[Callable[[], None] | None]") -> None:
+    for work in iter(waiting.get, None):
+        work()
 
 
 async def close_in_thread(close: Callable[[], object], *, name: str) -> None:

@@ -90,7 +90,7 @@ class Daemon:
                 are_open=self._controller.group.is_open,
                 lost=self._supervisor.operation.lost,
             ),
-            effect_of=self._layout.effect_of,
+            player=self._layout,
             layout=config.layout,
             learning=lambda: None if self.learning is None else self.learning.status,
         )

@@ -8,7 +8,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from controller.api.schema import AmplifierStatus, LatencySummary, LearningSummary, PlateEvent
+from controller.api.schema import (
+    STATE_WORDS,
+    AmplifierStatus,
+    LatencySummary,
+    LearningSummary,
+    PlateEvent,
+)
 from controller.api.topics import (
     AmplifiersEvent,
     Hub,
@@ -23,6 +29,7 @@ from controller.daemon.api_views import PlateView, learning_summary, plate_event
 from controller.daemon.operation import LinkChange
 from controller.daemon.states import DaemonState, Operation
 from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
@@ -36,9 +43,8 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
-    operation: of the plate; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; layout: the surface layout;
-    learning: what is learned of the plate, None where nothing is to be.
+    operation: of the plate; amplifiers: their statuses; player: of effects; layout: the surface
+    layout; learning: what is learned of the plate, None where nothing is to be.
     """
 
     def __init__(
@@ -46,11 +52,12 @@ class EventPublisher:
         *,
         operation: Callable[[], Operation],
         amplifiers: Callable[[], list[AmplifierStatus]],
-        effect_of: Callable[[ContactKey], str | None],
+        player: EffectPlayer,
         layout: SurfaceLayout | None,
         learning: Callable[[], LearningStatus | None],
     ) -> None:
-        self.view = PlateView(effect_of)
+        self.view = PlateView(player.effect_of, why_not=self._why_not)
+        self._player = player
         self.latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
@@ -94,6 +101,18 @@ class EventPublisher:
                 latency_ms=None,
             )
             self.hub.publish("silence", lambda: silence)
+
+        if new.state is not DaemonState.OPERATION_ENABLED:
+            self.view.silenced = None
+
+    def _why_not(self, key: ContactKey) -> str:
+        """Why a contact feels nothing of its own that the control loop has not reported."""
+        operation = self._operation()
+        if operation.state is not DaemonState.OPERATION_ENABLED:
+            return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
+        if operation.degraded:
+            return f"{operation.cause}; {operation.remedy}"
+        return self._player.why_not(key)
 
     def layout_changed(self, layout: SurfaceLayout | None) -> None:
         """Publish another surface layout; None for the same effect everywhere."""

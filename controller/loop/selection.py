@@ -3,15 +3,23 @@
 One question is answered at a time, with the fingers as they are when the one before was answered.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 
-from controller.loop.answer_thread import AnswerThread
+from controller.loop.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db
-from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
+from controller.loop.choice import Chooser, Chosen, Requested, is_alone, silent, sum_db
+from controller.loop.content import (
+    BEING_CHOSEN,
+    Prediction,
+    Selection,
+    Targets,
+    no_layer_free,
+    not_served,
+)
 from controller.loop.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
@@ -23,7 +31,15 @@ MOVE_TOLERANCE = 0.008
 # s; a finger that has not moved further for so long rests, and contents are chosen anew for it.
 _RESTS_AFTER = 0.1
 
+GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
+BLOCKED = (
+    f"{MAX_LATE} answers are still computed that took more than {TIME_LIMIT:g} s; touch with one "
+    "finger, and restart the daemon if it lasts"
+)
+
 _NOTHING = Selection((), ())
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -89,8 +105,10 @@ class Selector:
     a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
     targets and their levels do, no contact has moved more than 8 mm, and none has another load,
     which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
-    others as they are: a change would be felt. chooser: answers the next question; what the thread
-    computes goes on by the former one. arrived: called when the thread is done.
+    others as they are: a change would be felt. An answer that takes too long is given up: all that
+    lasts is silent until its fingers change, or until that answer has ended at last. chooser:
+    answers the next question; what the thread computes goes on by the former one. arrived: called
+    when the thread is done.
     """
 
     def __init__(
@@ -100,7 +118,9 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self.chooser = chooser
-        self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
+        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._ask_again)
+        self._computed: Requested | None = None  # by the thread
+        self._given_up = _NOTHING  # silent for want of an answer
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -143,7 +163,7 @@ class Selector:
             # Who has come back may be elsewhere.
             self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
         self.triggered_at = math.inf
-        arrived = self._thread.take()
+        arrived = self._arrived()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
         pulses, self._short = self._short, {}
@@ -161,16 +181,42 @@ class Selector:
             for requested in self._to_request(
                 intended, pulses, triggered_at, has_waited=arrived is not None
             ):
-                if requested.takes_long:
-                    self._thread.compute(partial(chooser.choose, requested, capabilities))
-                else:
+                if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities))
+                elif self._thread.is_blocked:
+                    self._give_up(requested, BLOCKED)
+                else:
+                    self._computed = requested
+                    self._thread.compute(partial(chooser.choose, requested, capabilities))
             self._waits_since = math.inf
         parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
-            found = replace(found, is_pending=True)
+            reason = found.reason or (None if found.contents else BEING_CHOSEN)
+            found = replace(found, is_pending=True, reason=reason)
         return found
+
+    def _arrived(self) -> Chosen | None:
+        """Return what the thread has chosen, if anything; give up what it has not in time."""
+        try:
+            return self._thread.take()
+        except TimeoutError:
+            if self._computed is not None and not self._computed.is_rested:  # what plays would do
+                self._give_up(self._computed, GIVEN_UP)
+            return None
+
+    def _give_up(self, requested: Requested, reason: str) -> None:
+        """Leave what was asked for without an answer, which ends what plays of what lasts."""
+        if reason != self._lasting.reason:
+            _logger.warning("loop: %d fingers feel nothing: %s", len(requested.contacts), reason)
+        self.due = math.inf
+        self._lasting = self._given_up = silent(requested, requested.lasting or (), reason)
+        self._short |= {each[0].key: silent(requested, (each,), reason) for each in requested.short}
+
+    def _ask_again(self) -> None:
+        """Ask anew for fingers that were left without an answer, as an answer has ended."""
+        if self._lasting is self._given_up:
+            self._lasting = _NOTHING
 
     def _to_request(
         self,

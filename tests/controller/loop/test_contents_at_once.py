@@ -1,7 +1,7 @@
 """Several fingers, each with a content of its own, on the plate in virtual time."""
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,6 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.loop.decision import ENDED, Decider
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly, unshaped
@@ -25,35 +24,26 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.arrays import Complex64Array
-from model.config.shapes import Rectangle
 from model.errors import InputError
 from model.table.pattern import Pattern
 from set_table import SetTiming
-from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, playable, table
-from virtual_loop import in_virtual_time
-
-LAYOUT = SurfaceLayout(
-    (
-        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="low"),
-        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="high"),
-        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="any"),
-    ),
-    {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
-    elsewhere=None,
+from several_fingers import (
+    ABOVE,
+    LAYOUT,
+    LEFT,
+    RIGHT,
+    answers_take,
+    fingers_on,
+    playable,
+    table,
 )
+from virtual_loop import in_virtual_time
 
 
 def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:
     """Let every answer of the thread take a time [s]; returns the running loop."""
-    loop = asyncio.get_running_loop()
-
-    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
-        future = loop.create_future()
-        loop.call_later(seconds, lambda: future.set_result(work()))
-        return future
-
-    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
-    return loop
+    answers_take(monkeypatch, seconds)
+    return asyncio.get_running_loop()
 
 
 @in_virtual_time
@@ -565,25 +555,6 @@ async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
             for one in each.contents.values()
         }
         assert "long" in names
-
-
-@in_virtual_time
-async def test_an_answer_that_takes_more_than_a_second_is_a_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Silent, with the reason, until it has come."""
-    answering_after(2.0, monkeypatch)
-    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.95)
-        before = len(fingers.silenced)
-        await fingers.hold(0.1)
-        (silenced,) = fingers.silenced[before:]
-        assert silenced.reason == (
-            "TimeoutError: answer must take less than 1 s, is still computed"
-        )
-        await fingers.hold(1.2)
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None, None]
 
 
 @in_virtual_time

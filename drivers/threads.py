@@ -6,10 +6,12 @@ a connection or a disk hangs.
 
 import asyncio
 import logging
+import os
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Executor, Future, InvalidStateError
+from concurrent.futures import Executor, Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
@@ -19,6 +21,7 @@ CLOSE_TIMEOUT = 0.7
 """Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
 
 _logger = logging.getLogger(__name__)
+_at_work: set[Future[Any]] = set()
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -46,17 +49,42 @@ def _run(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
 ) -> None:
     """Note the result of work, or its error; undo: called with that of work that was cancelled."""
+    _at_work.add(done)
     try:
         result = work()
     except Exception as error:
         with suppress(InvalidStateError):  # cancelled
             done.set_exception(error)
         return
+    finally:
+        _at_work.discard(done)
     try:
         done.set_result(result)
     except InvalidStateError:
         if undo is not None:
             undo(result)
+
+
+def leave_work() -> None:
+    """End the process at once where work goes on; to be called when all else is closed.
+
+    A library may wait for ever for its own threads if it ends while one is at work.
+    """
+    if _at_work:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+
+
+class ManyThreads(ThreadPoolExecutor):
+    """An event loop's own pool, with a daemon thread for each work."""
+
+    def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
+        """Do work at once."""
+        done: Future[_T] = Future()
+        given = partial(work, *args, **named), done
+        threading.Thread(target=_run, args=given, name="work", daemon=True).start()
+        return done
 
 
 class WorkerThread(Executor):

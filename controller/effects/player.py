@@ -132,7 +132,7 @@ class EffectPlayer:
             return f"{name} is not felt at rest; move the finger"
         if finger.ended:
             return f"{finger.ended} ended; touch there again"
-        return "the layout has no effect there; touch a region that has one"
+        return "no effect plays there; touch again, in a region that has one"
 
     def replace(self, layout: SurfaceLayout) -> None:
         """Play another layout from now on; fingers that rest feel no press of it.

@@ -108,7 +108,7 @@ class Decider:
         self._selector.chooser = Chooser(table, timing.levels, self._builder.shape)
 
     def prepare(self) -> None:
-        """Precompute what the first touch would have to wait for; tens of milliseconds.
+        """Precompute what the first touch would have to wait for; seconds, of a large rig.
 
         Raises InputError for a table that has no pattern for these amplifiers.
         """

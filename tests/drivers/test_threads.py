@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from drivers.threads import in_thread
+from drivers.threads import WorkerThread, in_thread
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
@@ -50,18 +50,44 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
     assert closed.wait(60)
 
 
-def test_program_ends_while_work_hangs() -> None:
-    """Unlike with asyncio's own pool."""
-    program = """
-import asyncio, threading
-from drivers.threads import in_thread
+@pytest.mark.parametrize(
+    "start",
+    [
+        "asyncio.create_task(in_thread(hang, name='hangs'))",
+        "loop.run_in_executor(WorkerThread('hangs'), hang)",
+        "loop.set_default_executor(ManyThreads()) or asyncio.create_task(asyncio.to_thread(hang))",
+    ],
+)
+def test_program_ends_while_work_hangs(start: str) -> None:
+    """Unlike with asyncio's own pool; also where a library would wait at the end for its own."""
+    program = f"""
+import asyncio, atexit, threading
+from drivers.threads import ManyThreads, WorkerThread, in_thread, leave_work
+
+hang = threading.Event().wait
+atexit.register(hang)
+atexit.register(leave_work)
 
 async def main():
-    opening = asyncio.create_task(in_thread(threading.Event().wait, name="hangs"))
-    await asyncio.sleep(0)
-    opening.cancel()
-    await asyncio.wait({opening})
+    loop = asyncio.get_running_loop()
+    work = {start}
+    await asyncio.sleep(0.1)
+    work.cancel()
+    await asyncio.wait({{work}})
 
 asyncio.run(main())
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_a_worker_does_its_work_in_order_in_one_thread_that_ends_with_it() -> None:
+    """What fails is raised where it was asked for, and holds up nothing."""
+    worker = WorkerThread("worker")
+    failed = worker.submit(divmod, 1, 0)
+    (thread,) = [each for each in threading.enumerate() if each.name == "worker"]
+    assert worker.submit(threading.current_thread).result(60) is thread
+    with pytest.raises(ZeroDivisionError):
+        failed.result(60)
+    del worker
+    thread.join(60)
+    assert not thread.is_alive()

@@ -569,6 +569,7 @@ async def test_what_is_not_served_says_why() -> None:
         for each in felt.values():
             assert each.verdict in ("own", "mixed", "shared", "held back")
             assert (each.held_back is None) == (each.verdict in ("own", "mixed"))
+            assert "(" not in (each.held_back or "")  # no object of the program
         assert {felt[id].verdict for id in (1, 2)} == {"held back"}  # the earliest
         assert felt[1].held_back == (
             "no layer is free: the amplifiers play 4 contents at once; lift a finger"

@@ -4,6 +4,7 @@ A program waits for the threads of asyncio's own pool before it ends, which may 
 a connection or a disk hangs.
 """
 
+import _thread
 import asyncio
 import logging
 import os
@@ -11,10 +12,9 @@ import sys
 import threading
 import weakref
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Executor, Future, InvalidStateError, ThreadPoolExecutor
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from queue import SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
 CLOSE_TIMEOUT = 0.7
@@ -76,41 +76,15 @@ def leave_work() -> None:
         os._exit(0)
 
 
-class ManyThreads(ThreadPoolExecutor):
-    """An event loop's own pool, with a daemon thread for each work."""
+class DaemonThreads(ThreadPoolExecutor):
+    """A pool for event loops, their own or another, with a daemon thread for each work."""
 
     def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
         """Do work at once."""
         done: Future[_T] = Future()
-        given = partial(work, *args, **named), done
-        threading.Thread(target=_run, args=given, name="work", daemon=True).start()
+        # Not by `threading`, which waits until it runs: a millisecond where that computes.
+        _thread.start_new_thread(_run, (partial(work, *args, **named), done))
         return done
-
-
-class WorkerThread(Executor):
-    """A daemon thread of a name that does one work after another, until nothing refers to this.
-
-    For an event loop's `run_in_executor`. It starts with the first work; work that hangs is left
-    behind with it.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._waiting = waiting = SimpleQueue[Callable[[], None] | None]()
-        self._thread = threading.Thread(target=_run_all, args=(waiting,), name=name, daemon=True)
-        weakref.finalize(self, waiting.put, None)
-
-    def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
-        """Do work after all before it."""
-        done: Future[_T] = Future()
-        self._waiting.put(partial(_run, partial(work, *args, **named), done))
-        if self._thread.ident is None:
-            self._thread.start()
-        return done
-
-
-def _run_all(waiting: "SimpleQueue[Callable[[], None] | None]") -> None:
-    for work in iter(waiting.get, None):
-        work()
 
 
 async def close_in_thread(close: Callable[[], object], *, name: str) -> None:

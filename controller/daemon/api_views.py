@@ -68,21 +68,24 @@ class PlateView:
         """Why nothing plays for the contacts of now; None while a pattern plays."""
         if self.applied is not None:
             return None
-        known = () if self.silenced is None else self.silenced.contacts
-        since = {(each.key, each.since) for each in known}
-        new = [each.key for each in self.contacts if (each.key, each.since) not in since]
-        if self.silenced is not None and self.contacts and not new:
-            return self.silenced.reason
-        return "; ".join(dict.fromkeys(map(self._why_not, new))) or NO_CONTACTS
-
-    def _why_not(self, key: ContactKey) -> str:
-        return self.why_not(key) or BEING_CHOSEN
+        reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
+        return "; ".join(filter(None, reasons)) or NO_CONTACTS
 
     def _statuses(
         self, contacts: Iterable[Contact], report: Applied | Silenced | None
     ) -> list[ContactStatus]:
+        reason = ""
+        if isinstance(report, Silenced) and not report.targets:  # as by a failure
+            reason = report.reason
+        known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
-            contact_status(each, report, self.effect_of(each.key), why_not=self._why_not(each.key))
+            contact_status(
+                each,
+                report,
+                self.effect_of(each.key),
+                why_not=self.why_not(each.key)
+                or (reason if (each.key, each.since) in known else BEING_CHOSEN),
+            )
             for each in contacts
         ]
 

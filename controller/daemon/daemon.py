@@ -29,7 +29,7 @@ from drivers import clock
 from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
-from drivers.threads import ManyThreads, in_thread
+from drivers.threads import DaemonThreads, in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -150,7 +150,7 @@ class Daemon:
         for amplifiers that do not fit the configuration.
         """
         loop = asyncio.get_running_loop()
-        loop.set_default_executor(ManyThreads())
+        loop.set_default_executor(DaemonThreads())
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
         loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)

@@ -92,18 +92,17 @@ class EventPublisher:
     def state_changed(self, old: Operation, new: Operation) -> None:
         """Publish a transition; outside OPERATION_ENABLED nothing plays."""
         self.hub.publish("state", lambda: _state_event(old, new))
-        if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
-            # The control loop does not report the end of what others have silenced.
-            self.view.applied = None
+        if new.state is DaemonState.OPERATION_ENABLED:
+            return
+        # The control loop does not report the end of what others have silenced.
+        applied, self.view.applied, self.view.silenced = self.view.applied, None, None
+        if applied is not None:
             silence = SilenceEvent(
                 contacts=self.view.contact_statuses(),
                 reason=new.cause,
                 latency_ms=None,
             )
             self.hub.publish("silence", lambda: silence)
-
-        if new.state is not DaemonState.OPERATION_ENABLED:
-            self.view.silenced = None
 
     def _why_not(self, key: ContactKey) -> str:
         """Why a contact feels nothing of its own that the control loop has not reported."""

@@ -5,10 +5,11 @@ nor the end of the process, and what it returns at last is dropped.
 """
 
 import asyncio
+import logging
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from drivers.threads import WorkerThread
+from drivers.threads import DaemonThreads
 
 T = TypeVar("T")
 
@@ -18,21 +19,22 @@ TIME_LIMIT = 1.0
 MAX_LATE = 2
 """Answers that may still be computed after they were given up; until one ends none is begun."""
 
+_logger = logging.getLogger(__name__)
+
 
 class AnswerThread(Generic[T]):
-    """A thread that answers one question at a time, another one after an answer that was given up.
+    """Answers one question at a time, each in a thread, until it has come or is given up.
 
-    arrived: called in the loop when `take` has something to return or to raise; freed: before it,
-    when an answer that was given up has ended.
+    arrived: called in the loop when there is something to `take`; freed: when an answer that was
+    given up has ended, before that.
     """
 
     def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
         self._arrived, self._freed = arrived, freed
-        self._worker = WorkerThread("answers")
+        self._threads = DaemonThreads()
         self._answer: asyncio.Future[T] | None = None
         self._limit: asyncio.TimerHandle | None = None
-        self._is_late = False
-        self._late = 0  # given up, and still computed
+        self._late = set[asyncio.Future[T]]()  # given up, and still computed
 
     @property
     def is_busy(self) -> bool:
@@ -42,41 +44,36 @@ class AnswerThread(Generic[T]):
     @property
     def is_blocked(self) -> bool:
         """Whether too many answers that were given up are still computed."""
-        return self._late >= MAX_LATE
+        return len(self._late) >= MAX_LATE
 
-    def compute(self, question: Callable[[], T]) -> None:
-        """Compute in the thread, which must be neither busy nor blocked."""
+    def compute(self, question: Callable[[], T], *, instead: T) -> None:
+        """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
         loop = asyncio.get_running_loop()
-        self._answer = loop.run_in_executor(self._worker, question)
-        self._answer.add_done_callback(self._done)
-        self._limit = loop.call_later(TIME_LIMIT, self._note_late)
+        self._answer = loop.run_in_executor(self._threads, question)
+        self._answer.add_done_callback(self._note)
+        self._limit = loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
 
     def take(self) -> T | None:
-        """Return the answer that was not taken yet; None without any; raises its error.
-
-        Raises TimeoutError, once, for an answer that has been computed for more than 1 s: it is
-        given up.
-        """
+        """Return the answer that was not taken yet; None without any; raises its error."""
         answer = self._answer
-        if answer is None or not (self._is_late or answer.done()):
+        if answer is None or not answer.done():
             return None
-        self._answer, self._is_late = None, False
+        self._answer = None
         if self._limit is not None:
             self._limit.cancel()
-        if not answer.done():
-            self._late += 1
-            self._worker = WorkerThread("answers")
-            raise TimeoutError
         return None if answer.cancelled() else answer.result()
 
-    def _note_late(self) -> None:
-        self._is_late = True
-        self._arrived()
+    def _give_up(self, answer: "asyncio.Future[T]", instead: T) -> None:
+        if not answer.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._late.add(answer)
+            self._answer = asyncio.get_running_loop().create_future()
+            self._answer.set_result(instead)
+            self._arrived()
 
-    def _done(self, answer: "asyncio.Future[T]") -> None:
-        if answer is not self._answer:
-            self._late -= 1
-            if not answer.cancelled():
-                answer.exception()  # of no interest any more
+    def _note(self, answer: "asyncio.Future[T]") -> None:
+        if answer in self._late:
+            self._late.remove(answer)
+            answer.exception()  # of no interest any more
             self._freed()
         self._arrived()

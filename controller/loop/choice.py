@@ -254,6 +254,17 @@ def _contents(parts: Iterable[Selection]) -> list[Content]:
     return [content for part in parts for content in part.contents]
 
 
+def unanswered(requested: Requested, reason: str) -> Chosen:
+    """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
+    none = silent(requested, requested.lasting or (), reason)
+    return Chosen(
+        replace(requested, triggered_at=math.inf),
+        None if requested.is_rested else none,
+        {each[0].key: silent(requested, (each,), reason) for each in requested.short},
+        is_limited=False,
+    )
+
+
 def silent(requested: Requested, targets: Targets, reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
     keys = {contact.key for contact, _ in targets}

@@ -3,7 +3,6 @@
 One question is answered at a time, with the fingers as they are when the one before was answered.
 """
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from functools import partial
 
 from controller.loop.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser, Chosen, Requested, is_alone, silent, sum_db
+from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
 from controller.loop.content import (
     BEING_CHOSEN,
     Prediction,
@@ -37,9 +36,9 @@ BLOCKED = (
     "finger, and restart the daemon if it lasts"
 )
 
-_NOTHING = Selection((), ())
+_UNANSWERED = (GIVEN_UP, BLOCKED)
 
-_logger = logging.getLogger(__name__)
+_NOTHING = Selection((), ())
 
 
 @dataclass(frozen=True)
@@ -119,8 +118,6 @@ class Selector:
     ) -> None:
         self.chooser = chooser
         self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._ask_again)
-        self._computed: Requested | None = None  # by the thread
-        self._given_up = _NOTHING  # silent for want of an answer
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -163,7 +160,7 @@ class Selector:
             # Who has come back may be elsewhere.
             self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
         self.triggered_at = math.inf
-        arrived = self._arrived()
+        arrived = self._thread.take()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
         pulses, self._short = self._short, {}
@@ -184,10 +181,12 @@ class Selector:
                 if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities))
                 elif self._thread.is_blocked:
-                    self._give_up(requested, BLOCKED)
+                    self._take(unanswered(requested, BLOCKED))
                 else:
-                    self._computed = requested
-                    self._thread.compute(partial(chooser.choose, requested, capabilities))
+                    self._thread.compute(
+                        partial(chooser.choose, requested, capabilities),
+                        instead=unanswered(requested, GIVEN_UP),
+                    )
             self._waits_since = math.inf
         parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
@@ -196,26 +195,9 @@ class Selector:
             found = replace(found, is_pending=True, reason=reason)
         return found
 
-    def _arrived(self) -> Chosen | None:
-        """Return what the thread has chosen, if anything; give up what it has not in time."""
-        try:
-            return self._thread.take()
-        except TimeoutError:
-            if self._computed is not None and not self._computed.is_rested:  # what plays would do
-                self._give_up(self._computed, GIVEN_UP)
-            return None
-
-    def _give_up(self, requested: Requested, reason: str) -> None:
-        """Leave what was asked for without an answer, which ends what plays of what lasts."""
-        if reason != self._lasting.reason:
-            _logger.warning("loop: %d fingers feel nothing: %s", len(requested.contacts), reason)
-        self.due = math.inf
-        self._lasting = self._given_up = silent(requested, requested.lasting or (), reason)
-        self._short |= {each[0].key: silent(requested, (each,), reason) for each in requested.short}
-
     def _ask_again(self) -> None:
-        """Ask anew for fingers that were left without an answer, as an answer has ended."""
-        if self._lasting is self._given_up:
+        """Ask anew for fingers that were left without an answer, since one has ended."""
+        if self._lasting.reason in _UNANSWERED:
             self._lasting = _NOTHING
 
     def _to_request(
@@ -274,6 +256,8 @@ class Selector:
         do again, since a finger that came has lifted meanwhile.
         """
         found = chosen.lasting
+        if found is not None and found.reason in _UNANSWERED:
+            return True  # in doubt nothing plays
         return (
             found is not None
             and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
@@ -287,6 +271,8 @@ class Selector:
         self._short = {**self._short, **chosen.short}
         if chosen.lasting is not None and not is_late:
             self._lasting = chosen.lasting
+            if self._lasting.reason in _UNANSWERED:
+                self.due = math.inf
             if chosen.is_limited:
                 ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER

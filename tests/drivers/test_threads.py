@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from drivers.threads import WorkerThread, in_thread
+from drivers.threads import in_thread
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
@@ -54,15 +54,15 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
     "start",
     [
         "asyncio.create_task(in_thread(hang, name='hangs'))",
-        "loop.run_in_executor(WorkerThread('hangs'), hang)",
-        "loop.set_default_executor(ManyThreads()) or asyncio.create_task(asyncio.to_thread(hang))",
+        "loop.run_in_executor(DaemonThreads(), hang)",
+        "loop.set_default_executor(DaemonThreads()) or loop.run_in_executor(None, hang)",
     ],
 )
 def test_program_ends_while_work_hangs(start: str) -> None:
     """Unlike with asyncio's own pool; also where a library would wait at the end for its own."""
     program = f"""
 import asyncio, atexit, threading
-from drivers.threads import ManyThreads, WorkerThread, in_thread, leave_work
+from drivers.threads import DaemonThreads, in_thread, leave_work
 
 hang = threading.Event().wait
 atexit.register(hang)
@@ -78,16 +78,3 @@ async def main():
 asyncio.run(main())
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
-
-
-def test_a_worker_does_its_work_in_order_in_one_thread_that_ends_with_it() -> None:
-    """What fails is raised where it was asked for, and holds up nothing."""
-    worker = WorkerThread("worker")
-    failed = worker.submit(divmod, 1, 0)
-    (thread,) = [each for each in threading.enumerate() if each.name == "worker"]
-    assert worker.submit(threading.current_thread).result(60) is thread
-    with pytest.raises(ZeroDivisionError):
-        failed.result(60)
-    del worker
-    thread.join(60)
-    assert not thread.is_alive()

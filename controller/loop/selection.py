@@ -4,6 +4,7 @@ One question is answered at a time, with the fingers as they are when the one be
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +23,7 @@ from controller.loop.content import (
 from controller.loop.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
+from model.table.answer import MAX_SEPARATE
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
@@ -334,7 +336,10 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
 def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
 ) -> tuple[Targets, tuple[Prediction, ...]]:
-    """Leave out targets for which there is no layer: of the lowest priority, then the earliest."""
+    """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
+
+    Many that may share have one layer together.
+    """
     mode = capabilities.drive_mode
     count = capabilities.layers if mode == UNRESTRICTED else 1
     if len(targets) <= count:
@@ -342,8 +347,17 @@ def _within_layers(
     reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
     if mode == UNRESTRICTED:
         reason = no_layer_free(count)
-    order = sorted(range(len(targets)), key=lambda at: (targets[at][1].priority, at), reverse=True)
-    served = {*order[:count]}
+    sharing = Counter([target.shared_as for _, target in targets])
+    layers: list[str | bool | None] = []
+    served = set[int]()
+    for at in sorted(range(len(targets)), key=lambda n: (targets[n][1].priority, n), reverse=True):
+        name = targets[at][1].shared_as
+        is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
+        if is_one and name in layers:
+            served.add(at)
+        elif len(layers) < count:
+            layers.append(name)
+            served.add(at)
     return (
         tuple(each for at, each in enumerate(targets) if at in served),
         tuple(

@@ -119,7 +119,7 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self.chooser = chooser
-        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._ask_again)
+        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._request_again)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -197,7 +197,7 @@ class Selector:
             found = replace(found, is_pending=True, reason=reason)
         return found
 
-    def _ask_again(self) -> None:
+    def _request_again(self) -> None:
         """Ask anew for fingers that were left without an answer, since one has ended."""
         if self._lasting.reason in _UNANSWERED:
             self._lasting = _NOTHING

@@ -128,6 +128,24 @@ async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
         assert not energised(far)
 
 
+async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None:
+    """Its amplifiers are open by then; clients are served meanwhile."""
+    hangs = (
+        "import runpy, threading\nfrom controller.loop.decision import Decider\n"
+        "Decider.prepare = lambda decider: threading.Event().wait()\n"
+        f"runpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
+    )
+    async with far_end(tmp_path) as far:
+        journal, program = Journal(far), (sys.executable, "-c", hangs)
+        async with daemon_process(tmp_path, far, program=program, waits=False) as daemon:
+            await until(lambda: journal.entries and daemon.socket.is_socket())
+            async with await daemon.client() as era:
+                await asyncio.sleep(0.2)  # it is being prepared
+                assert (await era.status()).state == "NOT_READY"
+            daemon.process.terminate()
+            assert await daemon.status() == 0
+
+
 def serves(port: int) -> bool:
     """Whether connections are accepted."""
     with socket.socket() as client:

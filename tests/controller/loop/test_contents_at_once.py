@@ -448,35 +448,6 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
         assert felt == {1: None, 2: "nothing is felt there"}
 
 
-@pytest.mark.parametrize("what", ["stop", "lift"])
-@in_virtual_time
-async def test_stop_and_lift_do_not_wait_for_an_answer(
-    what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While one is computed for 0.2 s: silent as soon as without, and what it says is dropped."""
-    loop = answering_after(0.2, monkeypatch)
-    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
-        assert len(fingers.applied) == 1
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.05)  # an answer is being computed
-        assert len(fingers.applied) == 1
-        begin, count = loop.time(), len(fingers.committed)
-        if what == "stop":
-            fingers.witness.operator_command(begin, "stop")
-            stopped = await fingers.controller.stop()
-            assert all(each.is_confirmed for each in stopped.values())
-            assert loop.time() - begin < 0.02
-        else:
-            fingers.at.clear()
-            fingers.report()
-            await asyncio.sleep(0.02)
-            assert fingers.committed[count][2] == ()
-            assert fingers.committed[count][0] - begin < 0.005
-        await fingers.hold(0.5)
-        assert len(fingers.applied) == 1
-        assert len(fingers.committed) <= count + 1
-
-
 @in_virtual_time
 async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
     monkeypatch: pytest.MonkeyPatch,

@@ -4,19 +4,25 @@ A program waits for the threads of asyncio's own pool before it ends, which may 
 a connection or a disk hangs.
 """
 
+import _thread
 import asyncio
 import logging
+import os
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, ParamSpec, TypeVar
 
 CLOSE_TIMEOUT = 0.7
 """Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
 
 _logger = logging.getLogger(__name__)
+_at_work: set[Future[Any]] = set()
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
@@ -29,21 +35,7 @@ async def in_thread(
     opened.
     """
     done: Future[_T] = Future()
-
-    def run() -> None:
-        try:
-            result = work()
-        except Exception as error:
-            with suppress(InvalidStateError):  # cancelled
-                done.set_exception(error)
-            return
-        try:
-            done.set_result(result)
-        except InvalidStateError:
-            if undo is not None:
-                undo(result)
-
-    threading.Thread(target=run, name=name, daemon=True).start()
+    threading.Thread(target=_run, args=(work, done, undo), name=name, daemon=True).start()
     try:
         return await asyncio.wrap_future(done)
     except asyncio.CancelledError:
@@ -51,6 +43,48 @@ async def in_thread(
         if undo is not None and not done.cancelled() and done.exception() is None:
             threading.Thread(target=undo, args=(done.result(),), name=name, daemon=True).start()
         raise
+
+
+def _run(
+    work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
+) -> None:
+    """Note the result of work, or its error; undo: called with that of work that was cancelled."""
+    _at_work.add(done)
+    try:
+        result = work()
+    except Exception as error:
+        with suppress(InvalidStateError):  # cancelled
+            done.set_exception(error)
+        return
+    finally:
+        _at_work.discard(done)
+    try:
+        done.set_result(result)
+    except InvalidStateError:
+        if undo is not None:
+            undo(result)
+
+
+def leave_work() -> None:
+    """End the process at once where work goes on; to be called when all else is closed.
+
+    A library may wait for ever for its own threads if it ends while one is at work.
+    """
+    if _at_work:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+
+
+class DaemonThreads(ThreadPoolExecutor):
+    """A pool for event loops, their own or another, with a daemon thread for each work."""
+
+    def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
+        """Do work at once."""
+        done: Future[_T] = Future()
+        # Not by `threading`, which waits until it runs: a millisecond where that computes.
+        _thread.start_new_thread(_run, (partial(work, *args, **named), done))
+        return done
 
 
 async def close_in_thread(close: Callable[[], object], *, name: str) -> None:

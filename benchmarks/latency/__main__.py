@@ -1,16 +1,20 @@
 """Time from a touch to the bytes on the wires of a real daemon, and what the daemon costs.
 
     python -m benchmarks.latency [--touches N] [--report]
+    python -m benchmarks.latency --fingers [--touches N]
 
 The daemon, floods and programs that load the machine are processes; the panel and the amplifiers,
 behind serial servers, are this one. A touch is sent when the set of the one before has come and no
 other is under way, so that the next set is its own; a case with a planted delay proves that. Six
 minutes. Beside each figure is how busy other programs kept the processors: on a machine that is not
-left alone figures are upper bounds. --report: write docs/measured/latency.md.
+left alone figures are upper bounds. --report: write docs/measured/latency.md. --fingers: instead,
+when ten fingers that land at once in one region are felt, on every rig of the examples, with the
+kernels and without a compiler, and the peak memory of the daemon.
 """
 
 import argparse
 import asyncio
+import math
 import os
 import platform
 import sys
@@ -18,6 +22,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TypeAlias
 
@@ -29,7 +34,7 @@ from benchmarks.setting import use_one_thread
 use_one_thread()  # with two the daemon would compete
 
 from benchmarks.latency import calls, crowd  # noqa: E402
-from benchmarks.latency.machine import OtherLoad, become_device, computed  # noqa: E402
+from benchmarks.latency.machine import OtherLoad, become_device, computed, peak_memory  # noqa: E402
 from benchmarks.latency.session import (  # noqa: E402
     DAEMON,
     Session,
@@ -39,12 +44,24 @@ from benchmarks.latency.session import (  # noqa: E402
     rest_one,
     taps,
 )
+from controller.sources.touch import Touch  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"
 TOUCHES = 300
 PLANTED = 0.02  # s
 _RIGS = {"4 ERAs on 1": "paper_plate", "16 on 4": "table"}
 _PLANTED = (sys.executable, "-m", "benchmarks.latency.planted", PLANTED)
+_WITHOUT_KERNELS = (
+    *(sys.executable, "-c"),
+    "import model.compiled.kernels as compiled\ncompiled.kernels = lambda: None\n"
+    "from controller.cli.main import main\nmain()",
+    "daemon",
+)
+_EXAMPLES = ("paper_plate", "tutorial_rig", "eight_eras", "car_display", "glass_panel", "table")
+_FINGERS_HEAD = (
+    "| rig | kernels | landings | felt after: median, at most | goal | peak memory | other load |\n"
+    "|---" + 6 * "|---" + "|"
+)
 _HEAD = (
     "| case | touches | without a set | sets | median | 99th | maximum | of that amplifiers "
     "| daemon: median | wire | CPU | other load |\n|---" + 11 * "|---" + "|"
@@ -179,6 +196,29 @@ async def further_row(
     return _joined([name, rig, text, goal, f"{others:.2f}"])
 
 
+async def fingers_row(rig: str, count: int, *, has_kernels: bool) -> str:
+    """Let ten fingers land so often in the west half of a plate; returns a row."""
+    program = DAEMON if has_kernels else _WITHOUT_KERNELS
+    load, times = OtherLoad(), list[float]()
+    async with daemon_session(rig, program=program, is_two=True) as session:
+        far = session.far
+        for number in range(count):
+            far.begin()
+            places = [(0.06 + 0.09 * (n % 5), (0.3, 0.7)[n // 5]) for n in range(10)]
+            sent_at = session.touch(*(Touch(10 * number + n, *at) for n, at in enumerate(places)))
+            found = await far.until(lambda: far.playing_since(1), 2.0)
+            times.append(math.inf if found is None else found - sent_at)
+            session.touch()
+            await far.quiet()
+        peak = peak_memory(session.pid)
+    median, most = np.quantile(times, [0.5, 1.0], method="inverted_cdf")
+    kernels, goal = ("yes", "50 ms") if has_kernels else ("no", "300 ms")
+    felt = f"{_ms(median)}, {_ms(most)} ms"
+    return _joined(
+        [rig, kernels, str(count), felt, goal, f"{peak / 1e6:.0f} MB", f"{load.processors():.2f}"]
+    )
+
+
 async def _processor(
     session: Session, act: Callable[[Session, float], Awaitable[None]], seconds: float
 ) -> str:
@@ -225,7 +265,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
     parser.add_argument("--touches", type=int, default=TOUCHES, help="of each case")
     parser.add_argument("--report", action="store_true", help="write docs/measured/latency.md")
+    parser.add_argument("--fingers", action="store_true", help="ten fingers, on every rig")
     options = parser.parse_args()
+    if options.fingers:
+        become_device()
+        print(_FINGERS_HEAD)
+        for rig, has_kernels in product(_EXAMPLES, (True, False)):
+            found = asyncio.run(fingers_row(rig, options.touches, has_kernels=has_kernels))
+            print(found, flush=True)
+        return
     own = calls.table(_RIGS)
     print(own, flush=True)
     note = "" if become_device() else " Real-time priority was not permitted."

@@ -18,9 +18,6 @@ def show_event(event: Notification, *, ahead: float) -> str:
 
 def show_status(status: StatusResult) -> str:
     """Format a status."""
-    silent = status.silence_reason
-    if silent is None and status.state == "READY_TO_SWITCH_ON":
-        silent = "not armed; arm with era arm"
     left = status.lease_left_s
     armed = None if left is None else f"{status.armed_by}, {left:.1f} s left"
     lines = [
@@ -33,7 +30,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
         *_given(("  armed by {}", armed)),
         *map(_contact, status.contacts),
-        *_given(("  silent: {}", silent if status.contacts else None)),
+        *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),
     ]
     lines += [

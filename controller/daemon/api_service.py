@@ -65,11 +65,6 @@ PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
 _ENABLED = DaemonState.OPERATION_ENABLED
-_REMEDIES = {
-    DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
-    DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
-}
-"""Remedies of requests in states that have no remedy of their own."""
 
 
 class ApiService:
@@ -127,7 +122,7 @@ class ApiService:
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.statuses_now(self._controller.table),
-            silence_reason=view.silenced.reason if view.silenced and lease else None,
+            silence_reason=view.silence_reason if operation.state is _ENABLED else None,
             **playing_of(view.applied if operation.state is _ENABLED else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
@@ -331,5 +326,5 @@ def _wrong_state(operation: Operation, code: ErrorCode = ErrorCode.WRONG_STATE) 
         code,
         headline(operation.state.value, operation.cause),
         where="state",
-        remedy=operation.remedy or _REMEDIES.get(operation.state),
+        remedy=operation.next_step,
     )

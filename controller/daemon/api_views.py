@@ -1,6 +1,6 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -27,7 +27,8 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.states import Loss
 from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
-from controller.loop.content import leaks_db_sl
+from controller.loop.content import BEING_CHOSEN, leaks_db_sl
+from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Applied, Silenced
 from controller.loop.plate_set import Drive
 from controller.sources.contacts import Contact, ContactKey
@@ -49,19 +50,44 @@ _VOLTAGE, _HIGH_VOLTAGE = QUANTITIES["voltage"], STATUS_FLAGS["high_voltage"]
 class PlateView:
     """Contacts on the plate and the pattern that plays, as last reported by the control loop.
 
-    effect_of: the effect that plays for a contact; silenced: None while a pattern plays.
+    effect_of: the effect that plays for a contact; silenced: None while a pattern plays; why_not:
+    why a contact feels nothing that these do not say, "" if it shall.
     """
 
     effect_of: Callable[[ContactKey], str | None]
     contacts: tuple[Contact, ...] = ()
     applied: Applied | None = None
     silenced: Silenced | None = None
+    why_not: Callable[[ContactKey], str] = lambda key: ""
 
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts with their roles."""
+        return self._statuses(self.contacts, self.applied or self.silenced)
+
+    @property
+    def silence_reason(self) -> str | None:
+        """Why nothing plays for the contacts of now; None while a pattern plays."""
+        if self.applied is not None:
+            return None
+        reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
+        return "; ".join(filter(None, reasons)) or NO_CONTACTS
+
+    def _statuses(
+        self, contacts: Iterable[Contact], report: Applied | Silenced | None
+    ) -> list[ContactStatus]:
+        reason = ""
+        if isinstance(report, Silenced) and not report.targets:  # as by a failure
+            reason = report.reason
+        known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
-            contact_status(contact, self.applied or self.silenced, self.effect_of(contact.key))
-            for contact in self.contacts
+            contact_status(
+                each,
+                report,
+                self.effect_of(each.key),
+                why_not=self.why_not(each.key)
+                or (reason if (each.key, each.since) in known else BEING_CHOSEN),
+            )
+            for each in contacts
         ]
 
     def statuses_now(self, table: LocalizationTable) -> list[ContactStatus]:
@@ -92,10 +118,7 @@ class PlateView:
         if applied is None:
             return None
         return PatternEvent(
-            contacts=[
-                contact_status(contact, applied, self.effect_of(contact.key))
-                for contact in applied.contacts
-            ],
+            contacts=self._statuses(applied.contacts, applied),
             **playing_of(applied),
             latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
@@ -106,10 +129,7 @@ class PlateView:
         if silenced is None:
             return None
         return SilenceEvent(
-            contacts=[
-                contact_status(contact, silenced, self.effect_of(contact.key))
-                for contact in silenced.contacts
-            ],
+            contacts=self._statuses(silenced.contacts, silenced),
             reason=silenced.reason,
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
         )
@@ -139,9 +159,12 @@ def played_tones(drive: Drive) -> dict[str, PlayedTone]:
 
 
 def contact_status(
-    contact: Contact, report: Applied | Silenced | None, effect: str | None
+    contact: Contact, report: Applied | Silenced | None, effect: str | None, *, why_not: str
 ) -> ContactStatus:
-    """Describe a contact with what it is predicted to feel, and the effect that it was to feel."""
+    """Describe a contact with what it is predicted to feel, and the effect that it was to feel.
+
+    why_not: why it feels nothing of its own, unless it is a target of the report.
+    """
     status: dict[str, object] = {
         "source": contact.key.source,
         "id": contact.key.id,
@@ -149,6 +172,7 @@ def contact_status(
         "y_m": contact.y,
         "effect": effect,
         "load": contact.load,
+        "held_back": why_not,
     }
     if report is not None:
         for felt in report.targets:

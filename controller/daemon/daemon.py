@@ -29,7 +29,7 @@ from drivers import clock
 from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
-from drivers.threads import in_thread
+from drivers.threads import DaemonThreads, in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -92,7 +92,7 @@ class Daemon:
                 what_may_play=self._supervisor.what_may_play,
                 targets=self._publisher.view.targets,
             ),
-            effect_of=self._layout.effect_of,
+            player=self._layout,
             layout=config.layout,
             inputs=lambda: self._inputs.event,
             learning=lambda: None if self.learning is None else self.learning.status,
@@ -158,6 +158,7 @@ class Daemon:
         for amplifiers that do not fit the configuration.
         """
         loop = asyncio.get_running_loop()
+        loop.set_default_executor(DaemonThreads())
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
         loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)

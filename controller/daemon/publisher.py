@@ -9,7 +9,13 @@ from functools import partial
 
 import numpy as np
 
-from controller.api.schema import AmplifierStatus, LatencySummary, LearningSummary, PlateEvent
+from controller.api.schema import (
+    STATE_WORDS,
+    AmplifierStatus,
+    LatencySummary,
+    LearningSummary,
+    PlateEvent,
+)
 from controller.api.topics import (
     AmplifiersEvent,
     Hub,
@@ -18,12 +24,14 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
+    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
 from controller.daemon.operation import LinkChange
 from controller.daemon.states import DaemonState, Operation
 from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
@@ -37,9 +45,9 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
-    operation: of the plate; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; layout: the surface layout; inputs: state of the touch inputs;
-    learning: what is learned of the plate, None where nothing is to be.
+    operation: of the plate; amplifiers: their statuses; player: of effects; layout: the surface
+    layout; inputs: state of the touch inputs; learning: what is learned of the plate, None where
+    nothing is to be.
     """
 
     def __init__(
@@ -47,12 +55,13 @@ class EventPublisher:
         *,
         operation: Callable[[], Operation],
         amplifiers: Callable[[], list[AmplifierStatus]],
-        effect_of: Callable[[ContactKey], str | None],
+        player: EffectPlayer,
         layout: SurfaceLayout | None,
         inputs: Callable[[], InputsEvent],
         learning: Callable[[], LearningStatus | None],
     ) -> None:
-        self.view = PlateView(effect_of)
+        self.view = PlateView(player.effect_of, why_not=self._why_not)
+        self._player = player
         self.latencies = LatencyStatistics()  # of touches alone
         self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
@@ -90,15 +99,26 @@ class EventPublisher:
     def state_changed(self, old: Operation, new: Operation) -> None:
         """Publish a transition; outside OPERATION_ENABLED nothing plays, because of the state."""
         self.hub.publish("state", lambda: _state_event(old, new))
-        view = self.view
         if new.state is DaemonState.OPERATION_ENABLED:
             return
         # The control loop does not report the end of what others have silenced.
-        was_playing, view.applied = view.applied is not None, None
-        silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
-        view.silenced = None if new.state is DaemonState.SWITCHED_ON else silenced  # decided next
-        if was_playing:
-            self.hub.publish("silence", view.silence_event)
+        applied, self.view.applied, self.view.silenced = self.view.applied, None, None
+        if applied is not None:
+            silence = SilenceEvent(
+                contacts=self.view.contact_statuses(),
+                reason=new.cause,
+                latency_ms=None,
+            )
+            self.hub.publish("silence", lambda: silence)
+
+    def _why_not(self, key: ContactKey) -> str:
+        """Why a contact feels nothing of its own that the control loop has not reported."""
+        operation = self._operation()
+        if operation.state is not DaemonState.OPERATION_ENABLED:
+            return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
+        if operation.degraded:
+            return f"{operation.cause}; {operation.remedy}"
+        return self._player.why_not(key)
 
     def layout_changed(self, layout: SurfaceLayout | None) -> None:
         """Publish another surface layout; None for the same effect everywhere."""

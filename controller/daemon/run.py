@@ -1,6 +1,7 @@
 """`era daemon`: from a configuration file to a running daemon."""
 
 import asyncio
+import atexit
 import logging
 import resource
 import signal
@@ -18,6 +19,7 @@ from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.gateway.settings import require_gateway
 from drivers.errors import DriverError
+from drivers.threads import leave_work
 from drivers.trace import tracing
 from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
@@ -72,6 +74,7 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         log = start_log(config.log_file, level=config.section.log.level)
         stack.callback(log.close)
         _run(config, lock, log=log, dashboard=address or _page_of_file(config))
+    atexit.register(leave_work)
 
 
 def _page_of_file(config: DaemonConfig) -> str | None:

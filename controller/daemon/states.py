@@ -55,6 +55,12 @@ class DaemonState(StrEnum):
     COMM_LOST = "COMM_LOST"
 
 
+_NEXT_STEPS = {
+    DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
+    DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
+}
+
+
 class Trigger(Enum):
     """Kinds of events."""
 
@@ -144,6 +150,11 @@ class Operation:
     degraded: tuple[str, ...] = ()
     lease: Lease | None = None
     epoch: int = 0
+
+    @property
+    def next_step(self) -> str | None:
+        """What to do so that something can play: the remedy, or what a state without one needs."""
+        return self.remedy or _NEXT_STEPS.get(self.state)
 
     def lease_at(self, now: float) -> Lease | None:
         """The lease, unless it has expired at a time [s]."""

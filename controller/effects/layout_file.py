@@ -1,5 +1,6 @@
 """The file of a surface layout: read, checked, and a kind of configuration for `era config`."""
 
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,7 @@ from model.rig.sections import Identifier
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
-_MAX_REGIONS = 256
+_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 
 
 class RegionSection(ShapedSection, TunedSection):
@@ -38,7 +39,9 @@ class RegionSection(ShapedSection, TunedSection):
 class LayoutSection(Section):
     """A surface layout."""
 
-    effects: Annotated[dict[Identifier, dict[str, Any]], Field(max_length=64, default_factory=dict)]
+    effects: Annotated[
+        dict[Identifier, dict[str, Any]], Field(max_length=_MAX_EFFECTS, default_factory=dict)
+    ]
     regions: Annotated[
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
@@ -62,7 +65,7 @@ def layout_of(
     _check_kind(document)
     validation = Validation(document, LayoutSection)
     effects = _effects(validation, level_db_sl)
-    for name in validation.mapping(("regions",)):
+    for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
     _check_use(validation, ("elsewhere",), elsewhere, effects, is_for_motion=None)
@@ -93,9 +96,10 @@ def _check_kind(document: Document) -> None:
 def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[str, Effect | None]:
     """Return effects by name, with the default ones; None for an invalid one."""
     effects: dict[str, Effect | None] = {**default_effects(level_db_sl)}
-    for name, parameters in validation.mapping(("effects",)).items():
+    own = validation.mapping(("effects",))
+    effects |= dict.fromkeys(own)
+    for name, parameters in islice(own.items(), _MAX_EFFECTS):
         path = ("effects", name)
-        effects[name] = None
         if not isinstance(parameters, dict):
             continue  # reported with the section of the layout
         kind = parameters.get("kind", name)

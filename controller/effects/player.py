@@ -73,6 +73,7 @@ class EffectPlayer:
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
         self._waiting: dict[ContactKey, Pulse] = {}  # short ones before their turn
+        self._sensing = self._targets = self._felt = frozenset[ContactKey]()  # of the last intent
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
@@ -99,9 +100,12 @@ class EffectPlayer:
             if target.key in waiting and target.is_short:
                 self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
+        self._sensing = frozenset([contact.key for _, _, contact, _ in felt])
+        self._targets = frozenset([each.key for each in targets])
+        self._felt = frozenset([each.key for each in now_felt])
         return HapticIntent(
             now_felt,
-            "" if now_felt else self._reason,
+            "" if now_felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
             until=min(ends, default=None),
             protected=frozenset(
                 [
@@ -112,15 +116,23 @@ class EffectPlayer:
             ),
         )
 
-    @property
-    def _reason(self) -> str:
-        """Why nothing is felt, if that is so."""
-        ended = dict.fromkeys(each.ended for each in self._fingers.values() if each.ended)
-        if ended:
-            return (
-                f"{' and '.join(ended)} ended, no other effect plays for the contacts on the plate"
-            )
-        return "no effect plays for the contacts on the plate"
+    def why_not(self, key: ContactKey) -> str:
+        """Return why a finger shall feel nothing by the last intent, "" if it shall."""
+        finger = self._fingers.get(key)
+        if finger is None or key in self._felt:
+            return ""
+        name = finger.plays[-1].name if finger.plays else ""
+        if key in self._waiting:
+            return f"{name} waits for its turn after those of other fingers"
+        if key in self._targets:
+            return f"{name} came too soon after those of other fingers; touch there again"
+        if key in self._sensing:
+            return f"{name} is felt by the newest finger outside of all regions; lift that one"
+        if name:
+            return f"{name} is not felt at rest; move the finger"
+        if finger.ended:
+            return f"{finger.ended} ended; touch there again"
+        return "no effect plays there; touch again, in a region that has one"
 
     def replace(self, layout: SurfaceLayout) -> None:
         """Play another layout from now on; fingers that rest feel no press of it.

@@ -1,59 +1,79 @@
-"""A thread for answers that take longer than the control loop may."""
+"""Threads for answers that take longer than the control loop may.
+
+An answer that hangs cannot be ended, only left behind: its thread holds up neither the next answer
+nor the end of the process, and what it returns at last is dropped.
+"""
 
 import asyncio
+import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Generic, TypeVar
+
+from drivers.threads import DaemonThreads
 
 T = TypeVar("T")
 
-_TIME_LIMIT = 1.0  # s; an answer takes some tens of milliseconds
+TIME_LIMIT = 1.0
+"""Time [s] after which an answer is given up; it takes some tens of milliseconds."""
+
+MAX_LATE = 2
+"""Answers that may still be computed after they were given up; until one ends none is begun."""
+
+_logger = logging.getLogger(__name__)
 
 
 class AnswerThread(Generic[T]):
-    """One thread that answers one question at a time.
+    """Answers one question at a time, each in a thread, until it has come or is given up.
 
-    arrived: called in the loop when there is something to `take`, or an answer is 1 s late.
+    arrived: called in the loop when there is something to `take`; freed: when an answer that was
+    given up has ended, before that.
     """
 
-    def __init__(self, arrived: Callable[[], None]) -> None:
-        self._arrived = arrived
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="answers")
+    def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
+        self._arrived, self._freed = arrived, freed
+        self._threads = DaemonThreads()
         self._answer: asyncio.Future[T] | None = None
         self._limit: asyncio.TimerHandle | None = None
-        self._is_late = False
+        self._late = set[asyncio.Future[T]]()  # given up, and still computed
 
     @property
     def is_busy(self) -> bool:
-        """Whether an answer is not taken yet: until then no other may use the table."""
+        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
         return self._answer is not None
 
-    def compute(self, question: Callable[[], T]) -> None:
-        """Compute in the thread, which must not be busy."""
+    @property
+    def is_blocked(self) -> bool:
+        """Whether too many answers that were given up are still computed."""
+        return len(self._late) >= MAX_LATE
+
+    def compute(self, question: Callable[[], T], *, instead: T) -> None:
+        """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
         loop = asyncio.get_running_loop()
-        self._answer = loop.run_in_executor(self._pool, question)
-        self._answer.add_done_callback(lambda _: self._arrived())
-        self._limit = loop.call_later(_TIME_LIMIT, self._late)
+        self._answer = loop.run_in_executor(self._threads, question)
+        self._answer.add_done_callback(self._note)
+        self._limit = loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
 
     def take(self) -> T | None:
-        """Return the answer that was not taken yet; None without any; raises its error.
-
-        Raises TimeoutError while an answer has been computed for more than 1 s.
-        """
+        """Return the answer that was not taken yet; None without any; raises its error."""
         answer = self._answer
-        if answer is None:
+        if answer is None or not answer.done():
             return None
-        if not answer.done():
-            if self._is_late:
-                raise TimeoutError(
-                    f"answer must take less than {_TIME_LIMIT:g} s, is still computed"
-                )
-            return None
-        self._answer, self._is_late = None, False
+        self._answer = None
         if self._limit is not None:
             self._limit.cancel()
         return None if answer.cancelled() else answer.result()
 
-    def _late(self) -> None:
-        self._is_late = True
+    def _give_up(self, answer: "asyncio.Future[T]", instead: T) -> None:
+        if not answer.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._late.add(answer)
+            self._answer = asyncio.get_running_loop().create_future()
+            self._answer.set_result(instead)
+            self._arrived()
+
+    def _note(self, answer: "asyncio.Future[T]") -> None:
+        if answer in self._late:
+            self._late.remove(answer)
+            answer.exception()  # of no interest any more
+            self._freed()
         self._arrived()

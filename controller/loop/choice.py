@@ -114,10 +114,7 @@ class Chooser:
         if left.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
-        if not limited.contents:
-            silent = _silent(targets, limited.quiet, _USED_UP)
-            limited = replace(silent, protected=requested.protected)
-        return limited, True
+        return limited if limited.contents else silent(requested, targets, _USED_UP), True
 
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
@@ -161,7 +158,7 @@ class Chooser:
             else:
                 _logger.error("loop: table failed, silencing its targets", exc_info=error)
                 reason = failure_text(error)
-            found = _silent(targets, quiet, reason)
+            found = silent(requested, targets, reason)
         return replace(found, protected=requested.protected)
 
     def _alone(
@@ -185,12 +182,13 @@ class Chooser:
         leak = -math.inf if promised is None else felt - promised
         if requested.protected - {key} and leak > IMPERCEPTIBLE_DB_SL:
             reason = f"a protected finger would notice it, up to {leak:.1f} dB SL; {_QUIETER}"
-            return _silent(targets, quiet, reason)
+            return silent(requested, targets, reason)
         if felt < 0:
             is_beside = bool(_contents(beside))
             is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
             if change < 0 or (is_beside and not is_heard):
-                return _silent(targets, quiet, _USED_UP if is_beside else LIMITS_LEAVE_NOTHING)
+                reason = _USED_UP if is_beside else LIMITS_LEAVE_NOTHING
+                return silent(requested, targets, reason)
         others = sum_db(heard) if heard else None
         if others is not None:
             promised = min(math.inf if promised is None else promised, felt - others)
@@ -256,7 +254,20 @@ def _contents(parts: Iterable[Selection]) -> list[Content]:
     return [content for part in parts for content in part.contents]
 
 
-def _silent(targets: Targets, quiet: tuple[Contact, ...], reason: str) -> Selection:
+def unanswered(requested: Requested, reason: str) -> Chosen:
+    """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
+    none = silent(requested, requested.lasting or (), reason)
+    return Chosen(
+        replace(requested, triggered_at=math.inf),
+        None if requested.is_rested else none,
+        {each[0].key: silent(requested, (each,), reason) for each in requested.short},
+        is_limited=False,
+    )
+
+
+def silent(requested: Requested, targets: Targets, reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
+    keys = {contact.key for contact, _ in targets}
+    quiet = tuple([each for each in requested.contacts if each.key not in keys])
     skipped = tuple(not_served(contact, reason) for contact, _ in targets)
-    return Selection(targets, quiet, (), reason, skipped)
+    return Selection(targets, quiet, (), reason, skipped, protected=requested.protected)

@@ -19,6 +19,8 @@ Targets = tuple[tuple[Contact, Target], ...]
 
 OWN, SHARED, HELD_BACK = "own", "shared", "held back"
 
+BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
+
 
 @dataclass(frozen=True)
 class Prediction:

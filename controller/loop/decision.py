@@ -28,7 +28,10 @@ from registry.plugins import failure_text
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
-ENDED = "the vibration has ended by itself: it was not renewed, or a limit of time was reached"
+ENDED = (
+    "the vibration has ended by itself: it was not renewed, or a limit of time was reached; touch "
+    "there again"
+)
 
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
@@ -116,7 +119,7 @@ class Decider:
         self._selector.chooser = Chooser(table, timing.levels, self._builder.shape)
 
     def prepare(self) -> None:
-        """Precompute what the first touch would have to wait for; tens of milliseconds.
+        """Precompute what the first touch would have to wait for; seconds, of a large rig.
 
         Raises InputError for a table that has no pattern for these amplifiers.
         """

@@ -84,6 +84,13 @@ class Target:
     modulation_hz: float | None = None
 
     @property
+    def shared_as(self) -> str | bool | None:
+        """Equal for contacts that may feel one vibration that lasts; None for its own alone."""
+        if self.is_short or self.is_own:
+            return None
+        return self.may_share or self.content
+
+    @property
     def is_short(self) -> bool:
         """Whether it ends before a shaped onset would have settled."""
         return self.pulse is not None and self.pulse.duration < SHAPED_FROM

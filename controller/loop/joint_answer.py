@@ -305,7 +305,10 @@ def _content(
             contact,
             layer.promised_level_db_sl + change,
             verdict=layer.verdict,
-            held_back=None if layer is served[0][2] else f"shares the content of {first.key}",
+            held_back=None
+            if layer is served[0][2]
+            else f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or "
+            "move them apart",
             promised_contrast_db=layer.promised_contrast_db,
             foreign_level_db_sl=_changed(layer.foreign_level_db_sl, change),
             frequency=layer.frequency,

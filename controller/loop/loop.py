@@ -185,7 +185,7 @@ class Controller:
                 timing=self._timing,
                 arrived=self._wake.set,
             )
-            decider.prepare()
+            await asyncio.to_thread(decider.prepare)  # seconds, of a large rig
         except BaseException as error:
             if not isinstance(error, LinkError):
                 await self.release()

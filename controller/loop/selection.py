@@ -4,17 +4,26 @@ One question is answered at a time, with the fingers as they are when the one be
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 
-from controller.loop.answer_thread import AnswerThread
+from controller.loop.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db
-from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
+from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
+from controller.loop.content import (
+    BEING_CHOSEN,
+    Prediction,
+    Selection,
+    Targets,
+    no_layer_free,
+    not_served,
+)
 from controller.loop.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
+from model.table.answer import MAX_SEPARATE
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
@@ -22,6 +31,14 @@ MOVE_TOLERANCE = 0.008
 
 # s; a finger that has not moved further for so long rests, and contents are chosen anew for it.
 _RESTS_AFTER = 0.1
+
+GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
+BLOCKED = (
+    f"{MAX_LATE} answers are still computed that took more than {TIME_LIMIT:g} s; touch with one "
+    "finger, and restart the daemon if it lasts"
+)
+
+_UNANSWERED = (GIVEN_UP, BLOCKED)
 
 _NOTHING = Selection((), ())
 
@@ -89,8 +106,10 @@ class Selector:
     a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
     targets and their levels do, no contact has moved more than 8 mm, and none has another load,
     which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
-    others as they are: a change would be felt. chooser: answers the next question; what the thread
-    computes goes on by the former one. arrived: called when the thread is done.
+    others as they are: a change would be felt. An answer that takes too long is given up: all that
+    lasts is silent until its fingers change, or until that answer has ended at last. chooser:
+    answers the next question; what the thread computes goes on by the former one. arrived: called
+    when the thread is done.
     """
 
     def __init__(
@@ -100,7 +119,7 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self.chooser = chooser
-        self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
+        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._request_again)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -161,16 +180,27 @@ class Selector:
             for requested in self._to_request(
                 intended, pulses, triggered_at, has_waited=arrived is not None
             ):
-                if requested.takes_long:
-                    self._thread.compute(partial(chooser.choose, requested, capabilities))
-                else:
+                if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities))
+                elif self._thread.is_blocked:
+                    self._take(unanswered(requested, BLOCKED))
+                else:
+                    self._thread.compute(
+                        partial(chooser.choose, requested, capabilities),
+                        instead=unanswered(requested, GIVEN_UP),
+                    )
             self._waits_since = math.inf
         parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
-            found = replace(found, is_pending=True)
+            reason = found.reason or (None if found.contents else BEING_CHOSEN)
+            found = replace(found, is_pending=True, reason=reason)
         return found
+
+    def _request_again(self) -> None:
+        """Ask anew for fingers that were left without an answer, since one has ended."""
+        if self._lasting.reason in _UNANSWERED:
+            self._lasting = _NOTHING
 
     def _to_request(
         self,
@@ -228,6 +258,8 @@ class Selector:
         do again, since a finger that came has lifted meanwhile.
         """
         found = chosen.lasting
+        if found is not None and found.reason in _UNANSWERED:
+            return True  # in doubt nothing plays
         return (
             found is not None
             and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
@@ -241,6 +273,8 @@ class Selector:
         self._short = {**self._short, **chosen.short}
         if chosen.lasting is not None and not is_late:
             self._lasting = chosen.lasting
+            if self._lasting.reason in _UNANSWERED:
+                self.due = math.inf
             if chosen.is_limited:
                 ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER
@@ -302,7 +336,10 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
 def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
 ) -> tuple[Targets, tuple[Prediction, ...]]:
-    """Leave out targets for which there is no layer: of the lowest priority, then the earliest."""
+    """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
+
+    Many that may share have one layer together.
+    """
     mode = capabilities.drive_mode
     count = capabilities.layers if mode == UNRESTRICTED else 1
     if len(targets) <= count:
@@ -310,8 +347,17 @@ def _within_layers(
     reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
     if mode == UNRESTRICTED:
         reason = no_layer_free(count)
-    order = sorted(range(len(targets)), key=lambda at: (targets[at][1].priority, at), reverse=True)
-    served = {*order[:count]}
+    sharing = Counter([target.shared_as for _, target in targets])
+    layers: list[str | bool | None] = []
+    served = set[int]()
+    for at in sorted(range(len(targets)), key=lambda n: (targets[n][1].priority, n), reverse=True):
+        name = targets[at][1].shared_as
+        is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
+        if is_one and name in layers:
+            served.add(at)
+        elif len(layers) < count:
+            layers.append(name)
+            served.add(at)
     return (
         tuple(each for at, each in enumerate(targets) if at in served),
         tuple(

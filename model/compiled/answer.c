@@ -128,8 +128,8 @@ SHARED void worst_ratios(float *worst, const int *combinations, int count, size_
 /* A tone of each content, of all combinations that exchange bands and are apart, else of all that exchange bands. */
 SHARED int best_combination(int *chosen_tones, const candidates *from, const judged *every, const plates *on,
                             const rules *by, const question *of, arena *memory) {
-    const int contents = of->contents, most = by->max_combinations;
-    const size_t each = (size_t)of->bands * 2 * (by->candidates + contents / 2); /* tones of a content */
+    const int contents = of->contents, most = of->combinations;
+    const size_t each = (size_t)of->bands * 2 * of->candidates; /* tones of a content */
     const size_t room = each > (size_t)most ? each : (size_t)most;
     const arena mark = *memory;
     int *content_of = integers(memory, on->k), *kept = integers(memory, room * contents);
@@ -200,7 +200,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
         const int kept = ranked_rows(some, on, by, of, memory);
         if (kept && kept < count) rows = some, count = kept;
     }
-    const size_t most = contents * of->bands * 2 * (by->candidates + contents / 2);
+    const size_t most = contents * of->bands * 2 * of->candidates;
     candidates from = {0, integers(memory, most), integers(memory, most), integers(memory, most), floats(memory, most),
                        floats(memory, 2 * most * n)};
     int is_limited = find_candidates(&from, on, by, of, rows, count, memory);
@@ -256,6 +256,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     plates on = *table;
     on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness;
     question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
+                   .candidates = given->candidates, .combinations = given->combinations,
                    .apart = given->apart, .level = given->level, .background = given->background, .judging = given->judging,
                    .promise = given->promise, .few = read->few, .fine = read->fine, .few_points = at.few,
                    .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};

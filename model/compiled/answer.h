@@ -11,8 +11,7 @@
 /* How tones are chosen: constants of `model.table.contents` and of the searches. */
 typedef struct {
     int kept, missing;             /* frequencies that are ranked first, and how many of these may miss the level */
-    int max_by_point, candidates;  /* other fingers whose points count one by one; best tones of a content */
-    int max_combinations, pruning_step;
+    int max_by_point, pruning_step; /* other fingers whose points count one by one; of the plates that judge first */
     int rim_count, is_deep, others; /* points of the rim; deep nulls; plates of other thickness */
     float gain_variance, ridge, margin, highest;
     float reached;
@@ -26,6 +25,7 @@ typedef struct {
 /* Fingers (k) and contents, as given. */
 typedef struct {
     int contents, bands, fingers, quiet_count;
+    int candidates, combinations; /* best tones of a content in a band; of these, those kept */
     float apart;                /* of frequencies [Hz] */
     const int *numbers;         /* (contents + 1) starts of targets; these and quiet ones, by finger; (contents)
                                  * priorities; (contents, bands, 2) first row of a band and one past the last */
@@ -38,7 +38,7 @@ typedef struct {
 
 /* The same with what is found first. */
 typedef struct {
-    int contents, bands, quiet_count, is_ranked; /* see `ranked_rows` */
+    int contents, bands, quiet_count, candidates, combinations, is_ranked; /* see `ranked_rows` */
     float apart;
     const int *starts, *targets, *quiet, *priority;
     const float *level, *background;

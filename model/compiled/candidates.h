@@ -213,7 +213,7 @@ SHARED float highest_level(searched *blocks, const rules *by, const int *all, in
 SHARED void keep_apart(candidates *to, const rows_found *found, const rules *by, const question *of, int content, int band,
                        const int *rows, int first, int end, size_t n, arena *memory) {
     const arena mark = *memory;
-    const int most = by->candidates + (of->contents > 1 ? of->contents / 2 : 0), start = to->count;
+    const int most = of->candidates, start = to->count;
     int *order = integers(memory, end - first);
     best_first(order, found->score + first, end - first, memory);
     for (int i = 0; i < end - first && to->count - start < most; i++) {

@@ -225,22 +225,32 @@ SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
     for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, 1);
 }
 
-/* x = R^-1 c of a positive Hermitian R (n, n), of which the upper triangle is given and lost. */
-SHARED void solve_positive(value *restrict x, value *restrict R, const value *restrict c, size_t n) {
-    memcpy(x, c, n * sizeof(value));
+/* Factors of a positive Hermitian R (n, n), of which the upper triangle is given, in its place; a pivot's inverse is the
+ * imaginary part of its diagonal. */
+SHARED void factorise(value *restrict R, size_t n) {
     for (size_t s = 0; s < n; s++) {
         const value *from = R + s * n;
-        lanes pivot = inverse(from[s].re);
+        const lanes pivot = inverse(from[s].re);
         for (size_t u = s + 1; u < n; u++) {
             value by = {from[u].re * pivot, -from[u].im * pivot};
             for (size_t v = u; v < n; v++) R[u * n + v] = subtract_product(R[u * n + v], by, from[v]);
-            x[u] = subtract_product(x[u], by, x[s]);
         }
+        R[s * n + s].im = pivot;
     }
+}
+
+/* x = R^-1 x of R as `factorise` leaves it. */
+SHARED void solve_factorised(value *restrict x, const value *restrict R, size_t n) {
+    for (size_t s = 0; s < n; s++)
+        for (size_t u = s + 1; u < n; u++) {
+            const value from = R[s * n + u];
+            const lanes pivot = R[s * n + s].im;
+            x[u] = subtract_product(x[u], (value){from.re * pivot, -from.im * pivot}, x[s]);
+        }
     for (size_t s = n; s-- > 0;) {
         value own = x[s];
         for (size_t u = s + 1; u < n; u++) own = subtract_product(own, R[s * n + u], x[u]);
-        x[s] = scaled(own, inverse(R[s * n + s].re));
+        x[s] = scaled(own, R[s * n + s].im);
     }
 }
 

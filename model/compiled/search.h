@@ -12,7 +12,7 @@ typedef struct {
 
 /* How phases of several targets are aligned. */
 typedef struct {
-    int starts, iterations; /* of every target but the first; from each start */
+    int starts, iterations, again; /* targets whose own optimum gives a start; from each; from the step before */
 } phases;
 
 /* LANES frequencies; points: of each quiet form, which count one by one, 0 for none. */
@@ -114,69 +114,86 @@ INLINE void weighted(value *restrict R, const searched *on, const lanes *share) 
     }
 }
 
-/* Weights w of largest magnitude 1 of the least power R, which is lost, and their bound. */
-SHARED lanes least_power(value *restrict w, value *restrict R, const searched *on, arena *memory) {
-    const size_t n = on->n, targets = on->targets;
+/* w (n) = sum of columns (targets, n), each times a factor, scaled to a largest magnitude of 1. */
+SHARED void weigh(value *restrict w, const value *columns, const value *factor, size_t targets, size_t n) {
+    lanes most = {0};
+    for (size_t u = 0; u < n; u++) {
+        w[u] = ZERO;
+        for (size_t t = 0; t < targets; t++) w[u] = add_product(w[u], columns[t * n + u], factor[t]);
+        most = larger(most, power(w[u]));
+    }
+    most = inverse(larger(root(most), filled(LEAST)));
+    for (size_t u = 0; u < n; u++) w[u] = scaled(w[u], most);
+}
+
+/* Raised by a gain up to full stroke. */
+INLINE value saturated(value w, float gain) { return scaled(w, inverse(larger(root(power(w)), filled(1 / gain)))); }
+
+/* Set phases of factors (targets) to those of what they reach, and raise that of a weaker target, step by step; the best,
+ * by what the weakest target gets per root of the power. With a gain above 1 by the level of weights w (n) raised by it. */
+SHARED void align(value *restrict best, lanes *highest, value *restrict factor, value *restrict w, float gain, int steps,
+                  const value *gram, const value *columns, const searched *on) {
+    const size_t targets = on->targets, n = on->n;
+    const int is_raised = gain > 1;
+    value reached[targets];
+    lanes size[targets];
+    for (int step = 0; step < steps; step++) {
+        lanes weakest = filled(INFINITY), cost = {0}, most = {0};
+        if (is_raised) weigh(w, columns, factor, targets, n);
+        for (size_t u = 0; is_raised && u < n; u++) w[u] = saturated(w[u], gain);
+        for (size_t t = 0; t < targets; t++) {
+            reached[t] = is_raised ? field(on->target + t * n, w, n) : field(gram + t * targets, factor, targets);
+            size[t] = larger(root(power(reached[t])), filled(LEAST_FIELD));
+            weakest = smaller(weakest, size[t]);
+            cost += factor[t].re * reached[t].re + factor[t].im * reached[t].im;
+        }
+        const lanes found = is_raised ? weakest : weakest / root(larger(cost, filled(LEAST)));
+        const mask better = found > STABLE * *highest;
+        *highest = chosen(better, found, *highest);
+        for (size_t t = 0; t < targets; t++) {
+            best[t].re = chosen(better, factor[t].re, best[t].re);
+            best[t].im = chosen(better, factor[t].im, best[t].im);
+            reached[t] = scaled(reached[t], inverse(size[t]));
+            size[t] = root(power(factor[t])) / size[t];
+            most = larger(most, size[t]);
+        }
+        for (size_t t = 0; t < targets; t++) factor[t] = scaled(reached[t], size[t] / most);
+    }
+}
+
+/* Weights w of largest magnitude 1 of the least power R, which is lost, and their bound: w = R^-1 sum of conj(target)
+ * times a factor. best (targets): factors to start from, but for a first step, and as found; gain: as of `align`. */
+SHARED lanes least_power(value *restrict w, value *restrict R, value *restrict best, int is_first, float gain,
+                         const searched *on, arena *memory) {
+    const size_t n = on->n, targets = on->targets, most_starts = on->phases.starts;
+    const size_t starts = !is_first ? 1 : targets < most_starts ? targets : most_starts;
     const arena mark = *memory;
-    value *c = values(memory, n), *some = values(memory, targets > 1 ? n * n : 0);
-    size_t starts = 1;
-    for (size_t t = 1; t < targets; t++) starts *= on->phases.starts;
-    const size_t steps = targets > 1 ? on->phases.iterations : 1;
-    value *tried = values(memory, starts * steps * n), *factor = values(memory, targets);
-    lanes *reached = take(memory, starts * steps * sizeof(lanes)), highest = {0};
-    for (size_t start = 0; start < starts; start++) {
-        size_t rest = start;
-        for (size_t t = targets; t-- > 0; rest /= on->phases.starts) {
-            double angle = t ? 2 * M_PI * (double)(rest % on->phases.starts) / on->phases.starts : 0;
-            factor[t] = (value){filled((float)cos(angle)), filled((float)sin(angle))};
-            if (!t) break;
-        }
-        for (size_t step = 0; step < steps; step++) {
-            const size_t at = step * starts + start;
-            value *own = tried + at * n;
-            memset(c, 0, n * sizeof(value));
-            for (size_t t = 0; t < targets; t++)
-                for (size_t u = 0; u < n; u++) c[u] = add_conjugate_product(c[u], on->target[t * n + u], factor[t]);
-            if (targets > 1) memcpy(some, R, n * n * sizeof(value));
-            solve_positive(own, targets > 1 ? some : R, c, n);
-            if (targets == 1) {
-                value sum = ZERO;
-                for (size_t u = 0; u < n; u++) sum = add_conjugate_product(sum, c[u], own[u]);
-                reached[at] = root(root(power(sum)));
-                break;
-            }
-            lanes weakest = filled(INFINITY), mean = {0};
-            value at_targets[targets];
-            for (size_t t = 0; t < targets; t++) {
-                at_targets[t] = field(on->target + t * n, own, n);
-                lanes size = larger(root(power(at_targets[t])), filled(LEAST_FIELD));
-                weakest = smaller(weakest, size), mean += size / (float)targets;
-            }
-            for (size_t t = 0; t < targets; t++) {
-                lanes size = larger(root(power(at_targets[t])), filled(LEAST_FIELD));
-                lanes lacking = root(power(factor[t])) * root(mean / size) / size;
-                factor[t] = scaled(at_targets[t], lacking);
-            }
-            reached[at] = weakest / root(larger(expected(R, own, n), filled(LEAST)));
+    value *columns = values(memory, targets * n), *gram = values(memory, targets * targets);
+    value *factor = values(memory, targets);
+    lanes highest = {0};
+    factorise(R, n);
+    for (size_t t = 0; t < targets; t++) {
+        value *column = columns + t * n;
+        for (size_t u = 0; u < n; u++) column[u].re = on->target[t * n + u].re, column[u].im = -on->target[t * n + u].im;
+        solve_factorised(column, R, n);
+        for (size_t u = 0; u <= t; u++) {
+            const value found = field(on->target + u * n, column, n);
+            gram[u * targets + t] = found;
+            gram[t * targets + u] = (value){found.re, u < t ? -found.im : ZERO.im};
         }
     }
-    for (size_t at = 0; at < starts * steps; at++) highest = larger(highest, reached[at]);
-    mask open = highest == highest;
-    lanes bound = {0}, most = {0};
-    for (size_t at = 0; at < starts * steps; at++) {
-        mask chosen_here = open & (reached[at] >= highest * (2 - STABLE));
-        bound = chosen(chosen_here, reached[at], bound);
-        for (size_t u = 0; u < n; u++) {
-            w[u].re = chosen(chosen_here, tried[at * n + u].re, at ? w[u].re : ZERO.re);
-            w[u].im = chosen(chosen_here, tried[at * n + u].im, at ? w[u].im : ZERO.re);
+    if (targets == 1) best[0] = (value){filled(1), ZERO.im}, highest = root(gram[0].re);
+    for (size_t start = 0; start < starts && targets > 1; start++) {
+        for (size_t t = 0; t < targets; t++) {
+            const value own = is_first ? gram[t * targets + start * targets / starts] : best[t];
+            factor[t] = is_first ? scaled(own, inverse(larger(root(power(own)), filled(LEAST_FIELD)))) : own;
+            if (!start) best[t] = factor[t];
         }
-        open &= ~chosen_here;
+        align(best, &highest, factor, w, gain, is_first ? on->phases.iterations : on->phases.again, gram, columns, on);
     }
-    for (size_t u = 0; u < n; u++) most = larger(most, power(w[u]));
-    lanes size = inverse(larger(root(most), filled(LEAST)));
-    for (size_t u = 0; u < n; u++) w[u] = scaled(w[u], size);
+    weigh(w, columns, best, targets, n);
     release(memory, mark);
-    return bound;
+    return highest;
 }
 
 /* The best of as many weights as a method has steps. */
@@ -184,6 +201,7 @@ SHARED void search(best *to, const searched *on, const method *by, arena *memory
     const size_t n = on->n, q = constraints(on);
     const arena mark = *memory;
     value *w = values(memory, n), *fitting = values(memory, n), *R = values(memory, n * n);
+    value *factors = values(memory, on->targets);
     lanes *share = take(memory, q * sizeof(lanes)), *found = take(memory, q * sizeof(lanes));
     lanes *multiplier = take(memory, n * sizeof(lanes)), limit = {0};
     for (size_t i = 0; i < q; i++) share[i] = filled(1 / (float)q);
@@ -194,16 +212,14 @@ SHARED void search(best *to, const searched *on, const method *by, arena *memory
         weighted(R, on, share);
         for (size_t u = 0; u < n; u++)
             R[u * n + u] = (value){R[u * n + u].re * (1 + by->variance) + multiplier[u], ZERO.im};
-        to->bound = smaller(to->bound, least_power(w, R, on, memory));
+        to->bound = smaller(to->bound, least_power(w, R, factors, step == 0, by->gain, on, memory));
         lanes least;
         if (by->limited) {
             lanes amp = amplitude(&least, on, w);
             lanes gain = by->reserve * on->wanted / larger(least, 0.1f * amp + LEAST_FIELD);
             for (size_t u = 0; u < n; u++) w[u] = scaled(w[u], gain);
         }
-        const float full = by->gain;
-        for (size_t u = 0; u < n; u++)
-            fitting[u] = full ? scaled(w[u], inverse(larger(root(power(w[u])), filled(1 / full)))) : w[u];
+        for (size_t u = 0; u < n; u++) fitting[u] = by->gain ? saturated(w[u], by->gain) : w[u];
 
         quiet_power(found, on, fitting);
         lanes amp = amplitude(&least, on, fitting);

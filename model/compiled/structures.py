@@ -83,10 +83,10 @@ class Rules(Structure):
     """`rules`: how tones are chosen."""
 
     _fields_ = [
-        *_fields(i="kept missing max_by_point candidates max_combinations pruning_step"),
+        *_fields(i="kept missing max_by_point pruning_step"),
         *_fields(i="rim_count is_deep others"),
         *_fields(f="gain_variance ridge margin highest reached"),
-        *_fields(f="judged promised", i="starts iterations"),
+        *_fields(f="judged promised", i="starts iterations again"),
         ("one_finger", Method),
         ("several", Method),
         ("within", 3 * Method),
@@ -108,7 +108,7 @@ class GivenQuestion(Structure):
     """`question`: fingers, and what each is to feel; what is found first is not named."""
 
     _fields_ = [
-        *_fields(i="contents bands fingers quiet_count", f="apart"),
+        *_fields(i="contents bands fingers quiet_count candidates combinations", f="apart"),
         *_fields(p="numbers level places stiffness background judging promise"),
     ]
 

@@ -176,7 +176,7 @@ def _problem(
         case "too_short" | "too_long":
             bound = f"at least {context['min_length']}" if "min_length" in context else ""
             bound = bound or f"at most {context['max_length']}"
-            count = context["actual_length"]
+            count = len(details["input"])  # where it is known to be too many, it is not counted
             message = (
                 f"must have {bound} {'entry' if bound.endswith(' 1') else 'entries'}, got {count}"
             )

@@ -42,11 +42,13 @@ Those of the highest bounds |c^H w| / sqrt(w^H R w) of w = R^-1 c, R the mean ov
 fingers: one system of equations where a search takes several.
 """
 
-MIN_CANDIDATES = 4
-"""Candidates of a content by the mean over fingertips, and as many by their points."""
+MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
+"""Candidates of a content by the mean over fingertips, and as many by their points: of an only
+content, and of any in all its bands."""
 
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
-"""Combinations of candidates that are kept for the next content and the choice, by some draws."""
+"""Combinations of candidates that are kept for the next content and the choice, by some draws; of
+more than four contents fewer, so that time grows with the square of their number."""
 
 REACHED = 1 - 1e-5
 """Of a level, what counts as reached."""
@@ -87,6 +89,17 @@ class Contents:
         """Whether the KEPT frequencies are searched first: of one content for one finger."""
         first = self.streams[0]
         return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
+
+    @property
+    def candidates(self) -> int:
+        """Candidates of each content in each of its bands, and as many by points."""
+        count, bands = len(self.streams), len(self.streams[0].bands)
+        return max(1, min(MIN_CANDIDATES + count // 2, MAX_CANDIDATES // bands))
+
+    @property
+    def combinations(self) -> int:
+        """Combinations of candidates that are kept."""
+        return min(MAX_COMBINATIONS, 4 * MAX_COMBINATIONS // len(self.streams))
 
     @property
     def rows(self) -> IntArray:

@@ -25,8 +25,6 @@ from model.ensemble.touched_plate import RIDGE
 from model.table.contents import (
     JUDGING_DRAWS,
     KEPT,
-    MAX_COMBINATIONS,
-    MIN_CANDIDATES,
     MISSING,
     PROMISED_DRAWS,
     PROMISED_PERCENTILE,
@@ -42,9 +40,6 @@ from model.table.raster_kernel import given_raster
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
-MAX_TARGETS = 4
-"""Of a content that the kernel serves: the room of its search grows by five for each."""
-
 
 def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""
@@ -57,8 +52,6 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
             bands += band
         priorities.append(stream.priority)
         levels.append(10 ** (stream.level_db_sl / 20))
-        if len(stream.targets) > MAX_TARGETS:
-            by = None
     if by is None:
         return choose_by_numpy(table, contents)
     count, n, k = len(streams), len(table.eras), len(places)
@@ -73,6 +66,7 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
     background = contents.background
     given = GivenQuestion(
         *(count, len(streams[0].bands), k, len(quiet)),
+        *(contents.candidates, contents.combinations),
         *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
         *(at.buffer_info()[0], stiffness.ctypes.data),
         None if background is None else background.ctypes.data,
@@ -125,11 +119,11 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
     uncertainty = table.uncertainty
     variance = uncertainty.gain_variance
     rules = Rules(
-        *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
+        *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.thickness > 0),
         *(variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
         *(PERCENTILE, PROMISED_PERCENTILE),
-        *(coherent.TARGET_STARTS, coherent.ALIGNMENTS),
+        *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
         (Method * 3)(*map(_method, coherent.WITHIN_STROKE)),
     )

@@ -15,8 +15,6 @@ from model.finger.perception import decibels
 from model.table.contents import (
     JUDGING_DRAWS,
     KEPT,
-    MAX_COMBINATIONS,
-    MIN_CANDIDATES,
     MISSING,
     PRUNING_STEP,
     REACHED,
@@ -31,6 +29,7 @@ if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
 _TINY, _SAME_FREQUENCY = 1e-20, 1e-3  # -, Hz
+_BATCH = 64  # candidates that are judged at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,6 @@ def _candidates(
     """The best tones of each content in each band, and whether a level was hard to reach."""
     count, hertz = len(contents.streams), fingers.table.frequencies
     formed = fingers.forms(rows, with_fine=True)
-    candidate_count = MIN_CANDIDATES + (count // 2 if count > 1 else 0)
     apart_hz = contents.apart_hz if count > 1 else 0.0
     found: list[tuple[int, int, int, float, Complex64Array]] = []
     is_limited = False
@@ -112,7 +110,7 @@ def _candidates(
             if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
                 ways.append(search(here.by_point(forms, others)))
             for way in ways:
-                for each in _apart(way.score, hertz[here.rows], candidate_count, apart_hz):
+                for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
                     score, weights = float(way.score[each]), way.weights[each]
                     found.append((number, band, int(here.rows[each]), score, weights))
     parts = zip(*found, strict=True) if found else ((),) * 5
@@ -138,12 +136,16 @@ def _judged(
 
     Those of several contents at the contents' levels.
     """
-    judged = fingers.drawn(JUDGING_DRAWS, found.rows, found.weights)
-    loudest = judged.loudest[:, :, 1:].astype(float)
+    parts = [
+        fingers.drawn(JUDGING_DRAWS, found.rows[first:][:_BATCH], found.weights[first:][:_BATCH])
+        for first in range(0, len(found.rows), _BATCH)
+    ]
+    means = np.concatenate([part.means for part in parts])
+    loudest = np.concatenate([part.loudest[:, :, 1:] for part in parts], dtype=float)
     own = np.empty((len(loudest), loudest.shape[2]))
     for number, stream in enumerate(contents.streams):
         of = found.streams == number
-        own[of] = judged.means[of][:, [*stream.targets], 1:].min(axis=1)
+        own[of] = means[of][:, [*stream.targets], 1:].min(axis=1)
         if len(contents.streams) > 1:
             gain = contents.levels[number] / np.maximum(percentile(own[of]), _TINY)
             own[of] *= gain[:, None]
@@ -190,10 +192,10 @@ def best_combination(
             if len(streams[0].bands) > 1:
                 allowed &= (found.bands[last] != found.bands[before]).all(axis=1)
             combinations = np.concatenate([before, last], axis=1)[allowed]
-            if len(combinations) > MAX_COMBINATIONS:
+            if len(combinations) > contents.combinations:
                 some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
                 worst = worst_ratios(combinations, streams, contents.quiet, *some)
-                combinations = combinations[best_few(worst, MAX_COMBINATIONS)]
+                combinations = combinations[best_few(worst, contents.combinations)]
         if len(combinations):
             worst = worst_ratios(combinations, streams, contents.quiet, own, loudest)
             return combinations[best_of(worst)], gap == contents.apart_hz

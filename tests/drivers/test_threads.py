@@ -50,17 +50,30 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
     assert closed.wait(60)
 
 
-def test_program_ends_while_work_hangs() -> None:
-    """Unlike with asyncio's own pool."""
-    program = """
-import asyncio, threading
-from drivers.threads import in_thread
+@pytest.mark.parametrize(
+    "start",
+    [
+        "asyncio.create_task(in_thread(hang, name='hangs'))",
+        "loop.run_in_executor(DaemonThreads(), hang)",
+        "loop.set_default_executor(DaemonThreads()) or loop.run_in_executor(None, hang)",
+    ],
+)
+def test_program_ends_while_work_hangs(start: str) -> None:
+    """Unlike with asyncio's own pool; also where a library would wait at the end for its own."""
+    program = f"""
+import asyncio, atexit, threading
+from drivers.threads import DaemonThreads, in_thread, leave_work
+
+hang = threading.Event().wait
+atexit.register(hang)
+atexit.register(leave_work)
 
 async def main():
-    opening = asyncio.create_task(in_thread(threading.Event().wait, name="hangs"))
-    await asyncio.sleep(0)
-    opening.cancel()
-    await asyncio.wait({opening})
+    loop = asyncio.get_running_loop()
+    work = {start}
+    await asyncio.sleep(0.1)
+    work.cancel()
+    await asyncio.wait({{work}})
 
 asyncio.run(main())
 """

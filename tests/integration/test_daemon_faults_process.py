@@ -20,6 +20,7 @@ import pytest
 
 import patient_daemon
 from controller.api.async_client import AsyncClient
+from controller.loop.selection import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon
 from daemon_process import (
@@ -30,6 +31,7 @@ from daemon_process import (
     armed,
     daemon_process,
     disarmed,
+    energised,
     loudness,
     play,
     playing_daemon,
@@ -90,6 +92,58 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
+
+
+async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
+    """It has said so at both fingers by then, and one of them feels its own without an answer."""
+    hangs = (
+        "import runpy, threading\nfrom controller.loop.choice import Chooser\n"
+        "choose = Chooser.choose\n"
+        "def hang(chooser, requested, *more):\n"
+        "    requested.takes_long and threading.Event().wait()\n"
+        "    return choose(chooser, requested, *more)\n"
+        f"Chooser.choose = hang\nrunpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
+    )
+    half = "{rectangle: {start: [%s m, 0 m], end: [%s m, 0.2 m]}, on_press: buzz}"
+    layout = f"regions: {{west: {half % (0, 0.15)}, east: {half % (0.15, 0.3)}}}\n"
+    (tmp_path / "layout.yaml").write_text(layout, "utf-8")
+    program = (sys.executable, "-c", hangs)
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far, "layout: layout.yaml\n", program=program) as daemon,
+        await daemon.client() as era,
+    ):
+        await armed(era)
+        async with holding(era, (0.08, 0.1), (0.22, 0.1)):
+            while {each.held_back for each in (await era.status()).contacts} != {  # noqa: ASYNC110
+                GIVEN_UP
+            }:
+                await asyncio.sleep(0.05)
+        async with holding(era, (0.08, 0.1), far=far):
+            pass
+        async with holding(era, (0.08, 0.1), (0.22, 0.1)):
+            await asyncio.sleep(0.1)
+            daemon.process.terminate()
+            assert await daemon.status() == 0
+        assert not energised(far)
+
+
+async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None:
+    """Its amplifiers are open by then; clients are served meanwhile."""
+    hangs = (
+        "import runpy, threading\nfrom controller.loop.decision import Decider\n"
+        "Decider.prepare = lambda decider: threading.Event().wait()\n"
+        f"runpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
+    )
+    async with far_end(tmp_path) as far:
+        journal, program = Journal(far), (sys.executable, "-c", hangs)
+        async with daemon_process(tmp_path, far, program=program, waits=False) as daemon:
+            await until(lambda: journal.entries and daemon.socket.is_socket())
+            async with await daemon.client() as era:
+                await asyncio.sleep(0.2)  # it is being prepared
+                assert (await era.status()).state == "NOT_READY"
+            daemon.process.terminate()
+            assert await daemon.status() == 0
 
 
 def serves(port: int) -> bool:

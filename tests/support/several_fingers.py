@@ -6,17 +6,21 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from chain import Chain, Position
+from controller.effects.buzz import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.effects.region import Region
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.observer import Applied
 from drivers import clock
 from model.arrays import FloatArray
+from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.build import build_table
@@ -29,6 +33,36 @@ from virtual_loop import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 """Places on the paper's plate, 11 to 23 cm apart."""
+
+
+LAYOUT = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="low"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="high"),
+        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="any"),
+    ),
+    {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+def answers_take(patch: pytest.MonkeyPatch, *seconds: float) -> list[float]:
+    """Let answers of the thread take these times [s], the last one as often as it is asked.
+
+    Returns when [s] each was asked for.
+    """
+    loop, asked = asyncio.get_running_loop(), list[float]()
+
+    def slowly(loop: Any, executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
+        future = loop.create_future()
+        loop.call_later(
+            seconds[min(len(asked), len(seconds) - 1)], lambda: future.set_result(work())
+        )
+        asked.append(loop.time())
+        return future
+
+    patch.setattr(type(loop), "run_in_executor", slowly)
+    return asked
 
 
 @cache

@@ -193,7 +193,7 @@ export class PlateOverlay {
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
     let below = role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
     if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${verdict}${isKnown(promised) ? `, ≥ ${fixed(promised)} dB` : ""}`;
-    if (held_back) below = verdict ?? "held back";
+    if (held_back && verdict) below = verdict;
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }
 

@@ -14,6 +14,7 @@ from controller.effects.layout_file import LayoutSection, RegionSection, load_la
 from controller.effects.ramp import Ramp
 from controller.effects.texture import Texture
 from key_tables import key_rows
+from model.config.document import ConfigError
 from model.config.shapes import CircleSection, Rectangle, RectangleSection
 from model.rig.file import example_rig_path, load_rig
 
@@ -63,6 +64,27 @@ def test_a_region_says_how_its_fingers_are_to_be_served(tmp_path: Path) -> None:
         "may_share": False,
         "protected": True,
     }
+
+
+def test_of_too_many_effects_the_number_is_said_and_no_more_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand: a region that has one of the last has no problem of its own."""
+    path, read = tmp_path / "layout.yaml", list[str]()
+    effects = ", ".join(f"e{n}: {{kind: click}}" for n in range(1000))
+    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}"
+    path.write_text(
+        f"effects: {{{effects}}}\nregions: {{a: {{{shape}, on_press: e999}}}}\n", "utf-8"
+    )
+    monkeypatch.setattr(
+        "controller.effects.layout_file.effect_kind", lambda kind: read.append(kind) or Click
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_layout(path, None)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.key) == (1, "effects")
+    assert "64 entries, got 1000" in problem.message
+    assert len(read) == 64
 
 
 def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Several fingers, each with a content of its own, on the plate in virtual time."""
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,6 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.loop.decision import ENDED, Decider
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly, unshaped
@@ -25,35 +24,26 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.arrays import Complex64Array
-from model.config.shapes import Rectangle
 from model.errors import InputError
 from model.table.pattern import Pattern
 from set_table import SetTiming
-from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, playable, table
-from virtual_loop import in_virtual_time
-
-LAYOUT = SurfaceLayout(
-    (
-        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="low"),
-        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="high"),
-        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="any"),
-    ),
-    {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
-    elsewhere=None,
+from several_fingers import (
+    ABOVE,
+    LAYOUT,
+    LEFT,
+    RIGHT,
+    answers_take,
+    fingers_on,
+    playable,
+    table,
 )
+from virtual_loop import in_virtual_time
 
 
 def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:
     """Let every answer of the thread take a time [s]; returns the running loop."""
-    loop = asyncio.get_running_loop()
-
-    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
-        future = loop.create_future()
-        loop.call_later(seconds, lambda: future.set_result(work()))
-        return future
-
-    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
-    return loop
+    answers_take(monkeypatch, seconds)
+    return asyncio.get_running_loop()
 
 
 @in_virtual_time
@@ -458,35 +448,6 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
         assert felt == {1: None, 2: "nothing is felt there"}
 
 
-@pytest.mark.parametrize("what", ["stop", "lift"])
-@in_virtual_time
-async def test_stop_and_lift_do_not_wait_for_an_answer(
-    what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While one is computed for 0.2 s: silent as soon as without, and what it says is dropped."""
-    loop = answering_after(0.2, monkeypatch)
-    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
-        assert len(fingers.applied) == 1
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.05)  # an answer is being computed
-        assert len(fingers.applied) == 1
-        begin, count = loop.time(), len(fingers.committed)
-        if what == "stop":
-            fingers.witness.operator_command(begin, "stop")
-            stopped = await fingers.controller.stop()
-            assert all(each.is_confirmed for each in stopped.values())
-            assert loop.time() - begin < 0.02
-        else:
-            fingers.at.clear()
-            fingers.report()
-            await asyncio.sleep(0.02)
-            assert fingers.committed[count][2] == ()
-            assert fingers.committed[count][0] - begin < 0.005
-        await fingers.hold(0.5)
-        assert len(fingers.applied) == 1
-        assert len(fingers.committed) <= count + 1
-
-
 @in_virtual_time
 async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
     monkeypatch: pytest.MonkeyPatch,
@@ -568,25 +529,6 @@ async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
 
 
 @in_virtual_time
-async def test_an_answer_that_takes_more_than_a_second_is_a_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Silent, with the reason, until it has come."""
-    answering_after(2.0, monkeypatch)
-    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.95)
-        before = len(fingers.silenced)
-        await fingers.hold(0.1)
-        (silenced,) = fingers.silenced[before:]
-        assert silenced.reason == (
-            "TimeoutError: answer must take less than 1 s, is still computed"
-        )
-        await fingers.hold(1.2)
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None, None]
-
-
-@in_virtual_time
 async def test_what_is_not_served_says_why() -> None:
     """Of six fingers the four newest have the four layers; the plate cannot serve all of these."""
     async with fingers_on(table(), LAYOUT, layers=4) as fingers:
@@ -598,6 +540,7 @@ async def test_what_is_not_served_says_why() -> None:
         for each in felt.values():
             assert each.verdict in ("own", "mixed", "shared", "held back")
             assert (each.held_back is None) == (each.verdict in ("own", "mixed"))
+            assert "(" not in (each.held_back or "")  # no object of the program
         assert {felt[id].verdict for id in (1, 2)} == {"held back"}  # the earliest
         assert felt[1].held_back == (
             "no layer is free: the amplifiers play 4 contents at once; lift a finger"

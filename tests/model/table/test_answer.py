@@ -1,6 +1,7 @@
 """Several contents at once, by plates solved exactly, and what is done where not all are served."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
 from model.table.answer import answer
+from model.table.contents_kernel import choose_tones
 from model.table.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
 from model.table.promised import felt_amplitudes, loudest_power
@@ -250,6 +252,51 @@ def test_fingers_whose_contents_have_one_name_share_and_no_others():
     assert "shared" in {found.layers[0].verdict, found.layers[2].verdict}
     assert found.layers[2].excitation == found.layers[0].excitation
     assert found.layers[1].excitation != found.layers[3].excitation
+
+
+TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("given", "most"),
+    [
+        (lambda n: {"content": "a"}, 1),
+        (lambda n: {"may_share": True, "priority": n}, 1),
+        (lambda n: {"content": "ab"[n % 2]}, 4),
+        (lambda n: {}, 9),
+        (lambda n: {"content": "abcde"[n % 5], "priority": n % 3}, 9),
+        (lambda n: {"max_foreign_db_sl": -50.0, "is_protected": n % 2 == 0}, 9),
+        (lambda n: {"level_db_sl": 90.0, "min_contrast_db": 12.0}, 9),
+        (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 9),
+    ],
+)
+def test_twenty_fingers_take_few_searches(given, most, monkeypatch):
+    """One where a name is shared by all, and about log(20) where each wants its own."""
+    asked = []
+
+    def counted(table, contents):
+        asked.append(contents)
+        return choose_tones(table, contents)
+
+    monkeypatch.setattr("model.table.answer.choose_tones", counted)
+    found = answer(smooth_table(), [Request(at, **given(n)) for n, at in enumerate(TWENTY)])
+    assert len(found.layers) == 20
+    assert len(asked) <= most
+
+
+def test_twenty_fingers_take_little_memory(without_kernels):
+    """In numpy, whose arrays are counted: that of a screen or two, however many share."""
+    without_kernels()
+    peaks = []
+    for count in (2, 20):
+        requests = [Request(at, content="a", level_db_sl=90.0) for at in TWENTY[:count]]
+        answer(smooth_table(), requests)
+        tracemalloc.start()
+        answer(smooth_table(), requests)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 20 * peaks[0]
+    assert peaks[1] < 50e6
 
 
 def test_what_is_to_be_own_is_own_or_makes_contents_give_way():

@@ -69,6 +69,11 @@ SETS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "two, and two quiet fingers": (2, 2, {}),
     "four": (4, 0, {}),
     "two that share": (2, 2, {"shared": True}),
+    "five that share": (5, 0, {"shared": True}),
+    "eight that share, and two quiet fingers": (8, 2, {"shared": True}),
+    "twenty that share": (20, 0, {"shared": True}),
+    "twenty that share more than the stroke": (20, 0, {"shared": True, "level": 70.0}),
+    "six": (6, 1, {}),
     "bands that may be exchanged": (3, 0, {"bands": ((0, 9), (10, 20), (19, 29))}),
     "more than the stroke": (2, 1, {"level": 60.0}),
     "one that no level margin allows": (1, 2, {"level": 46.0}),
@@ -87,8 +92,9 @@ def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
     """Frequencies, weights and all figures, on random rigs: within 0.02 dB."""
     count, quiet, given = SETS[name]
     of = random_table(seed)
-    (places,) = contact_sets(1, fingers=max(2, count + quiet), seed=seed) if quiet < 9 else (GRID,)
-    places = places[: count + quiet]
+    fingers = count + quiet
+    (places,) = contact_sets(1, fingers=max(2, fingers), seed=seed) if fingers < 10 else (GRID,)
+    places = places[:fingers]
     if "at" in given:
         places = [(x * of.plate.length, y * of.plate.width) for x, y in given["at"]]
     bands = given.get("bands", ((0, len(of.frequencies)),))
@@ -101,7 +107,7 @@ def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
         streams,
         tuple(range(count, count + quiet)),
         apart_hz=30.0,
-        background=None if count + quiet > 1 else of.background(places[:1]),
+        background=None if quiet or len(groups) > 1 else of.background(places),
     )
     found, expected = choose_tones(of, contents), choose_by_numpy(of, contents)
     assert found.rows == expected.rows
@@ -116,7 +122,12 @@ def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
         np.testing.assert_allclose(one, other, rtol=0, atol=0.02, err_msg=key)
 
 
-GRID = [(0.03 + 0.06 * x, 0.05 + 0.12 * y) for x in range(5) for y in range(2)]
+GRID = [
+    (0.03 + 0.06 * x + column, 0.05 + 0.12 * y)
+    for column in (0, 0.028)
+    for x in range(5)
+    for y in range(2)
+]
 
 
 def test_bound_and_level_are_those_of_the_best_weights_for_the_mean() -> None:

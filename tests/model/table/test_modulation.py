@@ -161,9 +161,9 @@ def test_a_modulation_is_left_out_where_its_own_finger_would_have_too_little_con
 def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
     """What they say of others' contents nine of ten unseen plates keep; their bounds hold."""
     shares = [
-        Request((0.095, 0.121), content="a"),
-        Request((0.287, 0.211), content="a"),
-        Request((0.076, 0.059)),
+        Request((0.296, 0.177), content="a"),
+        Request((0.241, 0.174), content="a"),
+        Request((0.182, 0.21)),
     ]
     held = [
         Request((0.042, 0.184), priority=1),

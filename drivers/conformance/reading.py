@@ -106,10 +106,11 @@ async def _expect_prompt(
     subject: Subject, name: str, request: Callable[[], Awaitable[object]]
 ) -> None:
     """Make a request again and again, whose fastest replies must begin in time."""
+    subject.client.reactions[name].clear()  # lest a longer one of before hides its time
     for _ in range(_TRIES):
         await request()
     fastest = min(subject.client.reactions[name])
-    what = f"time until the reply to {name} begins [ms], the shortest of {_TRIES} or more"
+    what = f"time until the reply to {name} begins [ms], the shortest of {_TRIES}"
     expect_within(1e3 * fastest, 0, 1e3 * REACTION, what)
 
 

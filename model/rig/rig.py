@@ -78,11 +78,12 @@ class Rig:
                     )
 
     def era(self, name: str) -> Era:
-        """The ERA of a name; raises KeyError for an unknown one."""
+        """The ERA of a name; raises InputError for an unknown one."""
         for era in self.eras:
             if era.name == name:
                 return era
-        raise KeyError(name)
+        names = ", ".join(era.name for era in self.eras)
+        raise InputError(f"ERA must be one of the rig's, {names}, got {name!r}")
 
     @property
     def fingerprint(self) -> str:

@@ -50,10 +50,10 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
                 f"and one on all thicknesses, {own}, got {other}; build it again"
             )
     faster = thicker * np.sqrt(stiffer)
-    most = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
-    if max(abs(thicker - 1), abs(faster - 1)) > most:
+    max_scale = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
+    if max(abs(thicker - 1), abs(faster - 1)) > max_scale:
         raise InputError(
-            f"thickness and frequencies must be within {100 * most:g} % of the table's, got "
+            f"thickness and frequencies must be within {100 * max_scale:g} % of the table's, got "
             f"factors of {thicker:.4g} and {faster:.4g}; build it again"
         )
     return replace(

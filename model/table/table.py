@@ -29,7 +29,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS
+from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, SAME_FREQUENCY
 from model.table.pattern import Pattern
 from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
@@ -55,9 +55,6 @@ PAPER_GRID = Grid(12, 9)
 BACKGROUND_CELL, CELLS_PER_WAVELENGTH = 0.0254, 4
 """Largest side [m] of the cells by whose centres the power of the plate around targets counts, that
 of the founding paper's cells; and how many a bending wave has at least."""
-
-SAME_FREQUENCY = 1e-3
-"""Distance [Hz] of two frequencies that are one."""
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:

@@ -138,7 +138,7 @@ def test_query_reaches_the_level_at_both_targets():
 
 @pytest.mark.parametrize("mode", ["switched", "phased"])
 def test_the_grid_of_summaries_decides_no_answer(mode):
-    """A lone finger feels the same whatever it is, and about the mean of a dense lattice."""
+    """A lone finger feels the same whatever it is."""
     table = smooth_table()
     question = Question((TARGET,), drive_mode=mode)
     expected = table.query(question)
@@ -146,14 +146,6 @@ def test_the_grid_of_summaries_decides_no_answer(mode):
         found = replace(table, grid=Grid(*cells)).query(question)
         assert found.excitation == expected.excitation
         assert found.surroundings_contrast_db == expected.surroundings_contrast_db
-    sides = table.plate.length, table.plate.width
-    points = np.stack(np.meshgrid(*((np.arange(90) + 0.5) / 90 * side for side in sides)), axis=-1)
-    points = points.reshape(-1, 2)
-    points = points[np.linalg.norm(points - TARGET, axis=1) > 0.05]
-    frequencies, amplitudes = table.amplitudes(expected.excitation, points)
-    above = ((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1)
-    around = expected.level_db_sl - 10 * np.log10(above.mean())
-    assert expected.surroundings_contrast_db == pytest.approx(around, abs=0.4)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Contrast and time of answers to several contents, by number of ERAs.
 
     python -m benchmarks.contents [--only RIG ...] [--sets N] [--fingers K] [--modulation HZ]
-                                 [--distortion PERCENT] [--bands]
+                                 [--distortion PERCENT] [--bands] [--sharing]
 
 The examples with four, eight, twelve and sixteen ERAs, 40 to 320 Hz in steps of 10, fingers 5 cm
 apart (8 cm on the table) with contents of 20 dB SL, 20 Hz apart; `identified`: with an uncertainty
@@ -14,11 +14,16 @@ where it is served, median over the sets (and the most). With --distortion ampli
 harmonic is so much of full level: contents above all second harmonics, sums and differences up to
 500 Hz at their fingers [dB], median (and least), and above those nearer than 30 Hz. With --bands
 two and three contents, each in another band of 40 to 110, 140 to 190 and 230 to 320 Hz, whichever
-promises most; the time is that of all answers which this takes.
+promises most; the time is that of all answers which this takes. With --sharing 2 to 20 fingers of
+one content beside 0 to 6 quiet ones in turn, 2.5 cm apart: what a search from every target, of 400
+iterations, promises beyond the answer in contrast at the worst finger for 20 dB SL, and in level
+where 90 are asked for [dB], median (and worst tenth), both with their time; how many times as long
+an answer takes without kernels in C.
 """
 
 import argparse
 import time
+from collections import defaultdict
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -52,6 +57,7 @@ def main() -> None:
     parser.add_argument("--modulation", type=float, metavar="HZ", help="of the first content")
     parser.add_argument("--distortion", type=float, metavar="PERCENT", help="of full level")
     parser.add_argument("--bands", action="store_true", help="a band for each content")
+    parser.add_argument("--sharing", action="store_true", help="2 to 20 fingers of one content")
     options = parser.parse_args()
     use_one_thread()
     import numpy as np
@@ -78,6 +84,9 @@ def main() -> None:
                 frequencies=np.arange(40.0, 501.0 if options.distortion else 321.0, 10.0),
             )
             table.prepare(with_ringing=False)
+            if options.sharing:
+                _print_sharing((name, label), table, count=options.sets)
+                continue
             for contents, quiet in sets:
                 apart = (0.08 if name == "table" else 0.05) * (0.6 if options.fingers else 1)
                 row = (name, label), table, contents, quiet
@@ -150,6 +159,58 @@ def _worst(found: "Answer") -> float:
     if found.promised_worst_db is None:
         raise ValueError("a set must have two fingers")
     return found.promised_worst_db
+
+
+def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count: int) -> None:
+    """Print what a search that takes its time finds beyond the answers."""
+    import numpy as np
+
+    from model.drive_modes import coherent
+    from model.table.contents import Contents, Stream
+    from model.table.contents_kernel import choose_tones
+    from model.table.contents_numpy import choose_by_numpy
+
+    chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
+    coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
+    patient = replace(table)
+    patient.prepare(with_ringing=False)  # kernels read the numbers once for a table
+    coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = chosen
+    for targets in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20):
+        lost: dict[float, list[float]] = {20.0: [], 90.0: []}
+        spent = defaultdict[tuple[bool, float], list[float]](list)
+        for quiet in range(min(7, 21 - targets)):
+            for places in _sets(table, targets, quiet, count=count // 7 + 1, apart=0.025):
+                shared, others = range(targets), range(targets, targets + quiet)
+                background = None if quiet else table.background(places[:targets])
+                for level in lost:
+                    stream = Stream(tuple(shared), level, ((0, len(table.frequencies)),))
+                    asked = tuple(places), (), (stream,), tuple(others)
+                    contents = Contents(*asked, background=background)
+                    best = choose_tones(patient, contents)
+                    for choose in (choose_tones, choose_by_numpy):
+                        found = choose(table, contents)  # once for what so many fingers need
+                        started = time.process_time()
+                        found = choose(table, contents)
+                        spent[choose is choose_tones, level].append(time.process_time() - started)
+                    if level > 20:
+                        most, least = (
+                            min(each.level_db_sl[finger][1] for finger in shared)
+                            for each in (best, found)
+                        )
+                        lost[level].append(most - least)
+                    elif quiet:
+                        lost[level].append(best.worst_db - found.worst_db)
+        times = {each: 1e3 * np.median(some) for each, some in spent.items()}
+        figures = "   ".join(
+            f"{np.median(some):5.2f} ({np.percentile(some, 90):.2f}) {times[True, level]:6.1f} ms"
+            for level, some in lost.items()
+            if some
+        )
+        slower = times[False, 20.0] / times[True, 20.0]
+        row = (
+            f"{names[0]:12} {names[1]:11} {targets:4d} share   {figures}   numpy {slower:.1f} times"
+        )
+        print(row, flush=True)
 
 
 def _print_modulated(

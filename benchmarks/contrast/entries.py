@@ -139,7 +139,7 @@ class _HeldOut:
 
     def accelerations(self, frequency: float, plates: "_Drawn") -> ComplexArray:
         """Fields (m, points, eras)."""
-        rows = np.searchsorted(self.case.table.frequencies, [frequency])
+        rows = self.case.table.rows_of(np.array([frequency]))
         return self.case.fields_on(rows, plates.plates)[:, 0]
 
 

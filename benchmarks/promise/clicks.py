@@ -140,7 +140,7 @@ def given(
             frequencies, amplitudes = other.amplitudes(
                 tones, fingertip_points(*target, plate), contacts=question.contacts
             )
-            threshold = other.thresholds[np.searchsorted(other.frequencies, frequencies)]
+            threshold = other.thresholds[other.rows_of(frequencies)]
             steady = np.linalg.norm(amplitudes / threshold[:, None], axis=0)
             level = 20 * math.log10(float(steady @ fingertip_weights(*target, plate)))
             found[row, number] = level + pulse.targets[0] - (pulse.quiet_db_sl or 0.0)

@@ -384,7 +384,7 @@ def _felt(
 ) -> dict[float, complex]:
     """Complex acceleration at a finger, by frequency [Hz]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
-    rows = np.searchsorted(table.frequencies, frequencies)
+    rows = table.rows_of(frequencies)
     weights = bases / [era.stroke for era in table.eras]
     felt = (weights * fields[rows]).sum(axis=1)
     return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))

@@ -307,7 +307,7 @@ def _coarse(error: float, mesh: "PlateMesh") -> str | None:
         return None
     return (
         f"mesh {mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised takes "
-        "this error into account and is lower for it; `mesh: auto` keeps it at 1 %"
+        "this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
     )
 
 

@@ -84,8 +84,18 @@ def kernels() -> Kernels | None:
         library = ctypes.CDLL(str(own)) if own.exists() else _compiled(version)
         return Kernels(library, version.lanes)
     except (InputError, OSError) as error:
-        _logger.warning("answers take several times as long without kernels in C: %s", error)
+        _logger.warning("%s: %s", WITHOUT_KERNELS, error)
         return None
+
+
+WITHOUT_KERNELS = "answers take 6 to 19 times as long without kernels in C"
+"""Of steady ones, from twenty fingers that share to one, beside 0 to 6 quiet ones on four and on
+twelve ERAs, by both in turn (python -m benchmarks.contents --sharing); clicks take 1.3 times."""
+
+
+def why_slow() -> str | None:
+    """How much slower this machine is for want of a compiler, in words; None where it is not."""
+    return None if kernels() else f"{WITHOUT_KERNELS}; install a C compiler, such as gcc or clang"
 
 
 def run(kernel: Callable[..., int], *given: Any) -> int:

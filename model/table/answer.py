@@ -10,6 +10,7 @@ hold, if by silence.
 
 import math
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -181,16 +182,12 @@ class _Answering:
 
     def _many_joined(self, plan: _Plan) -> _Plan:
         """The plan with one content for more than MAX_SEPARATE fingers that may all share."""
-        groups: list[list[tuple[int, ...]]] = []
+        groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
         for content in plan.contents:
             request = self.requests[content[0]]
-            for group in groups:
-                if all(request.may_feel_one_with(self.requests[each[0]]) for each in group):
-                    group.append(content)
-                    break
-            else:
-                groups.append([content])
-        for group in groups:
+            if request.may_feel_one_with(request):
+                groups[request.may_share or str(request.content)].append(content)
+        for group in groups.values():
             if len(group) > MAX_SEPARATE:
                 plan = self._joined(plan, group)
         return plan

@@ -50,6 +50,9 @@ MAX_COMBINATIONS, PRUNING_STEP = 200, 4
 """Combinations of candidates that are kept for the next content and the choice, by some draws; of
 more than four contents fewer, so that time grows with the square of their number."""
 
+SAME_FREQUENCY = 1e-3
+"""Distance [Hz] of two frequencies that are one."""
+
 REACHED = 1 - 1e-5
 """Of a level, what counts as reached."""
 

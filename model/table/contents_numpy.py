@@ -18,6 +18,7 @@ from model.table.contents import (
     MISSING,
     PRUNING_STEP,
     REACHED,
+    SAME_FREQUENCY,
     Contents,
     Stream,
     Tones,
@@ -28,7 +29,7 @@ from model.table.promised import promised
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
-_TINY, _SAME_FREQUENCY = 1e-20, 1e-3  # -, Hz
+_TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
 
 
@@ -124,7 +125,7 @@ def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: f
         if score[at] <= 0 or len(found) == count:
             break
         gaps = np.abs(frequencies[found] - frequencies[at])
-        if len(found) < 2 or (gaps >= apart_hz - _SAME_FREQUENCY).all():
+        if len(found) < 2 or (gaps >= apart_hz - SAME_FREQUENCY).all():
             found.append(at)
     return found
 
@@ -188,7 +189,7 @@ def best_combination(
             before = np.repeat(combinations, len(own_candidates), axis=0)
             last = np.tile(own_candidates, len(combinations))[:, None]
             gaps = np.abs(hertz[last] - hertz[before])
-            allowed = (gaps >= gap - _SAME_FREQUENCY).all(axis=1)
+            allowed = (gaps >= gap - SAME_FREQUENCY).all(axis=1)
             if len(streams[0].bands) > 1:
                 allowed &= (found.bands[last] != found.bands[before]).all(axis=1)
             combinations = np.concatenate([before, last], axis=1)[allowed]

@@ -28,7 +28,7 @@ from model.transients.loaded_ramps import (
 from model.transients.ringing import ringing_time
 from model.vibration.excitation import Excitation, base_amplitudes
 
-MIN_CONTRAST_DB = 6.0
+MIN_RAISED_CONTRAST_DB = 6.0
 """Contrast over an effect down to which its drive is raised: quiet fingers feel half of it."""
 
 
@@ -214,7 +214,7 @@ def _allowed_db(felt_db_sl: float, contrast_db: float | None, level_db_sl: float
     if contrast_db is None:
         return math.inf
     quiet_db_sl = felt_db_sl - contrast_db
-    return max(level_db_sl - MIN_CONTRAST_DB, IMPERCEPTIBLE_DB_SL) - quiet_db_sl
+    return max(level_db_sl - MIN_RAISED_CONTRAST_DB, IMPERCEPTIBLE_DB_SL) - quiet_db_sl
 
 
 @dataclass(frozen=True)

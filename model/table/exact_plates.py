@@ -140,7 +140,7 @@ def _responses(
 ) -> tuple[IntArray, ComplexArray]:
     """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
-    rows = np.searchsorted(table.frequencies, frequencies)
+    rows = table.rows_of(frequencies)
     found = accelerations_on(table, discs, fingers, rows, bases[:, None], plates)[:, :, 0]
     weights = np.abs(bases) / [era.stroke for era in table.eras]
     size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))

@@ -5,7 +5,8 @@ deviations are values of the rig, and masses and moved ERAs act where the raster
 For changes as a plate in service has them; a rig that is another is built anew.
 """
 
-from dataclasses import replace
+import math
+from dataclasses import astuple, fields, replace
 
 import numpy as np
 
@@ -13,17 +14,19 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
 _SAME_PLACE = 1e-9  # m
-_MAX_SCALE = 0.1
+_MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
 
 
 def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     """The table for a rig whose parameters differ from those that it was built for.
 
-    Raises InputError for a plate of other sides, density or ratio, for other ERAs, and for
-    frequencies or masses of modes that differ by more than 10 %.
+    Raises InputError for other ERAs, a plate that differs in more than modulus, thickness, losses
+    and deviations of modes, those of all layers alike, and for frequencies or masses of modes that
+    differ by more than 10 %, 1 % before an air gap.
     """
     before, after = table.plate, rig.plate
     names = [era.name for era in table.eras]
@@ -32,22 +35,26 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
             f"ERAs must be {', '.join(names)}, those of the table, got "
             f"{', '.join(era.name for era in rig.eras)}; build it again"
         )
-    fixed = ("length", "width", "air_gap")
-    material = ("rho", "nu")
-    parts: list[tuple[object, object, str]] = [(before, after, key) for key in fixed]
-    parts += [(before.material, after.material, key) for key in material]
-    for own, other, key in parts:
-        if getattr(own, key) != getattr(other, key):
-            raise InputError(
-                f"plate.{key} must be {getattr(own, key)}, that of the table, got "
-                f"{getattr(other, key)}; build it again"
-            )
     thicker = after.thickness / before.thickness
-    faster = thicker * np.sqrt(after.material.E / before.material.E)
-    if max(abs(thicker - 1), abs(faster - 1)) > _MAX_SCALE:
+    stiffer = after.material.E / before.material.E
+    like = replace(
+        before.scaled(modulus=stiffer, thickness=thicker),
+        loss_factor=after.loss_factor,
+        loss_exponent=after.loss_exponent,
+        mode_deviations=after.mode_deviations,
+    )
+    for field, own, other in zip(fields(Plate), astuple(like), astuple(after), strict=True):
+        if not _is_same(own, other):
+            raise InputError(
+                f"plate.{field.name} must be that of the table, but for one factor on all moduli "
+                f"and one on all thicknesses, {own}, got {other}; build it again"
+            )
+    faster = thicker * np.sqrt(stiffer)
+    max_scale = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
+    if max(abs(thicker - 1), abs(faster - 1)) > max_scale:
         raise InputError(
-            f"thickness and frequencies must be within {100 * _MAX_SCALE:g} % of the table's, got "
-            f"factors of {thicker:.3g} and {faster:.3g}; build it again"
+            f"thickness and frequencies must be within {100 * max_scale:g} % of the table's, got "
+            f"factors of {thicker:.4g} and {faster:.4g}; build it again"
         )
     return replace(
         table,
@@ -56,6 +63,7 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
         masses=rig.masses,
         uncertainty=rig.uncertainty,
         fingertip=rig.fingertip,
+        threshold=rig.threshold,
         omega=faster * table.omega,
         losses=faster**2 * table.losses,
         dispersion=faster**2 * table.dispersion,
@@ -64,11 +72,19 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     )
 
 
+def _is_same(one: object, other: object) -> bool:
+    """Whether values, and those in them, are the same but for rounding."""
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other)
+    return one == other
+
+
 def _attachment_shapes(table: LocalizationTable, rig: Rig) -> FloatArray:
-    """Shapes (eras + masses, r) where the rig has them, as built where nothing has moved."""
-    own = footprints_of(table.eras, table.masses)[:, :2]
-    places = footprints_of(rig.eras, rig.masses)[:, :2]
-    shapes = table.shapes_at([(float(x), float(y)) for x, y in places])
+    """Shapes (eras + masses, r) where the rig has them, as built where nothing has changed."""
+    own, places = (footprints_of(each.eras, each.masses) for each in (table, rig))
+    shapes = table.shapes_at(places)
     for number, place in enumerate(places):
         same = np.flatnonzero(np.abs(own - place).max(axis=1) < _SAME_PLACE)
         if len(same):

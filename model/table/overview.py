@@ -80,9 +80,10 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     weak = overview.cells
     available = table.available_level_db_sl
     known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
+    thickness = (table.plate.laminate or table.plate).thickness
     summary: dict[str, Any] = {
         "mode": table.drive_mode,
-        "plate_m": [table.plate.length, table.plate.width, table.plate.thickness],
+        "plate_m": [table.plate.length, table.plate.width, thickness],
         "eras": [era.name for era in table.eras],
         "frequency_range_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],
         "frequency_count": len(table.frequencies),

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.compiled.kernels import kernels
 from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, attach
@@ -29,7 +29,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS
+from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, SAME_FREQUENCY
 from model.table.pattern import Pattern
 from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
@@ -51,6 +51,10 @@ EFFECT_DURATIONS = (0.02, 0.04, 0.08, 0.16)
 """Durations [s] of short effects for which the plate's ringing is kept; the nearest is taken."""
 
 PAPER_GRID = Grid(12, 9)
+
+BACKGROUND_CELL, CELLS_PER_WAVELENGTH = 0.0254, 4
+"""Largest side [m] of the cells by whose centres the power of the plate around targets counts, that
+of the founding paper's cells; and how many a bending wave has at least."""
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
@@ -185,8 +189,20 @@ class LocalizationTable:
         """Frequencies (k,) [Hz] of an excitation, and its field by unit fields (f, eras, ...)."""
         frequencies, bases = base_amplitudes(excitation, self.eras)
         weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
-        rows = np.searchsorted(self.frequencies, frequencies)
+        rows = self.rows_of(frequencies)
         return frequencies, (weights[:, None] @ fields[rows])[:, 0]
+
+    def rows_of(self, frequencies: FloatArray) -> IntArray:
+        """Rows (k,) of frequencies (k,) [Hz]; raises InputError for any but the table's own."""
+        rows = np.abs(np.subtract.outer(frequencies, self.frequencies)).argmin(axis=1)
+        for asked, nearest in zip(frequencies.tolist(), self.frequencies[rows], strict=True):
+            if not abs(asked - nearest) <= SAME_FREQUENCY:
+                raise InputError(
+                    f"frequency of a tone must be one of the table's, of which {nearest:g} Hz is "
+                    f"the nearest, got {asked:g} Hz; build a table with it: era table build "
+                    "--frequencies"
+                )
+        return np.asarray(rows)
 
     def shapes_at(self, points: Sequence[Point] | FloatArray) -> FloatArray:
         """Shapes of the reduced plate at points or footprints [m] of it, (p, r)."""
@@ -213,7 +229,7 @@ class LocalizationTable:
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
-        fields = self._cell_fields.transpose(2, 0, 1) / self.thresholds[:, None]
+        fields = self.unit_fields(self.cell_centres).transpose(2, 0, 1) / self.thresholds[:, None]
         return decibels(highest_levels(fields[:, None]).astype(float))
 
     @cached_property
@@ -316,14 +332,14 @@ class LocalizationTable:
         return np.asarray(error**2 * mean_square, dtype=np.float32)
 
     @cached_property
-    def _cell_fields(self) -> Complex64Array:
-        """Fields at the centres of the cells, (f, eras, cells)."""
-        return self.unit_fields(self.cell_centres)
-
-    @cached_property
-    def _cell_power(self) -> Complex64Array:
-        """Power summed over the cells, (f, eras, eras)."""
-        return _power(self._cell_fields)
+    def _everywhere(self) -> tuple[FloatArray, Complex64Array, Complex64Array]:
+        """Points (p, 2) [m] that tile the plate, fields there (f, eras, p), and power of all."""
+        wavelength = self.plate.bending_wavelength(float(self.frequencies[-1]))
+        side = min(BACKGROUND_CELL, wavelength / CELLS_PER_WAVELENGTH)
+        sides = self.plate.length, self.plate.width
+        points = Grid(*(min(max(round(each / side), 1), 200) for each in sides)).centres(self.plate)
+        fields = self.unit_fields(points)
+        return points, fields, _power(fields)
 
     def _modal_fields(
         self, contacts: Sequence[Point], loads: Sequence[float] = ()
@@ -336,9 +352,9 @@ class LocalizationTable:
 
     def background(self, targets: Sequence[Point]) -> Complex64Array:
         """Mean power of the plate beyond targets, without fingers on it, (f, eras, eras)."""
-        near = self._cell_fields[:, :, ~is_background(self.cell_centres, targets)]
-        count = self._cell_fields.shape[2] - near.shape[2]
-        return (self._cell_power - _power(near)) / np.float32(count)
+        points, fields, power = self._everywhere
+        is_near = ~is_background(points, targets)
+        return (power - _power(fields[:, :, is_near])) / np.float32(np.sum(~is_near))
 
 
 def _power(fields: Complex64Array) -> Complex64Array:

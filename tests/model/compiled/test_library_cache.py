@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from model.compiled import library_cache
-from model.compiled.kernels import kernels
+from model.compiled.kernels import kernels, why_slow
 from model.compiled.library_cache import compile_library
 from model.errors import InputError
 
@@ -153,10 +153,12 @@ def test_least_recently_used_libraries_are_removed(folder: Path) -> None:
 
 
 def test_machine_without_a_compiler_has_none(without_kernels: Callable[[], None]) -> None:
-    """No library, and no error; with one there is a library."""
+    """No library, no error, and words that say how much slower; with one there is a library."""
     assert kernels() is not None
+    assert why_slow() is None
     without_kernels()
     assert kernels() is None
+    assert why_slow()
 
 
 @pytest.fixture

@@ -191,6 +191,8 @@ def test_load_rig_reads_units_defaults_wiring_and_limits(tmp_path: Path) -> None
     assert (rig.mesh.nx, rig.mesh.ny) == (48, 36)
     assert (rig.mesh.length, rig.mesh.width) == (0.3048, 0.2286)
     assert [era.name for era in rig.eras] == ["SW", "NE"]
+    with pytest.raises(InputError):
+        rig.era("X")
     north_east = rig.era("NE")
     assert (north_east.x, north_east.y) == (0.3048, 0.2286)
     assert (north_east.stiffness, north_east.bolt_mass, north_east.stroke) == (17000, 0, 1e-4)

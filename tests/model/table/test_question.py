@@ -8,6 +8,7 @@ import pytest
 
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.grid import Grid
 from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern
 from model.table.pattern_query import UnreachableLevel
@@ -133,6 +134,18 @@ def test_query_reaches_the_level_at_both_targets():
     assert min(levels) == pytest.approx(pattern.level_db_sl, abs=0.01)
     assert pattern.robust_level_db_sl == pytest.approx(15.0)
     assert pattern.level_db_sl > 15.0
+
+
+@pytest.mark.parametrize("mode", ["switched", "phased"])
+def test_the_grid_of_summaries_decides_no_answer(mode):
+    """A lone finger feels the same whatever it is."""
+    table = smooth_table()
+    question = Question((TARGET,), drive_mode=mode)
+    expected = table.query(question)
+    for cells in ((1, 1), (2, 2), (6, 4), (30, 20)):
+        found = replace(table, grid=Grid(*cells)).query(question)
+        assert found.excitation == expected.excitation
+        assert found.surroundings_contrast_db == expected.surroundings_contrast_db
 
 
 @pytest.mark.parametrize(

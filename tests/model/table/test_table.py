@@ -1,5 +1,6 @@
 """The localization table: its fields, frequencies, raster, and the table that follows a plate."""
 
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -16,13 +17,14 @@ from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.structure.plate import Material, Plate
+from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from model.table.build import TableProblem, build_table
+from model.table.exact_plates import Plates, felt_on
 from model.table.live_table import table_following
 from model.table.question import Question
 from model.table.raster import Raster
 from model.table.table import LocalizationTable, default_drive_frequencies
-from model.vibration.excitation import tone_amplitudes
+from model.vibration.excitation import Tone, tone_amplitudes
 from paper_plate import make_paper_rig
 from paper_table import contact_sets, smooth_rig, smooth_table
 from registry.limits import GuardLimits
@@ -230,12 +232,52 @@ def test_same_rig_leaves_the_table_as_it_is(rig: Rig, table: LocalizationTable) 
     assert same.fingerprint == table.fingerprint
 
 
+def test_an_era_moved_by_a_micrometre_stays_on_its_foot(rig: Rig) -> None:
+    """It acts on a disc there, too: fields change by the micrometre, not by the disc."""
+    eras = tuple(replace(era, foot=8e-3) for era in rig.eras)
+    table = build_table(replace(rig, eras=eras), frequencies=FIVE)
+    moved = replace(rig, eras=(replace(eras[0], x=eras[0].x + 1e-6), *eras[1:]))
+    fields, found = (each.unit_fields(POINTS) for each in (table, table_following(table, moved)))
+    assert np.linalg.norm(found - fields) < 1e-3 * np.linalg.norm(fields)
+
+
+def test_a_frequency_that_a_table_lacks_is_refused(table: LocalizationTable) -> None:
+    """Between two of its own and beyond; one of a wire's steps is its own."""
+    one = Plates(*(np.ones(shape) for shape in (1, 1, 1, (1, 4), (1, 1), (1, 4), (1, 1))))
+    question = Question(((0.08, 0.06),))
+    for frequency in (79.0, 115.0, 145.1, 451.0, math.nan):
+        tones = {"SW": Tone(frequency, 1e-6, 0.0)}
+        with pytest.raises(InputError):
+            table.amplitudes(tones, POINTS)
+        with pytest.raises(InputError):
+            felt_on(table, question, tones, one)
+    tones = ({"SW": Tone(frequency, 1e-6, 0.0)} for frequency in (145.0, 145.0004))
+    expected, found = (table.amplitudes(each, POINTS)[1] for each in tones)
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_other_plates_are_refused(rig: Rig, table: LocalizationTable) -> None:
-    """Other ERAs, sides, or a thickness 20 % larger need a build."""
+    """Other ERAs, sides, masses or layers, or a thickness 20 % larger, need a build."""
+    plate, half = rig.plate, Layer(rig.plate.material, rig.plate.thickness / 2)
+    layered = replace(plate, laminate=Laminate((half, half)))
+    heavier = replace(half, material=replace(half.material, rho=2 * half.material.rho))
     plates = (
-        replace(rig.plate, length=0.31),
-        replace(rig.plate, thickness=1.2 * rig.plate.thickness),
+        replace(plate, length=0.31),
+        replace(plate, thickness=1.2 * plate.thickness),
+        replace(plate, material=replace(plate.material, rho=1.01 * plate.material.rho)),
+        replace(plate, air_gap=AirGap(2e-3)),
+        layered,
     )
+    of_layers = replace(table, plate=layered)
+    thicker = layered.scaled(thickness=1.01, modulus=0.97)
+    table_following(of_layers, replace(rig, plate=thicker))
+    for one, other in (
+        (of_layers, replace(layered, laminate=Laminate((half, heavier)))),
+        (of_layers, replace(thicker, laminate=layered.laminate)),
+        (replace(table, plate=plates[3]), plates[3].scaled(thickness=1.02)),
+    ):
+        with pytest.raises(InputError):
+            table_following(one, replace(rig, plate=other))
     for other in (replace(rig, eras=rig.eras[:3]), *(replace(rig, plate=each) for each in plates)):
         with pytest.raises(InputError):
             table_following(table, other)

@@ -57,6 +57,7 @@ from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.host.stop import Stopped
+from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 
 _logger = logging.getLogger(__name__)
@@ -133,6 +134,7 @@ class ApiService:
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
+            slow_because=why_slow(),
             uptime_s=now - self._started,
         )
 

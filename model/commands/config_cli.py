@@ -44,12 +44,14 @@ def check(
 
     List all errors; exit with 1 if there are any.
     """
+    from model.compiled.kernels import why_slow
     from model.config.document import ConfigError, read_document
     from model.config.kinds import kind_of
 
     try:
         document = read_document(file)
         good = kind_of(document).check(document)
+        warnings = [*good.warnings, *filter(None, [why_slow()])]
     except ConfigError as error:
         problems = [
             {"line": problem.line, "key": problem.key, "message": problem.message}
@@ -60,11 +62,11 @@ def check(
         )
         raise typer.Exit(1) from error
     if as_json:
-        answer = {"ok": True, "errors": [], "warnings": list(good.warnings)}
+        answer = {"ok": True, "errors": [], "warnings": warnings}
         typer.echo(json.dumps(answer))
         return
     typer.echo(f"{file}: {good.line}")
-    for warning in good.warnings:
+    for warning in warnings:
         typer.echo(f"warning: {warning}")
 
 

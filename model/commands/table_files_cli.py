@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -239,6 +240,7 @@ def build(
     as_json: JsonOption = False,
 ) -> None:
     """Solve the plate and write its table."""
+    from model.compiled.kernels import why_slow
     from model.drive_modes import DRIVE_MODES
     from model.finger.grid import Grid
     from model.rig.file import load_rig
@@ -262,7 +264,7 @@ def build(
     save_table(table, output)
     elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
-    warning = _coarse(error, table.mesh)
+    warnings = [*filter(None, (_coarse(error, table.mesh), why_slow()))]
     if as_json:
         answer = {
             "patterns": table.pattern_count,
@@ -279,7 +281,7 @@ def build(
             "files": [str(output)],
         }
         print(json.dumps(answer))
-        _warn(warning)
+        _warn(warnings)
         return
     print(
         f"{counted(table.pattern_count, 'pattern')} of "
@@ -293,7 +295,7 @@ def build(
     if note := rig.uncertainty.note:
         print(note)
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
-    _warn(warning)
+    _warn(warnings)
     print(next_line("era", "table", "show", output))
 
 
@@ -311,6 +313,6 @@ def _coarse(error: float, mesh: "PlateMesh") -> str | None:
     )
 
 
-def _warn(warning: str | None) -> None:
-    if warning:
+def _warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
         typer.echo(f"era: warning: {warning}", err=True)

@@ -4,7 +4,7 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from model.cli import app
+from model.compiled.kernels import WITHOUT_KERNELS
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.table import overview
@@ -164,3 +165,16 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
     assert (tmp_path / "t.mat").read_bytes().startswith(b"MATLAB 5.0")
     with pytest.raises(InputError, match="--content"):
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
+
+
+def test_commands_say_that_there_is_no_compiler(
+    without_kernels: Callable[[], None], tmp_path: Path
+) -> None:
+    """`era table build` and `era config check`, with how much longer answers take; exit status 0."""
+    without_kernels()
+    built = table("build", RIG, "-o", tmp_path / "t.npz", *QUICK)
+    checked = CliRunner().invoke(app, ["config", "check", RIG, "--json"])
+    assert (built.exit_code, checked.exit_code) == (0, 0)
+    assert WITHOUT_KERNELS in built.stderr
+    (warning,) = json.loads(checked.stdout)["warnings"]
+    assert warning.startswith(WITHOUT_KERNELS)

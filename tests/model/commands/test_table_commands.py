@@ -170,7 +170,7 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
 def test_commands_say_that_there_is_no_compiler(
     without_kernels: Callable[[], None], tmp_path: Path
 ) -> None:
-    """`era table build` and `era config check`, with how much longer answers take; exit status 0."""
+    """`era table build` and `era config check`, with how much longer answers take."""
     without_kernels()
     built = table("build", RIG, "-o", tmp_path / "t.npz", *QUICK)
     checked = CliRunner().invoke(app, ["config", "check", RIG, "--json"])

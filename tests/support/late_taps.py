@@ -23,7 +23,6 @@ from chain import Chain
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import DriverError
-from drivers.host.members import GroupState
 from model.rig.rig import Channel
 from model.vibration.excitation import Tone
 from registry.limits import GuardLimits
@@ -132,8 +131,7 @@ async def _armed(chain: Chain) -> None:
             if not chain.controller.group.is_open:
                 await chain.controller.release()
                 await chain.controller.open()
-            if chain.controller.group.state is GroupState.STOPPED:
-                await chain.operate("clear")
+            await chain.operate("clear")  # also of a late copy of a stop
             await chain.operate("arm")
         await asyncio.sleep(0.05)
     raise TimeoutError("could not be armed")

@@ -98,7 +98,7 @@ class StatusResult(Playing, Explained):
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"
     )
-    slow_because: str | None = Field(None, description="why answers take longer than they need")
+    slow_reason: str | None = Field(None, description="why answers take longer than they need")
     uptime_s: float
 
 

@@ -28,7 +28,7 @@ def show_status(status: StatusResult) -> str:
         ),
         headline(status.state, status.cause),
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
-        *_given(("  slow: {}", status.slow_because)),
+        *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
         *map(_contact, status.contacts),
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),

@@ -134,7 +134,7 @@ class ApiService:
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
-            slow_because=why_slow(),
+            slow_reason=why_slow(),
             uptime_s=now - self._started,
         )
 

@@ -44,7 +44,7 @@ class Responses:
 
     sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
     has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
-    known, and no polarity; left_out: number of values beyond the rig's limits of frequency.
+    known, and no polarity; skipped: number of values beyond the rig's limits of frequency.
     """
 
     sensors: tuple[str, ...]
@@ -52,7 +52,7 @@ class Responses:
     frequencies: FloatArray
     values: ComplexArray
     has_phases: bool = True
-    left_out: int = 0
+    skipped: int = 0
 
     @property
     def count(self) -> int:
@@ -84,15 +84,15 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     """
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     within = [each for each in measured if low <= each.frequency <= high]
-    left_out = len(measured) - len(within)
+    skipped = len(measured) - len(within)
     limits = f"the rig's limits.frequency of {low:g} to {high:g} Hz"
     if measured and not within:
         raise InputError(
             f"{measured[0].place}: a frequency must be within {limits}, got "
             f"{measured[0].frequency:g} Hz; measure others or widen the limits"
         )
-    if left_out:
-        _logger.warning("%d of %d values beyond %s are left out", left_out, len(measured), limits)
+    if skipped:
+        _logger.warning("%d of %d values beyond %s are left out", skipped, len(measured), limits)
     sensors: dict[str, tuple[float, float]] = {}
     first: dict[str, str] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
@@ -123,7 +123,7 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
         values[np.searchsorted(frequencies, frequency), number, column[sensor]] = value
     # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    return Responses(tuple(sensors), points, frequencies, values, left_out=left_out)
+    return Responses(tuple(sensors), points, frequencies, values, skipped=skipped)
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:

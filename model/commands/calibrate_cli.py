@@ -82,7 +82,7 @@ def calibrate(
     )
     finish(
         [heading, "", *rows, *calibration_report.gain_rows(calibration), "", *notes],
-        calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.left_out}
+        calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
         if as_json
         else None,
         files=files,

@@ -27,7 +27,7 @@ function silenceText({ silence, may_play_for_s }) {
 
 // eras: of the rig, for the names of the channels.
 function tile(amplifier, eras) {
-  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost, silence, reports } = amplifier;
+  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost, silence, reports = [] } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty || reports.length ? "tile bad" : "tile");
   const title = element("h3");

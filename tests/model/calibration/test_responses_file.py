@@ -221,7 +221,7 @@ def test_values_beyond_the_limits_are_left_out(responses, coarse_rig, tmp_path, 
     write_responses_csv(path, responses, coarse_rig)
     path.write_text(path.read_text("utf-8").replace(",50.0,", ",0.0,"), "utf-8")
     back = responses_of(read_measured(path), coarse_rig)
-    assert (back.left_out, back.count, back.frequencies.tolist()) == (6, 11, [110.25, 320.0])
+    assert (back.skipped, back.count, back.frequencies.tolist()) == (6, 11, [110.25, 320.0])
     assert "6 of 17" in caplog.text
 
 

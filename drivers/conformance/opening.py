@@ -8,7 +8,7 @@ from functools import partial
 
 from drivers import clock, trace
 from drivers.conformance.can_frames import CanClient
-from drivers.conformance.client import Client, Port, Violation
+from drivers.conformance.client import Client, Late, Port, Violation
 from drivers.conformance.modbus_frames import ModbusClient
 from drivers.conformance.serial_frames import SerialClient
 from drivers.errors import LinkError
@@ -56,9 +56,10 @@ async def opened(url: str) -> AsyncIterator[Client]:
     client.port = _TracedPort(port, url)
     try:
         boots_until = clock.now() + address.boot_time
-        while clock.now() < boots_until and not client.order:  # nothing was heard yet
-            with contextlib.suppress(Violation):
+        while clock.now() < boots_until:  # what a board says while it starts is no reply
+            with contextlib.suppress(Violation, Late):
                 await client.hello()
+                break
         client.session = random.getrandbits(16)
         client.wire_time = address.make_wire().exchange_time
         client.transit = client.wire_time(0, MAX_WORDS)

@@ -195,8 +195,11 @@ class Controller:
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send the stop that it is owed.
 
-        Raises LinkError, CommandError.
+        One whose line has stayed open is the same as before. Raises LinkError, CommandError.
         """
+        before = self._opened.get(name)
+        if before is not None and before.line.loss is None:
+            return before
         amplifier = await lines.amplifier(
             self.urls[name],
             self._rig.limits,
@@ -204,8 +207,8 @@ class Controller:
             serial_number=self._serial_numbers.get(name),
             is_output=name in self._rig.outputs,
         )
-        if name in self._opened:
-            amplifier.go_on_from(self._opened[name])
+        if before is not None:
+            amplifier.go_on_from(before)
         self._opened[name] = self.group.amplifiers[name] = amplifier
         if name in self._owed:
             stopping = _identified(amplifier, self.group.stop(waits_for=[name]))
@@ -237,7 +240,10 @@ class Controller:
         The requests on open lines are queued when this returns. Await it for what is known of each,
         by name: of one whose line is opened within 0.3 s by its reply.
         """
-        stopping = self.group.stop()
+        stopping: Awaitable[Mapping[str, Stopped]] = self.group.stop()
+        for each in self.group.amplifiers.values():
+            if not each.identity and each.line.loss is None:  # others are still searched for
+                stopping = asyncio.ensure_future(_identified(each, stopping))
         self._owe()
         return self._stopped(stopping, {**self._owed})
 

@@ -52,9 +52,9 @@ class Lines:
         CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
         address that is taken by one of another name; one of this name gives way.
         """
-        address = address_of(url)
+        address, before = address_of(url), self._opened
         async with self._changing.setdefault(address.line, asyncio.Lock()):
-            before, opened = self._opened, self._opened.get(address.line)
+            opened = self._opened.get(address.line)
             if opened is not None and opened.line.loss is not None:
                 del self._opened[address.line]
                 await opened.close()

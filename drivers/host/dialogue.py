@@ -107,7 +107,7 @@ class Feeding:
 
     def tells(self, sent_at: float) -> bool:
         """Whether a status asked for at a time [s] would show a watchdog that stands still."""
-        return sent_at - self.confirmed_at > REACTION
+        return self.may <= self.since and sent_at - self.confirmed_at > REACTION
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.

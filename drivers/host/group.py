@@ -20,7 +20,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
-from drivers.host.line import GRACE, Line
+from drivers.host.line import Line
 from drivers.host.members import GroupState, Members, is_lost
 from drivers.host.stop import Stopped, what_may_play
 from drivers.host.timing import STOP_RAMP, check_watchdog
@@ -59,6 +59,7 @@ class Group(Members):
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
         self._running_due: dict[str, float] = {}  # statuses just before a heartbeat
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
+        self._gives_up_at = math.inf  # s; nothing is repeated later, since all is being closed
 
     @property
     def is_silencing(self) -> bool:
@@ -70,7 +71,7 @@ class Group(Members):
 
         Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
         """
-        before = self.epoch
+        before, self._gives_up_at = self.epoch, math.inf
         await self.all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
@@ -135,7 +136,7 @@ class Group(Members):
         await arming
         disarmed = await asyncio.gather(
             *[
-                _retried(each, partial(each.disarm, STOP_RAMP))
+                self._retried(each, partial(each.disarm, STOP_RAMP))
                 for each in self.amplifiers.values()
                 if each.may_be_armed
             ],
@@ -159,19 +160,15 @@ class Group(Members):
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
-        lines = self._feed_together()
+        running: dict[str, asyncio.Future[Values]] = {}
+        late = self._feed_together(partial(self._read_one, running))
         feeding: list[Awaitable[Values]] = []
         for name in self.by_need:
             each = self.amplifiers[name]
             if each.silence_cause is None:
-                now = each.line.time()
-                # Where replies come late one of a line alone: none waits for long to be fed.
-                may_read = each.line not in lines or each.line.late <= GRACE
-                lines.add(each.line)
-                is_due = may_read and now >= self._running_due.get(name, 0.0)
-                if is_due and each.feeding.tells(now):
-                    pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
-                    self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
+                if name in running:
+                    feeding.append(self._read_and_feed(each, self.epoch, running[name]))
+                elif each.line not in late and self._is_running_due(each):
                     feeding.append(self._read_and_feed(each, self.epoch))
                 else:
                     feeding.append(each.ping())
@@ -181,8 +178,31 @@ class Group(Members):
                 self._readings[name] = reading
         return self.all(feeding)
 
-    async def _read_and_feed(self, amplifier: Amplifier, before: int) -> Values:
-        await amplifier.read_status(Priority.HEARTBEAT)
+    def _is_running_due(self, amplifier: Amplifier) -> bool:
+        """Whether a status is due that shows if a watchdog runs down; if so, the next is later."""
+        now = amplifier.line.time()
+        if now < self._running_due.get(amplifier.name, 0.0) or not amplifier.feeding.tells(now):
+            return False
+        pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+        self._running_due[amplifier.name] = now + max(pause, _STATUS_INTERVAL)
+        return True
+
+    def _read_one(
+        self, running: dict[str, "asyncio.Future[Values]"], members: Sequence[Amplifier]
+    ) -> None:
+        """Read the status of one amplifier alone, before all are fed: none waits for long."""
+        for each in sorted(members, key=lambda one: one.feeding.since):
+            if each.silence_cause is None and self._is_running_due(each):
+                running[each.name] = each.read_status(Priority.HEARTBEAT)
+                return
+
+    async def _read_and_feed(
+        self,
+        amplifier: Amplifier,
+        before: int,
+        reading: "asyncio.Future[Values] | None" = None,
+    ) -> Values:
+        await (reading or amplifier.read_status(Priority.HEARTBEAT))
         self.check_none_since(before)
         return await amplifier.ping()
 
@@ -194,11 +214,9 @@ class Group(Members):
         self._leave_armed()
         await self._silenced(self._disarm, [*self.amplifiers.values()], ramp)
 
-    async def _disarm(
-        self, members: Sequence[Amplifier], ramp: float, until: float = math.inf
-    ) -> None:
+    async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
         try:
-            await self.all([_retried(each, partial(each.disarm, ramp), until) for each in members])
+            await self.all([self._retried(each, partial(each.disarm, ramp)) for each in members])
         except BaseException:
             await self.stop()
             raise
@@ -282,7 +300,7 @@ class Group(Members):
     async def _read(self, priority: Priority) -> dict[str, Values]:
         amplifiers = self.amplifiers.values()
         statuses = await self.all(
-            [_retried(each, partial(each.read_status, priority)) for each in amplifiers]
+            [self._retried(each, partial(each.read_status, priority)) for each in amplifiers]
         )
         return dict(zip(self.amplifiers, statuses, strict=True))
 
@@ -294,6 +312,8 @@ class Group(Members):
         is_armed, now = self.is_armed, clock.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
+        # Of one that does not reply by then a stop is all that is left.
+        self._gives_up_at = min(self._gives_up_at, now + CONFIRM_TIMEOUT)
         async with self._closing:
             members = [
                 each
@@ -305,15 +325,23 @@ class Group(Members):
                     or (each.line.loss is None and what_may_play(each).may_play_until > now)
                 )
             ]
-            if self._silencing:  # a line is closed once what stops on it has ended
-                await asyncio.wait({*self._silencing})
-            if not members:
-                return
             try:
-                # Of one that does not reply by then a stop is all that is left.
-                await self._silenced(self._disarm, members, ramp, now + CONFIRM_TIMEOUT)
+                if members:
+                    await self._silenced(self._disarm, members, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
+            if self._silencing:  # a line is closed once what stops on it has ended
+                await asyncio.wait({*self._silencing})
+
+    async def _retried(self, amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
+        """Repeat a request until it is answered, the amplifier is lost, or all is being closed."""
+        while True:
+            try:
+                return await request()
+            except LinkTimeout:
+                if is_lost(amplifier) or clock.now() > self._gives_up_at:
+                    raise
+                await asyncio.sleep(_REPEAT_INTERVAL)
 
     def _silenced(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
@@ -335,19 +363,6 @@ def _seen(sent: "asyncio.Future[Values]") -> None:
     """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
     if not sent.cancelled():
         sent.exception()
-
-
-async def _retried(
-    amplifier: Amplifier, request: Callable[[], Awaitable[_T]], until: float = math.inf
-) -> _T:
-    """Repeat a request until it is answered or the amplifier is lost, or until a time [s]."""
-    while True:
-        try:
-            return await request()
-        except LinkTimeout:
-            if is_lost(amplifier) or clock.now() > until:
-                raise
-            await asyncio.sleep(_REPEAT_INTERVAL)
 
 
 async def _to_completion(task: "asyncio.Future[_T]") -> _T:

@@ -348,24 +348,28 @@ class Members:
         for name, status in zip(requests, statuses, strict=False):
             await _check_plays(self.amplifiers[name], status, token)
 
-    def _feed_together(self) -> set[Line]:
+    def _feed_together(
+        self, before: Callable[[Sequence[Amplifier]], None] = lambda members: None
+    ) -> set[Line]:
         """Feed all amplifiers of a line at once whose replies come late, before each in its turn.
 
-        By a commit of the set that all have committed last, which changes nothing. Returns the
-        lines of which they have not committed the same.
+        By a commit of the set that all have committed last, which changes nothing; where they have
+        not committed the same it is left out. before: called with the amplifiers of a line that is
+        fed next. Returns the lines whose replies come late.
         """
-        unfed = set[Line]()
+        late = set[Line]()
         for line in {each.line for each in self.amplifiers.values()}:
             members = [each for each in self.amplifiers.values() if each.line is line]
             tokens = {each.committed for each in members}
             if line.late <= GRACE or len(members) == 1:
                 continue
+            late.add(line)
             if len(tokens) > 1 or 0 in tokens:
-                unfed.add(line)
                 continue
+            before(members)
             make = partial(_commit_of, members, tokens.pop(), "Ping")
             line.submit(None, Priority.HEARTBEAT, "Commit", {}, make=make)
-        return unfed
+        return late
 
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""

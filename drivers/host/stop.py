@@ -58,14 +58,15 @@ def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
 
     cause: why no more is known, by default what ails its line. Over is what confirmed a stop, and
     was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was never
-    fed is over once it has shown that it is silent. One that shows more after its watchdog must
-    have silenced it is fed by another, or broken. A status after the stop alone confirms it.
+    fed is over once it has shown that it is silent. One that shows more after it was confirmed, or
+    its watchdog must have silenced it, is fed by another, or broken. A status after the stop alone
+    confirms it.
     """
     known, status, at = amplifier.known, amplifier.status, amplifier.status_at
     cause = cause or amplifier.line.loss or amplifier.silence_cause or ""
-    if known.is_confirmed:
-        return Stopped(False, known.may_play_until, cause)
-    until = max(amplifier.feeding.may_play_until, known.may_play_until)
+    until = known.may_play_until
+    if not known.is_confirmed:
+        until = max(until, amplifier.feeding.may_play_until)
     if status is not None and at is not None:
         is_armed = status["state"] == ENABLED
         if amplifier.is_silent(status) and not is_armed:  # and identified

@@ -109,6 +109,7 @@ STATES: Mapping[str, tuple[Sequence[Step], str, float | None]] = {
     "shows a level": ([*REACHED, "ARM", LOUD], MAY_PLAY, None),
     "shows a level, then lost": ([*REACHED, LOUD, {"waits": 1}, MUTE], MAY_PLAY, None),
     "silent": ([*REACHED, "ARM"], SILENT, None),
+    "silent, then shows a level": ([*REACHED, "ARM", "STOP", LOUD], MAY_PLAY, None),
     "silent, then lost": ([*REACHED, "ARM", "STOP", *LOST], ELAPSED, 0.0),
     "exchanged while stopped": ([*REACHED, "ARM", "STOP", ANOTHER, "CLEAR"], ELAPSED, 0.0),
 }
@@ -140,14 +141,17 @@ async def test_stop_says_what_is_known(state: str) -> None:
         await daemon.waits(8)
 
 
+@pytest.mark.parametrize("amid", ["DISARM", {"waits": 0.1}])
 @in_virtual_time
-async def test_end_does_not_wait_for_a_mute_amplifier() -> None:
+async def test_end_does_not_wait_for_a_mute_amplifier(amid: Step) -> None:
     """Armed, on a network that may deliver for 1 s: it is stopped, and all ends within a second."""
     async with watched(wire="modbus-tcp", breaks="plate") as daemon:
         await daemon.does("ARM")
         await daemon.take(MUTE)
+        await daemon.begins(amid)
         await daemon.waits(0.1)
         began = clock.now()
         await daemon.supervisor.close("the end")
         assert clock.now() - began < 0.9
+        await daemon.ends_anyhow(amid)
         daemon.recovers()

@@ -4,7 +4,10 @@ from collections import Counter
 
 import pytest
 
+from courses import Acted
 from late_taps import AMPLIFIERS, WIRES, play
+from set_chain import set_running
+from virtual_loop import in_virtual_time
 
 
 @pytest.mark.parametrize("amplifiers", AMPLIFIERS)
@@ -19,3 +22,16 @@ def test_late_frames_are_no_fault(wire: str, amplifiers: int) -> None:
     assert not counts - Counter(["clicks"] * taps)
     assert too_late > 0
     assert played + too_late >= 0.9 * taps
+
+
+@in_virtual_time
+async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> None:
+    """On a line that amplifiers share, where one commit feeds all of them before each in turn."""
+    async with set_running("a", "b", of=Acted, wire="modbus-rtu") as chain:
+        chain.witness.disturb()  # a status goes before what feeds
+        chain.delays(0.012)
+        await chain.holds(1.0, "finger")
+        assert chain.controller.group.is_armed
+        chain.answer("GetStatus", watchdog_left=250)
+        await chain.holds(3.0, "finger")
+        assert not chain.controller.group.is_armed

@@ -39,14 +39,15 @@ async def read_for_ever(amplifier: Amplifier) -> None:
 
 
 class SlowPort:
-    """Opens and closes in half a second; closed: how many were closed."""
+    """Opens and closes in half a second; opened, closed: how many were."""
 
     is_blocked = False
-    closed = 0
+    opened = closed = 0
 
     async def open(self, *_: object) -> Port:
         """Open a port, which is this one."""
         await asyncio.sleep(0.5)
+        self.opened += 1
         return self
 
     def write(self, data: bytes) -> None:
@@ -84,12 +85,16 @@ async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
     port = SlowPort()
     PORT_OPENER.set(port.open)
     lines = Lines()
-    opening = asyncio.ensure_future(lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x"))
+    opening = [
+        asyncio.ensure_future(lines.amplifier(f"serial:///dev/x?address={n}", LIMITS, name=f"{n}"))
+        for n in (1, 2)
+    ]
     await asyncio.sleep(0.1)
     await lines.close()
-    with pytest.raises(LinkError, match="closed"):
-        await opening
-    assert port.closed == 1
+    for each in opening:
+        with pytest.raises(LinkError, match="closed"):
+            await each
+    assert port.closed == port.opened
 
 
 @pytest.mark.real_time

@@ -1,13 +1,13 @@
 """`era measure`: frequency responses of a plate through a sound card."""
 
-import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.options import JsonOption, RigArgument, next_line
+from model.commands.options import JsonOption, RigArgument, next_line, print_report
 
 if TYPE_CHECKING:
     from sim.measuring.measure import Measured, Stepped
@@ -88,14 +88,13 @@ def measure(
     write = write_responses_csv if output.suffix.lower() == ".csv" else write_responses_uff
     write(output, found.responses, rig)
     elapsed = time.perf_counter() - started
-    if as_json:
-        print(
-            json.dumps(_as_json(found, check) | {"measure_time_s": elapsed, "files": [str(output)]})
-        )
-        return
-    _print(found, check, rate=rate)
-    print(f"measured in {elapsed:.1f} s; wrote {output}")
-    print(next_line("era", "calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated")))
+    rows = [
+        *_rows(found, check, rate=rate),
+        f"measured in {elapsed:.1f} s; wrote {output}",
+        next_line("era", "calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated")),
+    ]
+    answer = _as_json(found, check) | {"measure_time_s": elapsed, "files": [str(output)]}
+    print_report(rows, answer, as_json=as_json)
 
 
 def _as_json(found: "Measured", check: "Stepped | None") -> dict[str, Any]:
@@ -119,24 +118,25 @@ def _as_json(found: "Measured", check: "Stepped | None") -> dict[str, Any]:
     }
 
 
-def _print(found: "Measured", check: "Stepped | None", *, rate: float) -> None:
+def _rows(found: "Measured", check: "Stepped | None", *, rate: float) -> Iterator[str]:
+    """Yield how well responses were measured."""
     import numpy as np
 
     lines = found.responses.frequencies
-    print(
+    yield (
         f"{len(lines)} frequencies from {lines[0]:g} to {lines[-1]:g} Hz; delay of the sound card "
         f"{1e3 * found.latency:.3f} ms ({found.latency * rate:.1f} samples); "
         f"{found.repeated} runs repeated for lost blocks"
     )
-    print("sensor      coherence   lowest   noise    square law")
+    yield "sensor      coherence   lowest   noise    square law"
     for n, name in enumerate(found.responses.sensors):
-        print(
+        yield (
             f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
             f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
             f"{100 * found.even[n]:8.2f} %"
         )
     if check is not None:
-        print(
+        yield (
             f"stepped tones differ by {check.level_db[0]:.3f} dB rms, {check.level_db[1]:.2f} dB "
             f"at most, and {check.phase_deg[0]:.2f}° rms, {check.phase_deg[1]:.1f}° at most"
         )

@@ -1,12 +1,18 @@
 """`era demo`: the whole chain on a simulated plate."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import ExactOption, JsonOption, SeedOption, next_line, seed_of_plate
+from model.commands.options import (
+    ExactOption,
+    JsonOption,
+    SeedOption,
+    next_line,
+    print_report,
+    seed_of_plate,
+)
 from model.counting import counted
 from model.errors import InputError
 
@@ -96,26 +102,21 @@ def demo(
         )
     )
     files = write_pictures(table, rows, out)
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "wire": wire,
-                    "touches": [row.as_json() for row in rows],
-                    "files": [str(file) for file in files],
-                }
-            )
-        )
-        return
-    print(_summary(rows))
-    if wire == "sim" and len(rig.amplifiers) > 1:
-        print(_NO_BUS)
-    for file in files:
-        print(f"wrote {file}")
-    if own_rig is None:
-        print(next_line("era", "config", "init", "my_rig.yaml"))
-    else:
-        print(next_line("era", "table", "build", own_rig, "-o", "table.npz"))
+    further: tuple[str | Path, ...] = ("config", "init", "my_rig.yaml")
+    if own_rig is not None:
+        further = ("table", "build", own_rig, "-o", "table.npz")
+    answer = {
+        "wire": wire,
+        "touches": [row.as_json() for row in rows],
+        "files": [str(file) for file in files],
+    }
+    lines = [
+        _summary(rows),
+        _NO_BUS if wire == "sim" and len(rig.amplifiers) > 1 else None,
+        *(f"wrote {file}" for file in files),
+        next_line("era", *further),
+    ]
+    print_report(lines, answer, as_json=as_json)
 
 
 _NO_BUS = (

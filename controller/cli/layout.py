@@ -1,12 +1,11 @@
 """`era layout check`: how a surface layout will feel."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, print_report
 from model.counting import counted
 
 if TYPE_CHECKING:
@@ -65,25 +64,22 @@ def check(
         save_figure(check_figure(layout, table, checked, together), picture)
         files = [str(picture)]
     problems = sum(len(each.problems) for each in checked)
-    if as_json:
-        regions = [each.as_json() for each in checked]
-        at_once = [each.as_json() for each in together]
-        found = {"regions": regions, "promised_together": at_once}
-        print(json.dumps({**found, "files": files, "check_time_s": elapsed}))
-    else:
-        for each in checked:
-            print("\n".join(_lines(each)))
-        if together:
-            print("\n".join(_matrix(*matrix_of(together))))
-        touches = sum(len(each.touches) for each in checked)
-        outcome = counted(problems, "problem") if problems else "good"
-        outcome += close_pairs(together)
-        print(
-            f"{layout_file}: {outcome}; {counted(touches, 'touch', plural='touches')} in "
-            f"{elapsed:.1f} s"
-        )
-        for name in files:
-            print(f"wrote {name}")
+    touches = sum(len(each.touches) for each in checked)
+    outcome = counted(problems, "problem") if problems else "good"
+    rows = [
+        *(line for each in checked for line in _lines(each)),
+        *(_matrix(*matrix_of(together)) if together else ()),
+        f"{layout_file}: {outcome}{close_pairs(together)}; "
+        f"{counted(touches, 'touch', plural='touches')} in {elapsed:.1f} s",
+        *(f"wrote {name}" for name in files),
+    ]
+    answer = {
+        "regions": [each.as_json() for each in checked],
+        "promised_together": [each.as_json() for each in together],
+        "files": files,
+        "check_time_s": elapsed,
+    }
+    print_report(rows, answer, as_json=as_json)
     if problems:
         raise typer.Exit(FAILED)
 

@@ -1,6 +1,5 @@
 """`era rig check`: whether a rig is wired and built as its file says; the group `era rig`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -14,7 +13,7 @@ from controller.cli.identify import (
     require_untouched,
     rig_of_file,
 )
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, print_report
 from model.counting import counted
 from model.errors import InputError
 
@@ -82,7 +81,7 @@ def check(
     if (measured is None) == (url is None):
         raise InputError("give --url, of an amplifier with sensors, or --measured, a file")
     details: dict[str, object] = {}
-    rows: list[str] = []
+    rows: list[str | None] = []
     if url is not None:
         if mesh is not None:
             raise InputError("--mesh is of --measured; write mesh into the rig file")
@@ -99,23 +98,21 @@ def check(
     started = time.perf_counter()
     verdict = diagnose(rig, observation)
     elapsed = time.perf_counter() - started
-    if as_json:
-        exactly_known = [*rig.uncertainty.exactly_known]
-        answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
-        print(json.dumps({**diagnosis_report.as_json(verdict), **details, **answer}))
-    else:
-        low, high = verdict.frequencies.min(), verdict.frequencies.max()
-        rows.append(
-            f"{rig_file}: {counted(len(verdict.sensors), 'sensor')}, "
-            f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
-            f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
-        )
-        if note := rig.uncertainty.note:
-            rows.append(note)
-        rows += ["", *diagnosis_report.channel_table(verdict), ""]
-        rows += diagnosis_report.verdict_rows(verdict)
-        rows += diagnosis_report.difference_rows(verdict)
-        print("\n".join(rows))
+    low, high = verdict.frequencies.min(), verdict.frequencies.max()
+    rows += [
+        f"{rig_file}: {counted(len(verdict.sensors), 'sensor')}, "
+        f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
+        f"from {low:g} to {high:g} Hz, {elapsed:.1f} s",
+        rig.uncertainty.note,
+        "",
+        *diagnosis_report.channel_table(verdict),
+        "",
+        *diagnosis_report.verdict_rows(verdict),
+        *diagnosis_report.difference_rows(verdict),
+    ]
+    exactly_known = [*rig.uncertainty.exactly_known]
+    answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
+    print_report(rows, {**diagnosis_report.as_json(verdict), **details, **answer}, as_json=as_json)
     if not verdict.is_well:
         raise typer.Exit(FAILED)
 

@@ -28,14 +28,9 @@ from controller.api.methods import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import Empty, headline
+from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
-from controller.daemon.api_views import (
-    amplifier_silence,
-    effects_result,
-    hello_result,
-    playing_of,
-)
+from controller.daemon.api_views import effects_result, hello_result, playing_of
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
@@ -317,7 +312,7 @@ async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> St
     """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
     now = clock.now()
-    amplifiers = {name: amplifier_silence(each, now) for name, each in outcomes.items()}
+    amplifiers = {name: AmplifierSilence(**each.rows(now)) for name, each in outcomes.items()}
     if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
         raise NotSilent(amplifiers)
     return StopResult(epoch=epoch, amplifiers=amplifiers)

@@ -48,21 +48,26 @@ _VOLTAGE, _HIGH_VOLTAGE = QUANTITIES["voltage"], STATUS_FLAGS["high_voltage"]
 
 @dataclass
 class PlateView:
-    """Contacts on the plate and the pattern that plays, as last reported by the control loop.
+    """Contacts on the plate, and what the control loop has last reported of what plays.
 
-    effect_of: the effect that plays for a contact; silenced: None while a pattern plays; why_not:
-    why a contact feels nothing that these do not say, "" if it shall.
+    effect_of: the effect that plays for a contact; report: None before the first, and once others
+    have silenced what played; why_not: why a contact feels nothing that these do not say, "" if it
+    shall.
     """
 
     effect_of: Callable[[ContactKey], str | None]
     contacts: tuple[Contact, ...] = ()
-    applied: Applied | None = None
-    silenced: Silenced | None = None
+    report: Applied | Silenced | None = None
     why_not: Callable[[ContactKey], str] = lambda key: ""
+
+    @property
+    def applied(self) -> Applied | None:
+        """The pattern that plays; None while nothing does."""
+        return self.report if isinstance(self.report, Applied) else None
 
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts with their roles."""
-        return self._statuses(self.contacts, self.applied or self.silenced)
+        return self._statuses(self.contacts)
 
     @property
     def silence_reason(self) -> str | None:
@@ -72,10 +77,8 @@ class PlateView:
         reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
         return "; ".join(filter(None, reasons)) or NO_CONTACTS
 
-    def _statuses(
-        self, contacts: Iterable[Contact], report: Applied | Silenced | None
-    ) -> list[ContactStatus]:
-        reason = ""
+    def _statuses(self, contacts: Iterable[Contact]) -> list[ContactStatus]:
+        report, reason = self.report, ""
         if isinstance(report, Silenced) and not report.targets:  # as by a failure
             reason = report.reason
         known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
@@ -118,18 +121,18 @@ class PlateView:
         if applied is None:
             return None
         return PatternEvent(
-            contacts=self._statuses(applied.contacts, applied),
+            contacts=self._statuses(applied.contacts),
             **playing_of(applied),
             latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
 
     def silence_event(self) -> SilenceEvent | None:
         """The event of topic `silence`; None while something plays, or before a decision."""
-        silenced = self.silenced
-        if silenced is None:
+        silenced = self.report
+        if not isinstance(silenced, Silenced):
             return None
         return SilenceEvent(
-            contacts=self._statuses(silenced.contacts, silenced),
+            contacts=self._statuses(silenced.contacts),
             reason=silenced.reason,
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
         )
@@ -332,7 +335,7 @@ def _amplifier_status(
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
         reports=reports,
-        silence=amplifier_silence(what_may_play(name), clock.now())
+        silence=AmplifierSilence(**what_may_play(name).rows(clock.now()))
         if status is None or is_degraded
         else None,
         statistics=LinkCounters(
@@ -355,11 +358,6 @@ def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     if kind == "limited" and targets:
         cause += f", and fingers feel less than promised: {', '.join(targets)}"
     return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
-
-
-def amplifier_silence(stopped: Stopped, now: float) -> AmplifierSilence:
-    """Describe what an amplifier may play at a time [s], after a stop or as it is known."""
-    return AmplifierSilence(**stopped.rows(now))
 
 
 def learning_summary(

@@ -115,9 +115,9 @@ class Operator:
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
 
-    def note_lost(self, error: Exception) -> None:
+    def note_lost(self, names: tuple[str, ...], error: Exception) -> None:
         """Note which amplifiers are lost now, where that is known, and the present cause."""
-        lost, names = self.operation.lost, error.lost if isinstance(error, LinkError) else ()
+        lost = self.operation.lost
         if lost is not None:
             lost = lost._replace(names=names or lost.names)
             self.operation = replace(
@@ -232,8 +232,7 @@ class Operator:
                 await self._stop()
             case Action.REACT:
                 await self._stop()
-                cause, remedy = self.operation.cause, self.operation.remedy
-                await self.handle(DaemonEvent(Trigger.REACTION_DONE, cause, remedy))
+                await self.handle(DaemonEvent(Trigger.REACTION_DONE))
             case Action.CLEAR:
                 await self._over_link(self._clear(epoch), epoch)
             case Action.RECONNECT:
@@ -258,7 +257,7 @@ class Operator:
         except DriverError as error:
             is_stopping = isinstance(error, Preempted) and self.operation.is_latched
             if epoch == self.operation.epoch and not is_stopping:
-                await self.handle(DaemonEvent(Trigger.FAULT, str(error), acknowledge(str(error))))
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error)))
             raise
 
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
@@ -300,7 +299,7 @@ class Operator:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
             await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
         else:
-            await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
+            await self.handle(DaemonEvent(Trigger.FAULT, problem))
 
     async def _clear(self, epoch: int) -> None:
         self._clears.append(epoch)
@@ -312,7 +311,7 @@ class Operator:
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
-        await self.handle(DaemonEvent(Trigger.FAULT, problem, acknowledge(problem)))
+        await self.handle(DaemonEvent(Trigger.FAULT, problem))
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     def _check_none_since(self, epoch: int) -> None:

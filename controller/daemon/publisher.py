@@ -6,6 +6,7 @@ import logging
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -91,8 +92,8 @@ class EventPublisher:
         """The observer of the control loop."""
         return Observer(
             contacts_changed=self._contacts_changed,
-            pattern_applied=self._pattern_applied,
-            silenced=self._silenced,
+            pattern_applied=partial(self._reported, "pattern"),
+            silenced=partial(self._reported, "silence"),
             refused=lambda reason: _logger.warning("refused: %s", reason),
         )
 
@@ -102,8 +103,8 @@ class EventPublisher:
         if new.state is DaemonState.OPERATION_ENABLED:
             return
         # The control loop does not report the end of what others have silenced.
-        applied, self.view.applied, self.view.silenced = self.view.applied, None, None
-        if applied is not None:
+        was_playing, self.view.report = self.view.applied is not None, None
+        if was_playing:
             silence = SilenceEvent(
                 contacts=self.view.contact_statuses(),
                 reason=new.cause,
@@ -179,21 +180,14 @@ class EventPublisher:
         self.view.contacts = contacts
         self.hub.publish("contacts", self.view.contacts_event)
 
-    def _pattern_applied(self, applied: Applied) -> None:
-        self.view.applied, self.view.silenced = applied, None
-        self._count(applied)
-        self.hub.publish("pattern", self.view.pattern_event)
-
-    def _silenced(self, silenced: Silenced) -> None:
-        self.view.applied, self.view.silenced = None, silenced
-        self._count(silenced)
-        self.hub.publish("silence", self.view.silence_event)
-
-    def _count(self, report: Applied | Silenced) -> None:
-        """Add the latency of a command to those of touches, or of all other changes."""
+    def _reported(self, topic: Literal["pattern", "silence"], report: Applied | Silenced) -> None:
+        """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
+        self.view.report = report
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)
+        event = self.view.pattern_event if topic == "pattern" else self.view.silence_event
+        self.hub.publish(topic, event)
 
 
 def _state_event(old: Operation, new: Operation) -> StateEvent:

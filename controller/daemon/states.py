@@ -109,7 +109,7 @@ class Lease:
 
 @dataclass(frozen=True)
 class DaemonEvent:
-    """An event with its cause and a remedy for the user.
+    """An event with its cause and a remedy for the user: that of a fault follows from its cause.
 
     amplifiers: names of those that are lost, or do not reply.
     """
@@ -284,17 +284,17 @@ def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operati
 
 def _enter(before: Operation, updated: Operation, to: DaemonState, event: DaemonEvent) -> Operation:
     """Enter the next state of a transition with its cause and remedy."""
-    if to is before.state:
-        # A persisting fault may have a new cause.
-        has_cause = (Trigger.FAULT, Trigger.LINK_CHANGED)
-        is_new_cause = event.trigger in has_cause and bool(event.cause)
-        return replace(updated, cause=event.cause, remedy=event.remedy) if is_new_cause else updated
-    is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
-    cause, remedy = event.cause or before.cause, event.remedy
+    cause = event.cause or before.cause
     is_back = to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED)
     if before.lost is not None and is_back:
         cause = f"all amplifiers reply again and are disarmed; before: {before.lost.cause}"
-        remedy = acknowledge(cause) if to is DaemonState.FAULT else None
+    is_fault = to in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
+    remedy = acknowledge(cause) if is_fault else event.remedy
+    if to is before.state:
+        # A persisting fault may have a new cause.
+        is_new_cause = event.trigger in (Trigger.FAULT, Trigger.LINK_CHANGED) and bool(event.cause)
+        return replace(updated, cause=cause, remedy=remedy) if is_new_cause else updated
+    is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
     return replace(
         updated,
         state=to,

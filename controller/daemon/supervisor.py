@@ -18,7 +18,6 @@ from controller.daemon.states import (
     DaemonEvent,
     DaemonState,
     Trigger,
-    acknowledge,
 )
 from controller.loop.observer import Observer
 from drivers import clock
@@ -190,8 +189,7 @@ class Supervisor(Operator):
             await self.controller.open()
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
-            self._not_opened(error)
-            self.note_lost(error)
+            self.note_lost(self._not_opened(error), error)
             if self.controller.group.is_open:
                 await self.controller.release()
             return False
@@ -242,8 +240,7 @@ class Supervisor(Operator):
             return  # they may have been read before, or during a ramp
         problem, state = find_problem(statuses, group.amplifiers), self.operation.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
-            fault = DaemonEvent(Trigger.FAULT, problem, acknowledge(problem))
-            await self._in_background(self.handle(fault))
+            await self._in_background(self.handle(DaemonEvent(Trigger.FAULT, problem)))
         elif (
             not are_silent(statuses, group.amplifiers)
             and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
@@ -256,7 +253,7 @@ class Supervisor(Operator):
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
         if is_armed and self.controller.group.state in _SILENT:
-            self.post(DaemonEvent(Trigger.FAULT, cause, acknowledge(cause)))
+            self.post(DaemonEvent(Trigger.FAULT, cause))
 
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""
@@ -282,4 +279,4 @@ class Supervisor(Operator):
             return
         channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
         cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
-        self.post(DaemonEvent(Trigger.FAULT, cause, acknowledge(cause)))
+        self.post(DaemonEvent(Trigger.FAULT, cause))

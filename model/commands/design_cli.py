@@ -1,7 +1,7 @@
 """`era design`: places of ERAs for the best promised felt contrast, searched or given."""
 
-import json
 import time
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,7 @@ from model.commands.options import (
     MeshOption,
     RigArgument,
     next_line,
+    print_report,
     progress_bar,
 )
 from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
@@ -132,16 +133,14 @@ def design(
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
     _warn_of_light(result["eras"])
-    if as_json:
-        print(json.dumps(result))
-        return
-    _show(result, own_count=len(own))
-    print("wrote")
-    for name in files:
-        print(f"  {name}")
-    print(
-        next_line("era", "table", "build", files[0], "-o", output / "table.npz", "--mode", "phased")
-    )
+    table = output / "table.npz"
+    rows = [
+        *_rows(result, own_count=len(own)),
+        "wrote",
+        *(f"  {name}" for name in files),
+        next_line("era", "table", "build", files[0], "-o", table, "--mode", "phased"),
+    ]
+    print_report(rows, result, as_json=as_json)
 
 
 def _machines(address: str | None, workers: int | None) -> "Machines":
@@ -205,26 +204,26 @@ def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
         )
 
 
-def _show(result: dict[str, Any], *, own_count: int) -> None:
-    """Print places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
+def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
+    """Yield places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
     own = f"the rig's own {counted(own_count, 'ERA')}"
-    print(f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s")
-    print("name      x / mm   y / mm   dB per mm   load / N")
+    yield f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s"
+    yield "name      x / mm   y / mm   dB per mm   load / N"
     for name, era in result["eras"].items():
         x, y = (1000 * each for each in era["at_m"])
-        print(
+        yield (
             f"{name:8s} {x:7.1f}  {y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
             f"{era['static_load_n']:8.2f}"
         )
     if result["contents"] > 1:
-        print(f"{result['contents']} contents at the same time, contrast of the worst finger:")
+        yield f"{result['contents']} contents at the same time, contrast of the worst finger:"
     for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
         if result[key] is not None:
             medians = " / ".join(
                 f"{value:.1f}" for name, value in result[key].items() if name != "mean"
             )
             quiet = " / ".join(name.split("_")[1] for name in result[key] if name != "mean")
-            print(
+            yield (
                 f"{title}: mean {result[key]['mean']:.1f} dB, median {medians} dB with {quiet} "
                 "quiet fingers"
             )
@@ -232,24 +231,24 @@ def _show(result: dict[str, Any], *, own_count: int) -> None:
     if result["starts_db"]:
         starts = len(result["starts_db"])
         gap = f"{starts} starts, the worst {result['gap_db']:.1f} dB behind"
-        print(f"{gap if starts > 1 else '1 start'}; {reached}")
+        yield f"{gap if starts > 1 else '1 start'}; {reached}"
     else:
-        print(f"{result['layout_count']} layouts, {result['unsupported']} unsupported; {reached}")
-        _show_layouts(result["layouts"])
+        yield f"{result['layout_count']} layouts, {result['unsupported']} unsupported; {reached}"
+        yield from _rows_of_layouts(result["layouts"])
     for stiffness, value in result["by_stiffness_db"].items():
-        print(f"ERAs of {stiffness} N/m: mean {value:.1f} dB")
+        yield f"ERAs of {stiffness} N/m: mean {value:.1f} dB"
     counts = list(result["by_count_db"].items())
-    print("ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts))
-    print("mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts))
+    yield "ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts)
+    yield "mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts)
 
 
-def _show_layouts(layouts: list[dict[str, Any]]) -> None:
-    """Print the first of given layouts."""
-    print("rank  layout                          stiffness  contrast  expected")
+def _rows_of_layouts(layouts: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the first of given layouts."""
+    yield "rank  layout                          stiffness  contrast  expected"
     for each in layouts:
         contrast = f"{each['contrast_db']['mean']:.1f} dB" if each["contrast_db"] else "-"
         expected = f"{each['expected_contrast_db']:.1f} dB" if each["supported"] else "-"
-        print(
+        yield (
             f"{each['rank']:4d}  {each['layout']:28s}  {each['stiffness_n_m'] / 1000:6.4g} kN/m  "
             f"{contrast:>8s}  {expected:>8s}"
         )

@@ -1,12 +1,18 @@
 """`era figure`: the founding paper's figures."""
 
-import json
 import time
 from typing import Annotated
 
 import typer
 
-from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument, next_line
+from model.commands.options import (
+    FolderOption,
+    JsonOption,
+    MeshOption,
+    RigArgument,
+    next_line,
+    print_report,
+)
 
 figure_app = typer.Typer()
 
@@ -43,11 +49,10 @@ def figure(
         names.append(made.name)
         files += [str(path) for path in (picture, *tables)]
     elapsed = time.perf_counter() - started
-    if as_json:
-        answer = {"figures": names, "mesh": [rig.mesh.nx, rig.mesh.ny]}
-        print(json.dumps(answer | {"time_s": elapsed, "files": files}))
-        return
-    print(f"{elapsed:.1f} s, mesh {rig.mesh}; wrote")
-    for name in files:
-        print(f"  {name}")
-    print(next_line("era", "design", rig_file, "-o", "design"))
+    rows = [
+        f"{elapsed:.1f} s, mesh {rig.mesh}; wrote",
+        *(f"  {name}" for name in files),
+        next_line("era", "design", rig_file, "-o", "design"),
+    ]
+    answer = {"figures": names, "mesh": [rig.mesh.nx, rig.mesh.ny]}
+    print_report(rows, answer | {"time_s": elapsed, "files": files}, as_json=as_json)

@@ -1,6 +1,5 @@
 """What commands that fit a rig to a measurement have in common: the file they write, their end."""
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from model.commands.options import next_line
+from model.commands.options import next_line, print_report
 from model.errors import InputError
 from model.files.replacing import check_ending, check_place, check_replaceable
 
@@ -73,10 +72,8 @@ def finish(
     refusal: why the first of the files, the rig, was not; the exit status is then NO_FIT.
     elapsed: time of the fit [s].
     """
-    if report is None:
-        print("\n".join(rows))
-    else:
-        print(json.dumps(report | {"solve_time_s": elapsed, "files": list(files)}))
+    answer = (report or {}) | {"solve_time_s": elapsed, "files": list(files)}
+    print_report(rows, answer, as_json=report is not None)
     if refusal is not None:
         typer.echo(f"era: {refusal}", err=True)
         raise typer.Exit(NO_FIT)

@@ -1,13 +1,14 @@
 """Options that several commands share."""
 
+import json
 import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -88,6 +89,12 @@ def next_line(*words: str | Path) -> str:
 
         return f"Next: {list2cmdline(arguments)}"
     return f"Next: {shlex.join(arguments)}"
+
+
+def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print what a command has found: rows of text without those that are None, or its answer."""
+    text = json.dumps(answer) if as_json else "\n".join(row for row in rows if row is not None)
+    sys.stdout.write(f"{text}\n")
 
 
 _LINE_INTERVAL = 2.0  # s

@@ -1,9 +1,9 @@
 """`era plate`: natural frequencies, maps, materials and rigidity."""
 
-import json
 import math
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +17,7 @@ from model.commands.options import (
     SizeOption,
     figure_size,
     next_line,
+    print_report,
     progress_bar,
 )
 from model.config.points import parse_frequencies, parse_pair
@@ -54,33 +55,31 @@ def modes(
     solved = natural_modes(rig, count, support=support.value)
     elapsed = time.perf_counter() - started
     carried = solved.mesh.highest_frequency(rig.plate)
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "frequencies_hz": solved.frequencies.tolist(),
-                    "mesh_carries_up_to_hz": carried,
-                    "support": support.value,
-                    "mesh": [solved.mesh.nx, solved.mesh.ny],
-                    "dof": solved.mesh.dof,
-                    "element": solved.mesh.element_name,
-                    "solve_time_s": elapsed,
-                }
-            )
-        )
-        return
     name = solved.mesh.element_name
     element = "" if name in str(solved.mesh) else f" {name}"
-    print(f"{rig_file}: {solved.mesh}{element}, {solved.mesh.dof} dof, support: {support.value}")
-    for number, frequency in enumerate(solved.frequencies, start=1):
-        beyond = "  mesh too coarse" if frequency > carried else ""
-        print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")
-    if solved.frequencies[-1] > carried:
-        print(
-            f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes; use a finer "
-            "--mesh for those frequencies"
-        )
-    print(f"solved in {elapsed:.2f} s")
+    rows = [
+        f"{rig_file}: {solved.mesh}{element}, {solved.mesh.dof} dof, support: {support.value}",
+        *(
+            f"mode {number:3d}  {frequency:9.2f} Hz"
+            f"{'  mesh too coarse' if frequency > carried else ''}"
+            for number, frequency in enumerate(solved.frequencies, start=1)
+        ),
+        f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes; use a finer "
+        "--mesh for those frequencies"
+        if solved.frequencies[-1] > carried
+        else None,
+        f"solved in {elapsed:.2f} s",
+    ]
+    answer = {
+        "frequencies_hz": solved.frequencies.tolist(),
+        "mesh_carries_up_to_hz": carried,
+        "support": support.value,
+        "mesh": [solved.mesh.nx, solved.mesh.ny],
+        "dof": solved.mesh.dof,
+        "element": solved.mesh.element_name,
+        "solve_time_s": elapsed,
+    }
+    print_report(rows, answer, as_json=as_json)
 
 
 @plate_app.command("map")
@@ -130,34 +129,29 @@ def plate_map(
     from model.choice import best_of
 
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "x_m": solved.x.tolist(),
-                    "y_m": solved.y.tolist(),
-                    "peak_acceleration_m_s2": solved.peak.tolist(),
-                    "max_m_s2": float(solved.peak.max()),
-                    "max_at_m": [float(solved.x[column]), float(solved.y[row])],
-                    "nulls_m": solved.nulls.tolist(),
-                    "is_supported": unsupported is None,
-                    "mesh": [rig.mesh.nx, rig.mesh.ny],
-                    "solve_time_s": elapsed,
-                    "files": [str(output)] if output else [],
-                }
-            )
-        )
-        return
-    print(f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {elapsed:.2f} s")
-    print(
+    rows = [
+        f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {elapsed:.2f} s",
         f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
-        f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m"
-    )
-    print(f"median   {float(np.median(solved.peak)) / G:8.2f} g")
-    print(f"nulls    {len(solved.nulls):5d}")
+        f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m",
+        f"median   {float(np.median(solved.peak)) / G:8.2f} g",
+        f"nulls    {len(solved.nulls):5d}",
+    ]
     if output is not None:
-        print(f"wrote {output}")
-        print(next_line("era", "table", "build", rig_file, "-o", "table.npz"))
+        further = next_line("era", "table", "build", rig_file, "-o", "table.npz")
+        rows += [f"wrote {output}", further]
+    answer = {
+        "x_m": solved.x.tolist(),
+        "y_m": solved.y.tolist(),
+        "peak_acceleration_m_s2": solved.peak.tolist(),
+        "max_m_s2": float(solved.peak.max()),
+        "max_at_m": [float(solved.x[column]), float(solved.y[row])],
+        "nulls_m": solved.nulls.tolist(),
+        "is_supported": unsupported is None,
+        "mesh": [rig.mesh.nx, rig.mesh.ny],
+        "solve_time_s": elapsed,
+        "files": [str(output)] if output else [],
+    }
+    print_report(rows, answer, as_json=as_json)
 
 
 @plate_app.command()
@@ -191,63 +185,67 @@ def convergence(
             rig, meshes_to_compare(rig), frequencies=chosen, progress=progress
         )
     elapsed = time.perf_counter() - started
-    if as_json:
-        rows = [
-            {
-                "mesh": [error.mesh.nx, error.mesh.ny],
-                "element": error.mesh.element_name,
-                "strip_m": error.mesh.strip,
-                "dof": error.mesh.dof,
-                "is_the_rigs": error.mesh == rig.mesh,
-                "natural_frequency_error_percent": (100 * error.frequency).tolist(),
-                "response_error_percent": (100 * error.response).tolist(),
-                "estimated_response_error_percent": (
-                    None if error.estimate is None else (100 * error.estimate).tolist()
-                ),
-            }
-            for error in study.errors
-        ]
-        reference = {
+    meshes = [
+        {
+            "mesh": [error.mesh.nx, error.mesh.ny],
+            "element": error.mesh.element_name,
+            "strip_m": error.mesh.strip,
+            "dof": error.mesh.dof,
+            "is_the_rigs": error.mesh == rig.mesh,
+            "natural_frequency_error_percent": (100 * error.frequency).tolist(),
+            "response_error_percent": (100 * error.response).tolist(),
+            "estimated_response_error_percent": (
+                None if error.estimate is None else (100 * error.estimate).tolist()
+            ),
+        }
+        for error in study.errors
+    ]
+    answer = {
+        "reference": {
             "mesh": [study.reference.nx, study.reference.ny],
             "element": study.reference.element_name,
             "strip_m": study.reference.strip,
             "natural_frequencies_hz": study.natural_frequencies.tolist(),
-        }
-        answer = {
-            "reference": reference,
-            "drive_frequencies_hz": chosen.tolist(),
-            "meshes": rows,
-            "moved_era_change_percent": (100 * study.by_place).tolist(),
-            "wider_foot_change_percent": (100 * study.by_foot).tolist(),
-        }
-        print(json.dumps(answer | {"solve_time_s": elapsed}))
-        return
-    print(f"{rig_file}: errors against {study.reference}, solved in {elapsed:.1f} s")
-    print("natural frequencies: maximum of the lowest twelve, on the ERAs; response: relative L2")
-    print("error of the acceleration over the plate, maximum over the ERAs driven alone")
-    print()
+        },
+        "drive_frequencies_hz": chosen.tolist(),
+        "meshes": meshes,
+        "moved_era_change_percent": (100 * study.by_place).tolist(),
+        "wider_foot_change_percent": (100 * study.by_foot).tolist(),
+        "solve_time_s": elapsed,
+    }
     heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in chosen)
-    print(f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}")
+    rows = [
+        f"{rig_file}: errors against {study.reference}, solved in {elapsed:.1f} s",
+        "natural frequencies: maximum of the lowest twelve, on the ERAs; response: relative L2",
+        "error of the acceleration over the plate, maximum over the ERAs driven alone",
+        "",
+        f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}",
+    ]
     for error in study.errors:
         mesh_text = f"{error.mesh.nx}x{error.mesh.ny}"
         strip = f"{1000 * error.mesh.strip:.3g} mm" if error.mesh.strip else "-"
-        errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
-        columns = "".join(f"{value:10.3f} %" for value in errors)
+        errors = _percents([abs(error.frequency).max(), *error.response])
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""
-        print(
-            f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.mesh.dof:>8}{columns}{mine}"
+        rows.append(
+            f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.mesh.dof:>8}{errors}{mine}"
         )
         if error.estimate is not None:
-            columns = "".join(f"{value:10.3f} %" for value in 100 * error.estimate)
-            print(f"{'estimated without the reference':>46}{columns}")
-    print()
-    print("for comparison, what the same response changes by if every ERA")
-    changes = {
-        f"is {1000 * MOVED:g} mm nearer to the middle": study.by_place,
-        f"has a foot with {1000 * FOOT:g} mm more radius": study.by_foot,
-    }
-    for what, change in changes.items():
-        print(f"    {what:<42}" + "".join(f"{value:10.3f} %" for value in 100 * change))
+            estimated = _percents(error.estimate)
+            rows.append(f"{'estimated without the reference':>46}{estimated}")
+    nearer = f"is {1000 * MOVED:g} mm nearer to the middle"
+    wider = f"has a foot with {1000 * FOOT:g} mm more radius"
+    rows += [
+        "",
+        "for comparison, what the same response changes by if every ERA",
+        f"    {nearer:<42}{_percents(study.by_place)}",
+        f"    {wider:<42}{_percents(study.by_foot)}",
+    ]
+    print_report(rows, answer, as_json=as_json)
+
+
+def _percents(shares: Iterable[float]) -> str:
+    """Format shares in columns."""
+    return "".join(f"{100 * share:10.3f} %" for share in shares)
 
 
 def materials(as_json: JsonOption = False) -> None:
@@ -260,29 +258,30 @@ def materials(as_json: JsonOption = False) -> None:
             known[name] = known_material(name)
         except InputError as error:  # that of one plug-in does not hide the others
             problems.append(str(error))
-    if as_json:
-        entries = [
-            {
-                "name": name,
-                "E_pa": one.material.E,
-                "rho_kg_m3": one.material.rho,
-                "nu": one.material.nu,
-                "source": one.source,
-                "variation": one.variation,
-                "loss_factor": one.loss_factor,
-            }
-            for name, one in known.items()
-        ]
-        print(json.dumps({"materials": entries, "problems": problems}))
-        return
+    entries = [
+        {
+            "name": name,
+            "E_pa": one.material.E,
+            "rho_kg_m3": one.material.rho,
+            "nu": one.material.nu,
+            "source": one.source,
+            "variation": one.variation,
+            "loss_factor": one.loss_factor,
+        }
+        for name, one in known.items()
+    ]
+    rows = []
     for name, one in known.items():
         numbers = one.material
-        print(f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}")
-        print(f"    source  {one.source}")
-        print(f"    variation  {one.variation}")
-        print(f"    loss factor of the bare material, about  {one.loss_factor}")
-    print("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
-    for problem in problems:
+        rows += [
+            f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}",
+            f"    source  {one.source}",
+            f"    variation  {one.variation}",
+            f"    loss factor of the bare material, about  {one.loss_factor}",
+        ]
+    rows.append("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
+    print_report(rows, {"materials": entries, "problems": problems}, as_json=as_json)
+    for problem in () if as_json else problems:
         print(f"era: warning: {problem}", file=sys.stderr)
 
 
@@ -293,34 +292,35 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     from model.rig.plate_summary import plate_summary
 
     summary = plate_summary(load_rig(rig_file))
-    if as_json:
-        print(json.dumps(summary))
-        return
-    print(f"{rig_file}: {1e3 * summary['length_m']:g} x {1e3 * summary['width_m']:g} mm")
-    laminate = summary["laminate"]
-    if laminate is not None:
-        _print_laminate(laminate)
-    print("homogeneous plate like it at the highest frequency" if laminate is not None else "plate")
-    print(
+    bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
+    rows = [
+        f"{rig_file}: {1e3 * summary['length_m']:g} x {1e3 * summary['width_m']:g} mm",
+        *_laminate_rows(summary["laminate"]),
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
-        f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}"
-    )
-    print(f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m")
-    bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
-    print(f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)")
-    _print_air(summary["air_gap"])
-    for key, wavelength in summary["bending_wavelength_m"].items():
-        print(f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm")
+        f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}",
+        f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m",
+        f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)",
+        *_air_rows(summary["air_gap"]),
+        *(
+            f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
+            for key, wavelength in summary["bending_wavelength_m"].items()
+        ),
+    ]
     for mass in summary["point_masses"]:
         x, y = mass["at_m"]
-        print(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
+        rows.append(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
+    print_report(rows, summary, as_json=as_json)
 
 
-def _print_laminate(laminate: dict[str, Any]) -> None:
-    print(f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}")
+def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
+    """Yield the layers of a plate, None for a single one, and its rigidities."""
+    if laminate is None:
+        yield "plate"
+        return
+    yield f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}"
     for layer in laminate["layers"]:
-        print(
+        yield (
             f"    {1e3 * layer['thickness_m']:g} mm of {layer['material']}: "
             f"E {layer['E_pa'] / 1e9:g} GPa, rho {layer['rho_kg_m3']:g} kg/m³, nu {layer['nu']:g}"
         )
@@ -330,17 +330,19 @@ def _print_laminate(laminate: dict[str, Any]) -> None:
         rows[f"in free waves of {_frequency(key)}"] = rigidity
     for name, rigidity in rows.items():
         ratio = math.sqrt(rigidity / bonded)
-        print(f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}")
+        yield f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}"
+    yield "homogeneous plate like it at the highest frequency"
 
 
-def _print_air(air: dict[str, Any] | None) -> None:
+def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
+    """Yield the air gap behind a plate."""
     if air is None:
-        print("    no air: a plate in a vacuum, unless air_gap is given")
+        yield "    no air: a plate in a vacuum, unless air_gap is given"
         return
     edges = "sealed" if air["closed"] else "open"
-    print(f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}")
+    yield f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}"
     if air["closed"]:
-        print(f"        stiffness against even motion  {air['stiffness_n_m3'] / 1e6:.4g} MN/m³")
+        yield f"        stiffness against even motion  {air['stiffness_n_m3'] / 1e6:.4g} MN/m³"
 
 
 def _frequency(key: str) -> str:

@@ -2,13 +2,14 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from model.commands.options import JsonOption, TableArgument
+from model.commands.options import JsonOption, TableArgument, print_report
 from model.config.points import parse_point
 from model.errors import InputError
 
@@ -100,19 +101,19 @@ def query(
     line = {key: value for key, value in given.items() if value} | {"level_db_sl": level}
     table = load_table(table_file)
     answer = query_one(table, line)
-    if as_json:
-        print(json.dumps(answer))
-        return
-    (_print_contents if own else _print_answer)(answer)
-    print(
-        f"promised: what nine of ten plates within the rig's uncertainty give ({table.uncertainty})"
-    )
-    print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
+    rows = [
+        *(_rows_of_contents if own else _rows_of_answer)(answer),
+        "promised: what nine of ten plates within the rig's uncertainty give "
+        f"({table.uncertainty})",
+        f"solved in {1000 * answer['solve_time_s']:.1f} ms",
+    ]
+    print_report(rows, answer, as_json=as_json)
 
 
-def _print_answer(answer: dict[str, Any]) -> None:
+def _rows_of_answer(answer: dict[str, Any]) -> Iterator[str]:
+    """Yield the drive of an answer, and what it promises."""
     for era, tone in answer["drive"].items():
-        print(
+        yield (
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
             f"phase {tone['phase_deg']:.1f}°"
         )
@@ -145,28 +146,29 @@ def _print_answer(answer: dict[str, Any]) -> None:
         ]
     rows.append(("residual after the end", answer["residual_db"], "dB nominal"))
     for name, value, unit in rows:
-        print(f"{name:30s} {value:z6.1f} {unit}")
+        yield f"{name:30s} {value:z6.1f} {unit}"
 
 
-def _print_contents(found: dict[str, Any]) -> None:
-    print("finger [m]         frequency       level  contrast  foreign level")
+def _rows_of_contents(found: dict[str, Any]) -> Iterator[str]:
+    """Yield what each finger feels by an answer with several contents."""
+    yield "finger [m]         frequency       level  contrast  foreign level"
     for layer in found["layers"]:
-        print(
+        yield (
             f"{_place(layer):18s} {_cell(layer['frequency_hz'], 'Hz'):>9s} "
             f"{_cell(layer['promised_level_db_sl'], 'dB SL'):>11s} "
             f"{_cell(layer['robust_felt_contrast_db'], 'dB'):>9s} "
             f"{_cell(layer['foreign_level_db_sl'], 'dB SL'):>14s}  {layer['verdict']}"
         )
     for finger in found["quiet"]:
-        print(
+        yield (
             f"{_place(finger):18s} {'':9s} {'':10s} "
             f"{_cell(finger['robust_felt_contrast_db'], 'dB'):>9s} "
             f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  quiet"
         )
     if found["robust_worst_db"] is not None:
-        print(f"worst finger: {found['robust_worst_db']:.1f} dB promised")
+        yield f"worst finger: {found['robust_worst_db']:.1f} dB promised"
     for line in found["applied"]:
-        print(f"changed: {line}")
+        yield f"changed: {line}"
 
 
 def _own(text: str) -> dict[str, Any]:

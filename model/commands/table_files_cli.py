@@ -1,8 +1,7 @@
 """`era table build`, `plot`, `map` and `export`: files of a table."""
 
-import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +17,7 @@ from model.commands.options import (
     TableArgument,
     figure_size,
     next_line,
+    print_report,
     progress_bar,
 )
 from model.config.points import parse_frequencies, parse_pair, parse_point
@@ -82,13 +82,12 @@ def plot(
         path = output / f"{name}.{to.value}"
         save_figure(figure, path, inches=inches)
         files.append(str(path))
-    if as_json:
-        print(json.dumps({"files": files}))
-        return
-    print(f"{time.perf_counter() - started:.1f} s; wrote")
-    for file in files:
-        print(f"  {file}")
-    print(next_line("era", "table", "show", table_file, "--weak"))
+    rows = [
+        f"{time.perf_counter() - started:.1f} s; wrote",
+        *(f"  {file}" for file in files),
+        next_line("era", "table", "show", table_file, "--weak"),
+    ]
+    print_report(rows, {"files": files}, as_json=as_json)
 
 
 def export(
@@ -117,11 +116,11 @@ def export(
         export_mat(table, output)
     else:
         export_csv(table, output, content=(content or Content.PATTERNS).value)
-    if as_json:
-        print(json.dumps({"files": [str(output)]}))
-        return
-    print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
-    print(f"Next: {_reader(to, output)}")
+    rows = [
+        f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
+        f"Next: {_reader(to, output)}",
+    ]
+    print_report(rows, {"files": [str(output)]}, as_json=as_json)
 
 
 def _reader(to: Format, output: Path) -> str:
@@ -189,33 +188,34 @@ def contrast_map(
         from model.figures.table_pictures import contrast_map_figure
 
         save_figure(contrast_map_figure(table, found), output, inches=inches)
-    if as_json:
-        files = [] if output is None else [str(output)]
-        print(json.dumps(found.as_json() | {"solve_time_s": elapsed, "files": files}))
-        return
-    _show(found)
-    print(f"computed in {elapsed:.1f} s{'' if output is None else f'; wrote {output}'}")
     words = [word for text in quiet for word in ("--quiet", text)]
     target = f"{found.x[0]:.3g},{found.y[0]:.3g}"
-    print(next_line("era", "table", "query", table_file, "--target", target, *words))
+    rows = [
+        *_map_rows(found),
+        f"computed in {elapsed:.1f} s{'' if output is None else f'; wrote {output}'}",
+        next_line("era", "table", "query", table_file, "--target", target, *words),
+    ]
+    files = [] if output is None else [str(output)]
+    answer = found.as_json() | {"solve_time_s": elapsed, "files": files}
+    print_report(rows, answer, as_json=as_json)
 
 
-def _show(found: "ContrastMap") -> None:
-    """Print a map of each drive mode, the largest y first, and its distribution."""
+def _map_rows(found: "ContrastMap") -> Iterator[str]:
+    """Yield a map of each drive mode, the largest y first, and its distribution."""
     import numpy as np
 
     for mode, promised in found.promised_db.items():
-        print(f"{mode}: promised felt contrast to the quiet fingers, dB")
+        yield f"{mode}: promised felt contrast to the quiet fingers, dB"
         for row in promised[::-1]:
-            print("".join("   -" if np.isnan(value) else f"{value:4.0f}" for value in row))
+            yield "".join("   -" if np.isnan(value) else f"{value:4.0f}" for value in row)
         known, nominal = (of[np.isfinite(of)] for of in (promised, found.nominal_db[mode]))
         if len(known):
             low, median, high = np.percentile(known, [10, 50, 90])
-            print(
+            yield (
                 f"median {median:.1f} dB, one place in ten below {low:.1f}, one above {high:.1f}; "
                 f"median nominal {np.median(nominal):.1f}"
             )
-        print()
+        yield ""
 
 
 def build(
@@ -264,39 +264,33 @@ def build(
     save_table(table, output)
     elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
-    warnings = [*filter(None, (_coarse(error, table.mesh), why_slow()))]
-    if as_json:
-        answer = {
-            "patterns": table.pattern_count,
-            "cells": table.grid.cell_count,
-            "drive_frequencies_hz": table.frequencies.tolist(),
-            "mesh": [table.mesh.nx, table.mesh.ny],
-            "element": table.mesh.element_name,
-            "discretisation_error_percent": error,
-            "mode": table.drive_mode,
-            "fingerprint": table.fingerprint,
-            "code_version": table.code_version,
-            "exactly_known": [*rig.uncertainty.exactly_known],
-            "build_time_s": elapsed,
-            "files": [str(output)],
-        }
-        print(json.dumps(answer))
-        _warn(warnings)
-        return
-    print(
+    rows = [
         f"{counted(table.pattern_count, 'pattern')} of "
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
-        f"{counted(table.grid.cell_count, 'cell')}, built in {elapsed:.2f} s"
-    )
-    print(
+        f"{counted(table.grid.cell_count, 'cell')}, built in {elapsed:.2f} s",
         f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
-        f"{table.reference_mesh}"
-    )
-    if note := rig.uncertainty.note:
-        print(note)
-    print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
-    _warn(warnings)
-    print(next_line("era", "table", "show", output))
+        f"{table.reference_mesh}",
+        rig.uncertainty.note,
+        f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
+        next_line("era", "table", "show", output),
+    ]
+    answer = {
+        "patterns": table.pattern_count,
+        "cells": table.grid.cell_count,
+        "drive_frequencies_hz": table.frequencies.tolist(),
+        "mesh": [table.mesh.nx, table.mesh.ny],
+        "element": table.mesh.element_name,
+        "discretisation_error_percent": error,
+        "mode": table.drive_mode,
+        "fingerprint": table.fingerprint,
+        "code_version": table.code_version,
+        "exactly_known": [*rig.uncertainty.exactly_known],
+        "build_time_s": elapsed,
+        "files": [str(output)],
+    }
+    print_report(rows, answer, as_json=as_json)
+    for warning in filter(None, (_coarse(error, table.mesh), why_slow())):
+        typer.echo(f"era: warning: {warning}", err=True)
 
 
 NOTED_ERROR = 5.0
@@ -311,8 +305,3 @@ def _coarse(error: float, mesh: "PlateMesh") -> str | None:
         f"mesh {mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised takes "
         "this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
     )
-
-
-def _warn(warnings: Iterable[str]) -> None:
-    for warning in warnings:
-        typer.echo(f"era: warning: {warning}", err=True)

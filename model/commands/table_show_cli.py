@@ -1,13 +1,19 @@
 """`era table show` and `era table verify`, by other methods or by measuring."""
 
-import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.options import JsonOption, TableArgument, next_line, progress_bar
+from model.commands.options import (
+    JsonOption,
+    TableArgument,
+    next_line,
+    print_report,
+    progress_bar,
+)
 from model.counting import counted
 from model.errors import InputError
 from model.files.replacing import begins_with, check_picture
@@ -34,14 +40,14 @@ def show(
         overview = find_overview(table, progress=progress)
     summary, cells = summarize(table, overview), overview.cells
     elapsed = time.perf_counter() - started
-    if as_json:
-        print(json.dumps(summary | {"map": cells.as_json()}))
-        return
-    _show_summary(summary, mapped=str(cells.grid))
-    print()
-    _show_map(cells, listed=weak)
-    print(f"computed in {elapsed:.1f} s")
-    print(_example_query(table_file, summary["plate_m"]))
+    rows = [
+        *_summary_rows(summary, mapped=str(cells.grid)),
+        "",
+        *_map_rows(cells, listed=weak),
+        f"computed in {elapsed:.1f} s",
+        _example_query(table_file, summary["plate_m"]),
+    ]
+    print_report(rows, summary | {"map": cells.as_json()}, as_json=as_json)
 
 
 def verify(
@@ -128,14 +134,16 @@ def _verify_by_solving(
     with progress_bar("answers") as progress:
         found = verify_table(table, rig, samples=samples, seed=seed, progress=progress)
     elapsed = time.perf_counter() - started
-    if as_json:
-        print(json.dumps(found.as_json() | {"seed": seed, "verify_time_s": elapsed}))
-    else:
-        _show_verification(found)
-        count = len(found.checks)
-        print(f"{count - found.failed_count} of {count} passed (seed {seed}) in {elapsed:.1f} s")
-        if found.failed_count:
-            print(next_line("era", "table", "build", rig_file, "-o", table_file))
+    count = len(found.checks)
+    rows = [
+        *_verification_rows(found),
+        f"{count - found.failed_count} of {count} passed (seed {seed}) in {elapsed:.1f} s",
+        next_line("era", "table", "build", rig_file, "-o", table_file)
+        if found.failed_count
+        else None,
+    ]
+    answer = found.as_json() | {"seed": seed, "verify_time_s": elapsed}
+    print_report(rows, answer, as_json=as_json)
     if found.failed_count:
         raise typer.Exit(1)
 
@@ -147,8 +155,8 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
     return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
 
 
-def _show_summary(summary: dict[str, Any], *, mapped: str) -> None:
-    """Print the summary of a table; mapped: cells of the map that the shares are of."""
+def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
+    """Format the summary of a table; mapped: cells of the map that the shares are of."""
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -198,45 +206,43 @@ def _show_summary(summary: dict[str, Any], *, mapped: str) -> None:
         ("built by", f"era-haptics {summary['code_version']}"),
         ("fingerprint", summary["fingerprint"]),
     ]
-    for name, value in rows:
-        print(f"{name:20s} {value}")
+    return [f"{name:20s} {value}" for name, value in rows]
 
 
-def _show_map(cells: "WeakCells", *, listed: bool) -> None:
+def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
+    """Yield the map of a table; listed: with every weak cell."""
     import numpy as np
 
     from model.table.weak_cells import text_map
 
-    print("promised felt contrast, dB, to the median other finger; * marks weak cells")
+    yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
     if np.isfinite(cells.errors_db).any():
         median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
-        print(f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB")
-    for line in text_map(cells):
-        print(line)
+        yield f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB"
+    yield from text_map(cells)
     if listed:
-        print()
-        print("weak cells: centre, contrast to the median other finger, to one in ten")
+        yield "\nweak cells: centre, contrast to the median other finger, to one in ten"
         for (x, y), median, tenth in zip(
             cells.centres[cells.weak],
             cells.median_db[cells.weak],
             cells.tenth_db[cells.weak],
             strict=True,
         ):
-            print(f"({x:.4f}, {y:.4f}) m {median:7.1f} dB {tenth:7.1f} dB")
+            yield f"({x:.4f}, {y:.4f}) m {median:7.1f} dB {tenth:7.1f} dB"
 
 
-def _show_verification(found: "Verification") -> None:
+def _verification_rows(found: "Verification") -> Iterator[str]:
+    """Yield the checks of a table by solving, and their outcomes."""
     for check in found.content:
-        print(
+        yield (
             f"{check.name:24s} {check.error:8.1e} relative L2 to the reference  "
             f"{'passed' if check.is_passed else 'FAILED'}"
         )
-    print()
-    print("                       level, dB SL         felt contrast, dB")
-    print("target, m        quiet  predicted  direct  predicted  direct  in time   tolerances")
+    yield "\n                       level, dB SL         felt contrast, dB"
+    yield "target, m        quiet  predicted  direct  predicted  direct  in time   tolerances"
     for answer in found.answer_checks:
         x, y = answer.question.targets[0]
-        print(
+        yield (
             f"({x:.3f}, {y:.3f})  {len(answer.question.quiet):5d}  "
             f"{answer.pattern.level_db_sl:9.2f} {answer.direct_level_db_sl:7.2f}  "
             f"{answer.predicted_contrast_db:9.2f} {answer.direct_contrast_db:7.2f}  "
@@ -245,9 +251,8 @@ def _show_verification(found: "Verification") -> None:
             f"{answer.time_tolerance_db:.2f}  {'passed' if answer.is_passed else 'FAILED'}"
         )
     promise, plates = found.promise, f"{found.promise.plate_count} plates within the uncertainty"
-    print()
-    print(
-        f"promised contrast kept on {100 * promise.kept_share:.0f} % of {plates}  "
+    yield (
+        f"\npromised contrast kept on {100 * promise.kept_share:.0f} % of {plates}  "
         f"{'passed' if promise.is_passed else 'FAILED'}"
     )
 
@@ -289,33 +294,31 @@ def _verify_by_measuring(
 
         save_figure(promise_figure(found), picture)
         files.append(str(picture))
-    if as_json:
-        report = found.as_json() | {"seed": settings.seed, "verify_time_s": elapsed}
-        print(json.dumps(report | {"files": files}))
-    else:
-        _show(found)
-        print(
-            f"{counted(len(found.measured), 'pattern')} measured in {elapsed:.1f} s "
-            f"(seed {settings.seed})"
-        )
-        if files:
-            print(f"wrote {', '.join(files)}")
+    rows = [
+        *_measured_rows(found),
+        f"{counted(len(found.measured), 'pattern')} measured in {elapsed:.1f} s "
+        f"(seed {settings.seed})",
+        f"wrote {', '.join(files)}" if files else None,
+    ]
+    answer = {"seed": settings.seed, "verify_time_s": elapsed, "files": files}
+    print_report(rows, found.as_json() | answer, as_json=as_json)
     if not found.is_passed:
         raise typer.Exit(1)
 
 
-def _show(found: "MeasuredVerification") -> None:
-    print("                                    felt contrast, dB            level, dB SL")
-    print("target  quiet                  promised   median  measured  promised  measured")
+def _measured_rows(found: "MeasuredVerification") -> Iterator[str]:
+    """Yield what was promised and measured of each pattern."""
+    yield "                                    felt contrast, dB            level, dB SL"
+    yield "target  quiet                  promised   median  measured  promised  measured"
     for each in found.measured:
         target, *quiet = each.promise.sensors
-        print(
+        yield (
             f"{target:7s} {', '.join(quiet):20s} {each.promise.contrast_db:10.1f} "
             f"{each.promise.median_db:8.1f} {each.contrast_db:9.1f} "
             f"{each.promise.level_db_sl:9.1f} {each.level_db_sl:9.1f}  "
             f"{'kept' if each.is_kept else 'BROKEN'}"
         )
-    print(
+    yield (
         f"promised contrast kept by {100 * found.kept_share:.0f} % of the patterns, nine of ten "
         f"are expected  {'passed' if found.is_passed else 'FAILED'}"
     )

@@ -217,7 +217,7 @@ class Streamed(Chain):
 
 
 def _pattern(applied: Applied) -> Mapping[str, Any]:
-    event = PlateView(effect_of=lambda key: None, applied=applied).pattern_event()
+    event = PlateView(effect_of=lambda key: None, report=applied).pattern_event()
     assert event is not None
     return event.model_dump()
 

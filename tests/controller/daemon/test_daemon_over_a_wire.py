@@ -11,6 +11,7 @@ from controller.api.jsonrpc import ErrorCode
 from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
 from controller.gateway.settings import read_token
+from controller.loop.observer import Silenced
 from daemon_bench import (
     ENABLED,
     READY,
@@ -190,7 +191,7 @@ async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_
     """
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=60)
-        await until(lambda: bench.daemon._publisher.view.silenced is not None)
+        await until(lambda: isinstance(bench.daemon._publisher.view.report, Silenced))
         assert "no contact" in ((await era.status()).silence_reason or "")
         for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
             for _ in range(4):

@@ -18,7 +18,7 @@ def said(fingers: Fingers) -> dict[int, str | None]:
     if applied and silenced and silenced.time > applied.time:
         applied = None
     contacts = fingers.controller._tracker.contacts
-    view = PlateView(lambda key: None, contacts, applied, None if applied else silenced)
+    view = PlateView(lambda key: None, contacts, applied or silenced)
     return {each.id: each.held_back for each in view.contact_statuses()}
 
 

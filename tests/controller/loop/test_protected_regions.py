@@ -63,7 +63,7 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
         assert fingers.levels_db_sl()[3] < -10
         silenced = fingers.silenced[-1]
         assert {each.contact.key.id for each in silenced.targets} == {1, 2}
-        view = PlateView(lambda key: "effect", silenced.contacts, silenced=silenced)
+        view = PlateView(lambda key: "effect", silenced.contacts, silenced)
         for status in view.contact_statuses():
             assert (status.verdict == "held back") is (status.id != 3)
             assert ("protected" in (status.held_back or "")) is (status.id != 3)

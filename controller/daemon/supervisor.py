@@ -79,7 +79,7 @@ class Supervisor(Operator):
     def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Listen to the events of amplifiers, by name, whose lines have been opened."""
         for name, amplifier in amplifiers.items():
-            amplifier.listeners.append(partial(self._amplifier_event, name))
+            amplifier.listeners = [partial(self._amplifier_event, name)]  # of each attempt
 
     async def run(self) -> None:
         """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -26,7 +26,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
-from drivers.host.members import Played
+from drivers.host.members import GroupState, Played
 from drivers.host.stop import UNREACHED, Stopped, what_may_play
 from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
@@ -195,23 +195,23 @@ class Controller:
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send the stop that it is owed.
 
-        One whose line has stayed open is the same as before. Raises LinkError, CommandError.
+        One whose line is open since another attempt is the same, as is a stop of it that goes on.
+        Raises LinkError, CommandError.
         """
-        before = self._opened.get(name)
-        if before is not None and before.line.loss is None:
-            return before
-        amplifier = await lines.amplifier(
-            self.urls[name],
-            self._rig.limits,
-            name=name,
-            serial_number=self._serial_numbers.get(name),
-            is_output=name in self._rig.outputs,
-        )
-        if before is not None:
-            amplifier.go_on_from(before)
+        before = amplifier = self._opened.get(name)
+        if amplifier is None or amplifier.line.loss is not None:
+            amplifier = await lines.amplifier(
+                self.urls[name],
+                self._rig.limits,
+                name=name,
+                serial_number=self._serial_numbers.get(name),
+                is_output=name in self._rig.outputs,
+            )
+            if before is not None:
+                amplifier.go_on_from(before)
         self._opened[name] = self.group.amplifiers[name] = amplifier
         if name in self._owed:
-            stopping = _identified(amplifier, self.group.stop(waits_for=[name]))
+            stopping = _identified([amplifier], self.group.stop(waits_for=[name]))
             self._owed.pop(name).set_result(asyncio.ensure_future(stopping))
         return amplifier
 
@@ -240,12 +240,12 @@ class Controller:
         The requests on open lines are queued when this returns. Await it for what is known of each,
         by name: of one whose line is opened within 0.3 s by its reply.
         """
-        stopping: Awaitable[Mapping[str, Stopped]] = self.group.stop()
-        for each in self.group.amplifiers.values():
-            if not each.identity and each.line.loss is None:  # others are still searched for
-                stopping = asyncio.ensure_future(_identified(each, stopping))
+        stopping = self.group.stop()
+        if self.group.state is GroupState.CLOSED:  # who replies on open lines is not known for sure
+            opened = [each for each in self.group.amplifiers.values() if each.line.loss is None]
+            stopping = _identified(opened, stopping)
         self._owe()
-        return self._stopped(stopping, {**self._owed})
+        return self._stopped(asyncio.ensure_future(stopping), {**self._owed})
 
     def _owe(self) -> None:
         """Owe a stop to each amplifier whose line is closed."""
@@ -548,10 +548,13 @@ class Controller:
 
 
 async def _identified(
-    amplifier: Amplifier, stopping: Awaitable[Mapping[str, Stopped]]
+    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, Stopped]]
 ) -> Mapping[str, Stopped]:
-    """Await a stop, and identify the amplifier meanwhile: an unknown one confirms nothing."""
-    identifying = asyncio.gather(amplifier.identify(timeout=REPLY_TIMEOUT), return_exceptions=True)
+    """Await a stop, and identify amplifiers meanwhile: an unknown one confirms nothing."""
+    for each in amplifiers:
+        each.capabilities = {}
+    requests = [each.identify(timeout=REPLY_TIMEOUT) for each in amplifiers]
+    identifying = asyncio.gather(*requests, return_exceptions=True)
     try:
         return await stopping
     finally:

@@ -108,7 +108,8 @@ class SerialWire(Wire):
             else "the request itself came back: check the wire from the amplifier to this machine"
         )
         last = self._replied
-        if last is None or frame == last:
+        # Of another request that comes twice, late, each reply is of its own moment.
+        if last is None or frame == last or last.kind != HELLO | REPLY:
             return []
         is_same = (frame.address, frame.sequence) == (last.address, last.sequence)
         return [Several(frame.address)] if is_same else []

@@ -5,9 +5,13 @@ from collections.abc import Mapping
 
 import pytest
 
+from drivers.codec.serial_line.frame import REPLY, FrameReader, encode_frame
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier as Host
+from drivers.host.serial_wire import SerialWire
+from drivers.host.wire import Reply
+from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time, run_virtual
@@ -98,6 +102,18 @@ async def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> Non
     end = MemoryLine(wire, "a")
     end.outward = lambda name, data: [(0.0002, data), (0.004, data)]
     await end.hosts["a"].open()
+
+
+def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
+    """Of a request that came twice, and late: each of its replies is of its own moment."""
+    line, far = SerialWire(921_600, sequence=1), Amplifier("a", channels=2)
+    (asked,) = FrameReader().feed(line.request(1, "GetStatus", {}))
+    arrivals = []
+    for temperature in (250, 251):
+        words = MESSAGES["GetStatus"].reply.pack({**far.status(0.0), "temperature": temperature})
+        arrivals += line.received(encode_frame(asked._replace(kind=asked.kind | REPLY), words))
+        line.request(1, "Hello", {})
+    assert [type(each) for each in arrivals] == [Reply]
 
 
 @pytest.mark.parametrize("is_output", [True, False])

@@ -71,8 +71,8 @@ def leave_work() -> None:
     A library may wait for ever for its own threads if it ends while one is at work.
     """
     if _at_work:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            print(end="", file=stream, flush=True)  # a closed one is None
         os._exit(0)
 
 

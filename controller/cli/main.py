@@ -83,7 +83,7 @@ def run(
     try:
         on_loaded()
         status = _invoke(group, arguments)
-        sys.stdout.flush()
+        print(end="", flush=True)  # there may be no sys.stdout, which may be closed
     except BrokenPipeError:
         # Python would complain again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

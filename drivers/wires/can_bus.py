@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import math
 import random
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
@@ -176,6 +177,8 @@ class TextPort(PortAbove):
 _SLCAN_FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"
 _BAUD = 115_200  # of the adapter's serial port
 _CLOSE, _BELL = b"\rC\r", b"\x07"
+# Nothing, of what was sent, version and number, status, and frames that are not of this protocol.
+_SLCAN_REPLY = re.compile(rb"[zZ]?\Z|[VvNF][0-9A-Za-z]{2,}\Z|[TrRdDbB][0-9A-Fa-f]+\Z")
 
 
 class SlcanAddress(CanAddress):
@@ -201,7 +204,14 @@ class SlcanAddress(CanAddress):
         """Open the port; the first request opens the adapter's channel. Raises LinkError."""
         # Closed first, where an earlier host has left it open.
         hello = _CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate)
-        port = TextPort(SLCAN, on_data, hello=hello, cut_off=b"\r", goodbye=_CLOSE)
+
+        def unknown(text: bytes) -> None:
+            if not _SLCAN_REPLY.match(text):
+                on_data(pack_frames([CanFrame(ERROR_ID, text[:BLOCK])]))
+
+        port = TextPort(
+            SLCAN, on_data, on_other=unknown, hello=hello, cut_off=b"\r", goodbye=_CLOSE
+        )
         port.below = await open_port(self.place, port.received, on_loss)
         return port
 

@@ -183,16 +183,27 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
 
 
 _BLANKS = re.compile(r"(?<!^)\ufeff|[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000]")
+_NO_KEY = re.compile(r"\s*[\w.-]+(:(?![\s/])|\N{FULLWIDTH COLON})")  # `key:value`, but no URL
 
 
 def _remedy(text: str, line: int) -> str:
-    """What to do about a line that looks right: a directive, or a blank that is no space."""
-    wrong = text.splitlines()[line - 1] if line <= len(text.splitlines()) else ""
-    if wrong.startswith("%"):
+    """What to do about a line that looks right: a directive, a blank that is no space, `key:value`.
+
+    The parser sees some of these at the next line that is not empty.
+    """
+    lines = text.splitlines()[:line]
+    if len(lines) == line and lines[-1].startswith("%"):
         return "; remove this line"
-    if found := _BLANKS.search(wrong):
-        what = "tab" if found[0] == "\t" else f"character U+{ord(found[0]):04X}"
-        return f"; write a space in place of the {what} in column {found.start() + 1}"
+    for number in range(len(lines), 0, -1):
+        wrong = lines[number - 1].partition("#")[0]
+        where = "" if number == line else f" of line {number}"
+        if found := _BLANKS.search(wrong):
+            what = "tab" if found[0] == "\t" else f"character U+{ord(found[0]):04X}"
+            return f"; write a space in place of the {what} in column {found.start() + 1}{where}"
+        if found := _NO_KEY.match(wrong):
+            return f"; write a colon and a space in column {found.end()}{where}"
+        if wrong.strip() and number < line:
+            break
     return ""
 
 

@@ -4,6 +4,7 @@ import csv
 import io
 import logging
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,12 +17,13 @@ from numpy.typing import NDArray
 
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
-from model.files.uff import read_bytes
+from model.files.uff import read_bytes, text_of
 from registry.suggestions import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
 _SEPARATORS = (",", ";", "\t")
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+_POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one
+_BLANK = "\n ,;\t"  # of lines without content
 
 _logger = logging.getLogger(__name__)
 
@@ -77,13 +79,17 @@ class Line:
         """
         if default is not None and column not in self.cells:
             return default
-        text = self.cells[column]
+        # Some spreadsheet programs write a minus sign of their own.
+        text = self.cells[column].replace("\N{MINUS SIGN}", "-")
         try:
             value = float(text.replace(",", ".") if self.has_decimal_comma else text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise InputError(f"{self.place}: {column} must be a finite number, got {text[:30]!r}")
+            form = "; write all with a decimal point, or all with a comma" if "," in text else ""
+            raise InputError(
+                f"{self.place}: {column} must be a finite number, got {text[:30]!r}{form}"
+            )
         return value
 
 
@@ -91,27 +97,26 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
     """Read a file whose first line names its columns, in any order.
 
     Columns are separated by commas, semicolons or tabs; with the latter two a decimal comma is read
-    as well. Empty lines, empty cells behind the last column and further columns are skipped. Raises
-    InputError with file and line for missing and repeated columns, names that may be misspelt,
-    lines of another length, and a file without any.
+    as well, unless another number has a decimal point: it may separate thousands. Empty lines,
+    empty cells behind the last column and further columns are skipped. Raises InputError with file
+    and line for missing and repeated columns, names that may be misspelt, lines of another length,
+    and a file without any.
     """
-    content = read_bytes(path)
-    try:
-        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
+    text = text_of(path, read_bytes(path)).replace("\r\n", "\n").replace("\r", "\n")
     first = text.partition("\n")[0]
-    if first.startswith("sep="):  # of a spreadsheet program
-        text = "\n" + text[len(first) + 1 :]
-    separator = max(_SEPARATORS, key=text.lstrip("\n").partition("\n")[0].count)
+    if first.lower().startswith("sep="):  # of a spreadsheet program
+        text = text[len(first) :]
+    separator = max(_SEPARATORS, key=text.lstrip(_BLANK).partition("\n")[0].count)
     rows = csv.reader(io.StringIO(text), strict=True, skipinitialspace=True, delimiter=separator)
+    has_decimal_comma = separator != "," and _POINT.search(text) is None
+    filled = (row for row in rows if any(map(str.strip, row)))
     lines = []
     try:
-        header = [name.strip() for name in next(filter(None, rows), ())]
+        header = [name.strip() for name in next(filled, ())]
         while header and not header[-1]:
             del header[-1]
-        _check_header(path, header, columns, optional)
-        for row in filter(any, rows):
+        _check_header(f"{path}:{rows.line_num}", header, columns, optional)
+        for row in filled:
             place = f"{path}:{rows.line_num}"
             while len(row) > len(header) and not row[-1].strip():
                 del row[-1]
@@ -121,7 +126,7 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
                     f"{len(row)}; the file is damaged"
                 )
             cells = map(str.strip, row)
-            lines.append(Line(place, dict(zip(header, cells, strict=True)), separator != ","))
+            lines.append(Line(place, dict(zip(header, cells, strict=True)), has_decimal_comma))
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
@@ -132,7 +137,7 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
 
 
 def _check_header(
-    path: Path, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
+    place: str, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
 ) -> None:
     absent = [name for name in (*columns, *optional) if name not in header]
     missing = [name for name in columns if name not in header]
@@ -145,8 +150,8 @@ def _check_header(
         problems += [f"{named} unknown"] if unknown else []
         problems += ["a column is repeated"] if not problems else []
         raise InputError(
-            f"{path}:1: columns must be {', '.join(columns)}, optionally {', '.join(optional)}, "
+            f"{place}: columns must be {', '.join(columns)}, optionally {', '.join(optional)}, "
             f"got {'; '.join(problems)}"
         )
     if unknown:
-        _logger.warning("%s:1: columns not read: %s", path, named)
+        _logger.warning("%s: columns not read: %s", place, named)

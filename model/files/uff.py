@@ -22,6 +22,9 @@ from model.files.regular_file import regular_file
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
 
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+BYTE_ORDER_MARKS = (b"\xef\xbb\xbf", *_UTF_16)
+
 _MAX_BYTES = 512 << 20
 _READ = (15, 58, 164, 2411)
 _HEADER_LINES = 12  # of dataset 58, its number first
@@ -108,7 +111,12 @@ def read_universal(path: Path) -> Universal:
     """
     import pyuff
 
-    blocks = [each for each in _blocks(path, read_bytes(path)) if each.kind in _READ]
+    content = read_bytes(path)
+    if content.startswith(BYTE_ORDER_MARKS):  # text, as an editor saved it
+        content = text_of(path, content).encode()
+    if b"\n" not in content:
+        content = content.replace(b"\r", b"\n")
+    blocks = [each for each in _blocks(path, content) if each.kind in _READ]
     nodes: dict[int, tuple[float, float, float]] = {}
     functions, length = [], 1.0
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
@@ -135,6 +143,17 @@ def read_universal(path: Path) -> Universal:
     return Universal(
         {n: (x / length, y / length, z / length) for n, (x, y, z) in nodes.items()}, functions
     )
+
+
+def text_of(path: Path, content: bytes) -> str:
+    """The text of a measured file in UTF-8, or UTF-16 with a mark; raises InputError."""
+    try:
+        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: text must be UTF-8; save it as such") from error
+    if "\0" in text:
+        raise InputError(f"{path}: file must be text in UTF-8, got zero bytes; export it as such")
+    return text
 
 
 def read_bytes(path: Path) -> bytes:
@@ -170,6 +189,7 @@ class _Block:
         """The dataset as pyuff reads it, without free text and the numbers of a record."""
         rows = self.rows
         if self.kind == 58:
+            rows += [b""] * (_HEADER_LINES - len(rows))
             rows[_FORM] = rows[_FORM].upper().replace(b"D", b"E")
             rows = [rows[0], *[b"NONE"] * _ID_LINES, *rows[1 + _ID_LINES : _HEADER_LINES]]
         elif self.kind != 164:  # a node's number must not be taken for a mark
@@ -276,6 +296,11 @@ def _bytes_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -
     size = 8 if found["ord_data_type"] in (4, 6) else 4
     if len(data) < count * size:
         raise _too_few(path, block.line, count, len(data) // size)
+    if data[count * size :].strip(b"\0 \t\r\n"):
+        raise InputError(
+            f"{path}:{block.line}: record must end behind {count} numbers, as its header says, got "
+            f"{len(data) - count * size} bytes more; export it again, and copy it as a binary file"
+        )
     return np.frombuffer(data[: count * size], dtype=f"{order}f{size}").astype(float)
 
 

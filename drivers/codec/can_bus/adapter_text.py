@@ -68,7 +68,7 @@ def _frame(identifier: bytes, digits: bytes) -> CanFrame | None:
     return CanFrame(number, bytes.fromhex(digits.decode())) if number <= _ID_MAX else None
 
 
-SLCAN = TextFormat(re.compile(rb"[\r\x07]"), _slcan_line, _of_slcan_line, _of_slcan_line)
+SLCAN = TextFormat(re.compile(rb"[\r\n\x07]"), _slcan_line, _of_slcan_line, _of_slcan_line)
 SOCKETCAND = TextFormat(re.compile(rb">"), _element, _of_element, _of_sent)
 
 

@@ -189,6 +189,12 @@ def test_main_ends_quietly_when_its_reader_closes(tmp_path: Path) -> None:
         assert flood.wait() == 141
 
 
+def test_main_ends_well_without_an_output(entries, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Started with a closed standard output, for which Python has None, as by some services."""
+    monkeypatch.setattr("sys.stdout", None)
+    assert run(["--version"], entries) == 0
+
+
 def test_main_prints_what_its_output_cannot_encode(tmp_path: Path) -> None:
     """Escaped: a unit in an output of ASCII, and the name of a file that is not UTF-8."""
     (tmp_path / "era_test_commands.py").write_text(dedent(COMMANDS), encoding="utf-8")

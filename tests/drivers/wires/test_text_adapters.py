@@ -11,9 +11,10 @@ from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
+from drivers.hardware import PORT_OPENER
 from drivers.opening import Lines
 from drivers.wires import can_bus
-from drivers.wires.can_bus import TextPort
+from drivers.wires.can_bus import SlcanAddress, TextPort
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
@@ -156,6 +157,30 @@ async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> 
     sent = b"t18580102030405060708\r"
     assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
     assert heard == [CanFrame(0x800, b"\r\x07"), FRAME]
+
+
+async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
+    """Replies, frames of other kinds and line ends CR LF are none; a modem's or a shell's text is.
+
+    By LAWICEL's CANUSB manual: V, N, F and z.
+    """
+
+    class Below:
+        is_blocked = False
+
+    async def opener(name: str, on_data: object, on_loss: object) -> object:
+        return Below()
+
+    PORT_OPENER.set(opener)  # type: ignore[arg-type]
+    heard: list[CanFrame] = []
+    port = await SlcanAddress("can+slcan:///dev/ttyACM0#5").open_port(
+        lambda data: heard.extend(unpack_frames(data)), lambda cause: None
+    )
+    replies = b"V1013\rNA123\r\nF40\rz\r\r\nT0000018100\rr1230\rt18580102030405060708\r\n"
+    port.received(replies)  # type: ignore[attr-defined]
+    assert heard == [FRAME]
+    port.received(b"AT\r\nERROR\r\n")  # type: ignore[attr-defined]
+    assert [(frame.id, frame.data) for frame in heard[1:]] == [(0x800, b"AT"), (0x800, b"ERROR")]
 
 
 async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:

@@ -107,9 +107,15 @@ def test_read_measured_reads_binary_uff(
         return
     content = path.read_bytes()
     cut = content.rindex(b"    -1")
-    path.write_bytes(content[: cut - 24] + b"\n" + content[cut:])
-    with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
-        read_measured(path)
+    (size, *_) = re.findall(rb"58b.*?(\d+)     0", content)
+    for wrong in (
+        content[: cut - 24] + b"\n" + content[cut:],
+        content.replace(size, b"%d" % (int(size) + 8), 1),  # would run into the next record
+        content[:cut] + b"7\r\n" + content[cut:],
+    ):
+        path.write_bytes(wrong)
+        with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
+            read_measured(path)
 
 
 def damage(path: Path, before: str, after: str) -> None:
@@ -133,6 +139,7 @@ def damage(path: Path, before: str, after: str) -> None:
         (",0.1,0.05,", ",0.11,0.05,", r":\d+: sensor P1"),
         ("\nSW,", "\n\xff,", "UTF-8"),
         ("\nSW,", '\n"SW,', r":\d+: "),
+        ("\nSW,", "\n\0SW,", "zero bytes"),
     ],
 )
 def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, before, after, named):
@@ -155,6 +162,7 @@ def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, befo
         ("         1   3 ", "         1   1 ", r":\d+: .*1 and 3"),
         ("    4         0", "    9         0", ""),
         ("\n    -1\n", "\n    -3\n", r":\d+: "),
+        ("NONE", "\n    -1\n    -1\n    58\nNONE", r":\d+: "),  # a record without its header
     ],
 )
 def test_read_measured_refuses_damaged_uff(responses, coarse_rig, tmp_path, before, after, named):
@@ -169,12 +177,25 @@ def test_read_measured_refuses_damaged_uff(responses, coarse_rig, tmp_path, befo
         read_measured(path)
 
 
+def test_comma_may_separate_thousands(responses, coarse_rig, tmp_path):
+    """Where other numbers have a decimal point, 1,234 is not read as one and a bit."""
+    path = tmp_path / "measured.csv"
+    write_responses_csv(path, responses, coarse_rig)
+    text = path.read_text("utf-8").replace(",", ";").replace("320.0", "1,234")
+    path.write_text(text, "utf-8")
+    with pytest.raises(InputError, match=r"csv:\d+: frequency_hz .*'1,234'"):
+        read_measured(path)
+
+
 SPREADSHEETS = {
     "semicolons": lambda text: text.replace(",", ";").encode(),
     "decimal commas": lambda text: text.replace(",", ";").replace(".", ",").encode(),
     "tabs": lambda text: text.replace(",", "\t").encode("utf-16"),
     "sep": lambda text: f"sep=;\r\n{text.replace(',', ';')}".encode(),
-    "empty rows": lambda text: f"\n{text}{9 * ','}\n".encode(),
+    "empty rows": lambda text: f" \r\n{text}{9 * ','}\n".encode(),
+    "empty first rows": lambda text: f"\r\n;;\r\n{text.replace(',', ';')}".encode(),
+    "line ends of old": lambda text: text.replace("\n", "\r").encode(),
+    "minus signs": lambda text: text.replace(",-", ",\N{MINUS SIGN}").encode(),
     "coherence": lambda text: "\n".join(
         f"{line},{'0.99' if row else 'coherence'}" for row, line in enumerate(text.split())
     ).encode(),
@@ -193,11 +214,22 @@ def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("label", "factor"),
-    [("m/s²", 1.0), ("(m/s^2)", 1.0), ("m s-2", 1.0), ("g", 9.80665), ("mm/s2", 1e-3)],
+    ("label", "factor", "end", "encoding"),
+    [
+        ("m/s²", 1.0, "\r\n", "latin-1"),
+        ("(m/s^2)", 1.0, "\r", "latin-1"),
+        ("m s-2", 1.0, "\n", "utf-8-sig"),
+        ("g", 9.80665, "\r\n", "utf-16"),
+        ("mm/s2", 1e-3, "\r\n", "latin-1"),
+    ],
 )
-def test_read_measured_reads_uff_of_analysers(responses, coarse_rig, tmp_path, label, factor):
-    """By dataset 58's definition: any label of a unit, numbers of Fortran, the counted values."""
+def test_read_measured_reads_uff_of_analysers(
+    responses, coarse_rig, tmp_path, label, factor, end, encoding
+):
+    """By dataset 58's definition: any label of a unit, numbers of Fortran, the counted values.
+
+    As editors save it, too.
+    """
     path = tmp_path / "measured.uff"
     write_responses_uff(path, responses, coarse_rig)
     text = path.read_text("ascii").replace("m/s^2".ljust(20), label.ljust(20))
@@ -209,7 +241,7 @@ def test_read_measured_reads_uff_of_analysers(responses, coarse_rig, tmp_path, l
     lines[last] += "  0.00000e+00  0.00000e+00"  # fills the last line
     first = next(number for number, line in enumerate(lines) if line.strip() == "58")
     lines[first + 1] = "an offset of    -1"
-    path.write_bytes("\r\n".join(lines).encode("latin-1"))
+    path.write_bytes(end.join(lines).encode(encoding))
     back = responses_of(read_measured(path), coarse_rig)
     order = [back.sensors.index(name) for name in responses.sensors]
     np.testing.assert_allclose(back.values[:, :, order], factor * responses.values, rtol=1e-11)

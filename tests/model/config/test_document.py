@@ -53,7 +53,10 @@ def test_keys_are_text(tmp_path: Path, directive: str) -> None:
 
 
 def test_blanks_that_look_right_are_read_or_named(tmp_path: Path) -> None:
-    """Tabs where YAML 1.2 lets white space stand, blanks of word processors behind a value."""
+    """Tabs where YAML 1.2 lets white space stand, blanks of word processors behind a value.
+
+    Where the parser sees the lack of a space only in the next line, its own line is named.
+    """
     content = "a: 1\t# first\nb:\t[1,\t2]\t\nc: 3\N{NO-BREAK SPACE}\nd: 12\N{NO-BREAK SPACE}in\n"
     data = read_document(write(tmp_path, content)).data
     assert (data["a"], data["b"], data["c"]) == (1, [1, 2], 3)
@@ -61,6 +64,10 @@ def test_blanks_that_look_right_are_read_or_named(tmp_path: Path) -> None:
     for wrong, name in (
         ("a:\N{NO-BREAK SPACE}1\n", "U+00A0 in column 3"),
         ("\ta: 1\n", "tab in col"),
+        ("s:\n\N{NO-BREAK SPACE} a: 1\n\n  b: 2\n", "U+00A0 in column 1 of line 2"),
+        ("s:\n  a:1 # one\n  # two\n  b: 2\n", "a space in column 4 of line 2"),
+        ("s:\n  a\N{FULLWIDTH COLON} 1\n  b: 2\n", "a space in column 4 of line 2"),
+        ("a:1\n", "a space in column 2"),
     ):
         with pytest.raises(ConfigError, match=re.escape(name)):
             read_document(write(tmp_path, wrong))

@@ -7,10 +7,7 @@ from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.expected.amplifier import ExpectedAmplifier
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import STATES
 from drivers.uncertain_playback import Interval
-
-NAMES = {number: name for name, number in STATES.items()}
 
 
 class Judge(ExpectedAmplifier):

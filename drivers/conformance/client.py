@@ -69,20 +69,17 @@ def expect(condition: bool, what: str, *, expected: object, seen: object) -> Non
 
 def expect_equal(seen: object, expected: object, what: str) -> None:
     """Raise Violation unless both are equal."""
-    if seen != expected:
-        raise Violation(what, expected=expected, seen=seen)
+    expect(seen == expected, what, expected=expected, seen=seen)
 
 
 def expect_within(seen: float, low: float, high: float, what: str) -> None:
     """Raise Violation unless a number is within limits."""
-    if not low <= seen <= high:
-        raise Violation(what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
+    expect(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
 
 
 def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
     """Raise Violation unless something is known."""
-    if seen not in known:
-        raise Violation(what, expected=" or ".join(map(str, known)), seen=seen)
+    expect(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
 
 
 _MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late

@@ -39,7 +39,7 @@ async def opened(url: str) -> AsyncIterator[Client]:
     client.port = port = await address.open_port(client.received, client.lost)
     try:
         boots_until = clock.now() + address.boot_time
-        while clock.now() < boots_until and not client.order:  # nothing was heard yet
+        while clock.now() < boots_until and not any(client.order):  # no frame was heard yet
             with contextlib.suppress(Violation):
                 await client.hello()
         client.session = random.getrandbits(16)

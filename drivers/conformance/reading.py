@@ -61,7 +61,7 @@ async def capabilities(subject: Subject) -> None:
     )
     expect_equal(seen, must, "capabilities")
     again = (await subject.request("GetCaps")).values
-    expect_equal(again, subject.can.stated, "capabilities, read again")
+    expect_equal(again, subject.can, "capabilities, read again")
 
 
 @reading("protocol.md#states")

@@ -226,7 +226,7 @@ class ExpectedOutputs:
             self._check_levels(levels, when, report_low)
         lag = self._plays.lag + self._slack
         for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
-            voices = self.playback.voices_of(channel)
+            voices = self.playback.all_voices[channel]
             lasting = sorted({each.frequency for each in voices if not each.has_ended})
             is_settled = all(each.transition.end < time - lag for each in voices)
             if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):

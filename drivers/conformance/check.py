@@ -170,8 +170,7 @@ async def identified(client: Client, level: float) -> Subject:
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
     expect(bool(versions >> VERSION & 1), "versions", expected="bit 3 set", seen=versions)
-    message = MESSAGES["GetCaps"]
-    answer = await client.exchange(message.number, ())
+    answer = await client.exchange(MESSAGES["GetCaps"].number, ())
     expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
     can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
     return Subject(client, identity, Capabilities(can), level)

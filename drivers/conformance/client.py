@@ -330,10 +330,9 @@ class Client(ABC):
         """Return the reply to a message that was sent; Violation where none comes."""
         before, self.lag = self.lag, 0.0
         found = await self.next(is_meant, self.timeout)
-        if found is None and self.lag > _STALLED:
-            raise Late(f"no reply came to message {number}")
-        self.lag = max(self.lag, before)
+        is_in_time, self.lag = self.lag <= _STALLED, max(self.lag, before)
         if found is None:
+            require_in_time(is_in_time, f"no reply came to message {number}")
             others = f", but {len(self.came)} other bytes" if self.came else ""
             seen = f"none within {self.timeout:g} s{others}"
             raise Violation(f"reply to message {number}", expected="one", seen=seen)

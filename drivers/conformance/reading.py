@@ -21,7 +21,6 @@ from drivers.conformance.client import (
 from drivers.conformance.material import Rows, layer, send, stage
 from drivers.conformance.serial_frames import SerialClient
 from drivers.conformance.subject import Subject
-from drivers.expected.amplifier import flag
 from drivers.protocol.records import Values
 from drivers.protocol.table import (
     ENABLED,
@@ -33,6 +32,7 @@ from drivers.protocol.table import (
     REACTION,
     STATES,
     VERSION,
+    has_flag,
     name_of,
 )
 
@@ -72,7 +72,7 @@ async def starts_disarmed(subject: Subject) -> None:
         raise Armed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
     disarmed = [number for number in STATES.values() if number != ENABLED]
     expect_one_of(status["state"], disarmed, "state before Arm")
-    is_open = flag(status, "interlock_open") and not subject.has("interlock")
+    is_open = has_flag(status, "interlock_open") and not subject.has("interlock")
     expect_equal(is_open, False, "interlock of one without")
     expect_within(status["flags"], 0, 7, "flags")
 

@@ -185,10 +185,6 @@ class Playback:
         ]
         self._note_changes()
 
-    def voices_of(self, channel: int) -> tuple[Voice, ...]:
-        """Return the voices of a channel, the oldest first."""
-        return self.all_voices[channel]
-
     def playing(self, layer: int) -> LayerSet:
         """Return the set to which the voices of a layer lead, without envelopes; empty: silent."""
         commands = tuple(

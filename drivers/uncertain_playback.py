@@ -126,7 +126,7 @@ class UncertainPlayback:
         for channel, were in enumerate(before):
             left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
             known = {id(each.transition) for each in were}
-            for voice in self.playback.voices_of(channel):
+            for voice in self.playback.all_voices[channel]:
                 way = voice.transition
                 earlier = left.pop((voice.layer, voice.frequency, voice.origin), None)
                 self._origins.setdefault(voice.origin, half)
@@ -157,7 +157,7 @@ class UncertainPlayback:
                 peak = max(peak_of(tone.onset), peak_of(tone.ending))
                 extra += max(abs(amplitude_of(tone.level, 0)), peak)
         groups: dict[float, dict[float, list[Voice]]] = {}
-        for voice in self.playback.voices_of(channel):
+        for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:
                 extra += voice.peak(began) + voice.transition.radius
                 continue

@@ -68,22 +68,29 @@ class AmplifierUrl:
         self.path = unquote(parts.path, errors="surrogateescape")  # names of files are bytes
         pairs = parse_qsl(parts.query, keep_blank_values=True, errors="surrogateescape")
         self.options = dict(pairs)
-        if unknown := sorted(self.options.keys() - set(known)):
-            raise self.refused(
-                f"option {', '.join(unknown)} is unknown; known are {', '.join(known) or 'none'}"
-            )
-        if len(pairs) > len(self.options):
-            raise self.refused("an option must not be repeated")
+        unknown = sorted(self.options.keys() - set(known))
+        self.require(
+            not unknown,
+            f"option {', '.join(unknown)} is unknown; known are {', '.join(known) or 'none'}",
+        )
+        self.require(len(pairs) == len(self.options), "an option must not be repeated")
 
     def refused(self, why: str) -> CommandError:
         """Return the error for a URL that is invalid: why, as `X must be Y`."""
         return CommandError(f"{self._url!r}: {why}; use {self._form}")
 
+    def require(self, is_right: bool, why: str) -> None:
+        """Raise CommandError, and why as `refused`, unless the URL is right in something."""
+        if not is_right:
+            raise self.refused(why)
+
     def whole(self, text: str, name: str, high: int, *, low: int = 1) -> int:
         """Parse an integer of a range, as which a part of the URL stands."""
         is_number = text.isascii() and text.isdigit() and len(text) <= _DIGITS_MAX
-        if not (is_number and low <= int(text) <= high):
-            raise self.refused(f"{name} must be an integer of {low} to {high}, got {text!r}")
+        self.require(
+            is_number and low <= int(text) <= high,
+            f"{name} must be an integer of {low} to {high}, got {text!r}",
+        )
         return int(text)
 
     def whole_option(self, name: str, default: int, high: int, *, low: int = 1) -> int:
@@ -92,10 +99,10 @@ class AmplifierUrl:
 
     def device(self, baud: int) -> Place:
         """Return the serial device that the path names; baud: where no option names it."""
-        if self.place:
-            raise self.refused(f"path of the port must follow three slashes, got {self.place!r}")
-        if not self.path.strip("/"):
-            raise self.refused("path of the port must be given")
+        self.require(
+            not self.place, f"path of the port must follow three slashes, got {self.place!r}"
+        )
+        self.require(bool(self.path.strip("/")), "path of the port must be given")
         return Place(self.path, baud=self._baud(baud))
 
     def server(self, *, port: int = 0, number: str = "") -> Place:
@@ -103,14 +110,13 @@ class AmplifierUrl:
         if number:
             self.check_path(self.path, number)
         for name, value in (("host", self.host), ("port", self.port or port)):
-            if not value:
-                raise self.refused(f"{name} must be given, got {self.place!r}")
+            self.require(bool(value), f"{name} must be given, got {self.place!r}")
         return Place(host=self.host, port=self.port or port, baud=self._baud(0))
 
     def check_path(self, rest: str, number: str) -> None:
         """Refuse the rest of a path; number: of an amplifier, as it must be given in its place."""
-        if rest := rest.strip("/"):
-            raise self.refused(f"{number.format(rest)}, got /{rest} in the path")
+        rest = rest.strip("/")
+        self.require(not rest, f"{number.format(rest)}, got /{rest} in the path")
 
     def _baud(self, default: int) -> int:
         return self.whole_option("baud", default, _BAUD_MAX) if "baud" in self.options else default

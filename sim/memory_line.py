@@ -44,12 +44,13 @@ class SimulationUrl:
         self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "seed", "exact"))
         options = self._url.options
         file = unquote(self._url.place, errors="surrogateescape") + self._url.path
-        if not file:
-            raise self._url.refused("rig file must be named")
-        if self._url.number:
-            raise self._url.refused(f"amplifier must be given as ?amplifier={self._url.number}")
-        if {"seed", "exact"} <= options.keys():
-            raise self._url.refused("seed must not be given with exact")
+        self._url.require(bool(file), "rig file must be named")
+        self._url.require(
+            not self._url.number, f"amplifier must be given as ?amplifier={self._url.number}"
+        )
+        self._url.require(
+            not {"seed", "exact"} <= options.keys(), "seed must not be given with exact"
+        )
         self.rig = Path(file)
         self.seed = None if "exact" in options else self._url.whole_option("seed", 0, 10**9, low=0)
         self.control = Path(options["control"]) if options.get("control") else None
@@ -170,13 +171,10 @@ class MemoryPort:
             to_host=self._deliver,
             faults=self._first.faults,
         )
-        self._running = contextlib.AsyncExitStack()
+        self.running = contextlib.AsyncExitStack()
+        """What runs for it, which ends when it is closed."""
         self._is_open = True
         self._first.plug_listeners.append(self._plug)
-
-    def closes_with(self, running: contextlib.AsyncExitStack) -> None:
-        """Have it end what runs for it when it is closed."""
-        self._running = running
 
     def write(self, data: bytes) -> None:
         """Send bytes to the amplifiers; raises LinkError if it is lost."""
@@ -197,7 +195,7 @@ class MemoryPort:
 
     async def wait_closed(self) -> None:
         """End what runs for it."""
-        await self._running.aclose()
+        await self.running.aclose()
 
     def _deliver(self, data: bytes) -> None:
         # Never while the host still writes the request.
@@ -239,5 +237,5 @@ class SimulatedAddress(WireAddress):
                 device = AmplifierDevice(context.bench, name)
                 context.devices = {**context.devices, name: device}
             port = MemoryPort([device], on_data, on_loss)
-            port.closes_with(stack.pop_all())
+            port.running = stack.pop_all()
             return port

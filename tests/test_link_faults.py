@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from drivers import clock
-from drivers.by_hand.reaching import round_trip
 from drivers.contents import Layer, Tone
 from drivers.errors import DriverError, LinkDegraded
 from drivers.garbage_collection import no_long_collections
@@ -126,7 +125,9 @@ async def test_loss_is_detected_in_time(
     async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
         bound = 0.180 if wire in SLOWEST else THREE_HEARTBEATS
         if at_work is set_after_a_heartbeat:
-            bound = loss_detection_time([round_trip(host_of(hosted))])
+            host = host_of(hosted)
+            takes = host.line.wire.set_time(host.capabilities["channels"])
+            bound = loss_detection_time([takes])
         elif kind == "unplug":
             bound = 0.060
         for _ in range(3):

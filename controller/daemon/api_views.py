@@ -37,13 +37,13 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.stop import Stopped
-from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS, name_of
+from drivers.protocol.table import FAULTS, QUANTITIES, STATES, has_flag, name_of
 from drivers.statistics import LinkStatistics
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
 _LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
-_VOLTAGE, _HIGH_VOLTAGE = QUANTITIES["voltage"], STATUS_FLAGS["high_voltage"]
+_VOLTAGE = QUANTITIES["voltage"]
 
 
 @dataclass
@@ -328,7 +328,7 @@ def _amplifier_status(
         fault=name_of(FAULTS, status["fault"]) if status else None,
         levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
         temperature_c=_TEMPERATURE.from_wire(status["temperature"]) if status else None,
-        high_voltage=bool(status["flags"] >> _HIGH_VOLTAGE & 1) if status else None,
+        high_voltage=has_flag(status, "high_voltage") if status else None,
         high_voltage_v=_VOLTAGE.from_wire(status["voltage"]) if status else None,
         reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
         degraded=is_degraded,

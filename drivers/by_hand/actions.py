@@ -16,7 +16,6 @@ from drivers.by_hand.reaching import (
     keep_alive,
     random_session,
     reached,
-    round_trip,
     status_rows,
     wire_rows,
 )
@@ -244,7 +243,8 @@ async def drive(
             raise CommandError(str(refused)) from refused  # bad input, not a refusal
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
         watchdog = max(WATCHDOG, lowest)
-        check_watchdog(watchdog, round_trip(amplifier))
+        channels = amplifier.capabilities["channels"]
+        check_watchdog(watchdog, amplifier.line.wire.set_time(channels))
         before = await amplifier.read_status()
         if before["state"] in LATCHED:
             raise CommandRefused(

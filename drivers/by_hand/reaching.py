@@ -14,7 +14,7 @@ from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.reports import REPORTS, reports_of
-from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
+from drivers.host.timing import shortest_watchdog
 from drivers.opening import Lines
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.protocol.table import (
@@ -141,15 +141,9 @@ def random_session() -> int:
     return random.randint(_SESSION.minimum, _SESSION.maximum)  # noqa: S311  no secret
 
 
-def round_trip(amplifier: Amplifier) -> float:
-    """Return how long a set of all channels and its reply take on the wire [s]; 0 if unknown."""
-    words = set_words(amplifier.capabilities["channels"])
-    return amplifier.line.wire.exchange_time(words, TAKEN_WORDS)
-
-
 def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
     """Return limits by the wire's speed; empty where that is unknown."""
-    takes = round_trip(amplifier)
+    takes = amplifier.line.wire.set_time(amplifier.capabilities["channels"])
     if not takes:
         return {}
     return {

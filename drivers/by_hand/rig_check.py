@@ -96,7 +96,9 @@ def _late_loss_warnings(
     limit = MAX_LOSS_DETECTION_TIME
     warnings = []
     for names in lines.values():
-        took = loss_detection_time(addresses[name].set_time(channels[name]) for name in names)
+        took = loss_detection_time(
+            addresses[name].make_wire().set_time(channels[name]) for name in names
+        )
         if took > limit:
             warnings.append(
                 f"{', '.join(names)}: loss of the amplifiers may be detected only after "

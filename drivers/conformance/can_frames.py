@@ -24,8 +24,6 @@ from drivers.conformance.client import (
     Answer,
     Client,
     Heard,
-    Late,
-    Optional,
     Violation,
     When,
     altered,
@@ -34,12 +32,13 @@ from drivers.conformance.client import (
     expect_one_of,
     expect_within,
     read_as,
+    require,
+    require_in_time,
 )
-from drivers.conformance.expected import NAMES
 from drivers.conformance.material import layer
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
-from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK
+from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK, STATES, TEXTS, name_of
 from drivers.statistics import WireCounters
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
@@ -96,7 +95,7 @@ class CanClient(Client):
 
     def put(self, can_id: int, *data: bytes) -> None:
         """Send frames of one identifier."""
-        self.port.write(pack_frames(CanFrame(can_id, each) for each in data))
+        self.write(pack_frames(CanFrame(can_id, each) for each in data))
 
     def next_number(self) -> int:
         """Return the number of a new request."""
@@ -203,7 +202,6 @@ _PLACE = "can.md#messages-as-frames"
 _PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))
 _LIFE, _FORGOTTEN = 0.09, 0.12  # s; for which a number is kept, after which any begins
 _FAST = 0.015  # s; exchanges that are quick enough to see for how long a number is kept
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127
 
 
@@ -215,15 +213,15 @@ def _client(subject: Subject) -> CanClient:
 async def numbers(subject: Subject) -> None:
     """It takes newer numbers only, each message once, its frames in any order."""
     client = _client(subject)
-    if subject.exchange_time > _FAST:
-        raise Optional("the line is too slow to see for how long it keeps a number")
+    require(
+        subject.exchange_time <= _FAST, "the line is too slow to see for how long it keeps a number"
+    )
     await subject.arm()
     client.quiet = _FAST
 
     async def expect_replies(count: int, what: str, *data: bytes, since: float = math.inf) -> None:
         heard = await client.send(client.packed(data))
-        if clock.now() - since > _LIFE:
-            raise Late("frames were too far apart")
+        require_in_time(clock.now() - since <= _LIFE, "frames were too far apart")
         expect_equal(len(heard), count, f"replies to {what}")
 
     async def follow(number: int, *others: tuple[int, int]) -> None:
@@ -292,7 +290,7 @@ async def network_management(subject: Subject) -> None:
     await client.command("start")
     reply = await client.exchange(_STATUS, ())
     status = MESSAGES["GetStatus"].reply.unpack(reply.words, is_strict=False)
-    seen = NAMES.get(status["state"]), any(status["levels"]), status["token"]
+    seen = name_of(STATES, status["state"]), any(status["levels"]), status["token"]
     expect_equal(seen, ("SWITCH_ON_DISABLED", False, 0), "state, levels, token after reset_node")
     subject.require_alone()
 
@@ -341,9 +339,9 @@ async def objects(subject: Subject) -> None:
         data = await read_object(client, index, subindex)
         seen = len(data), value and int.from_bytes(data, "little")
         expect_equal(seen, (size, value), f"bytes and value of object {index:04x}/{subindex}")
-    for number, name in enumerate(_TEXTS, 1):
+    for number, field in enumerate(TEXTS, 1):
         text = (await read_object(client, 0x2000, number)).decode("utf-8", errors="replace")
-        expect_equal(text, subject.identity[name], f"{name} in object 2000")
+        expect_equal(text, subject.identity[field.name], f"{field.name} in object 2000")
     missing = [(0x1003, 0), (0x1016, 1), (0x2000, 6), (0x2001, len(caps) + 1)]
     for index, subindex in missing:
         await read_object(client, index, subindex, is_there=False)

@@ -170,10 +170,8 @@ async def identified(client: Client, level: float) -> Subject:
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
     expect(bool(versions >> VERSION & 1), "versions", expected="bit 3 set", seen=versions)
-    message = MESSAGES["GetCaps"]
-    answer = await client.exchange(message.number, ())
-    if answer.code:
-        raise Violation("GetCaps", expected="carried out", seen=answer.code)
+    answer = await client.exchange(MESSAGES["GetCaps"].number, ())
+    expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
     can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
     return Subject(client, identity, Capabilities(can), level)
 
@@ -215,14 +213,16 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
     with client.watching():
         while is_again:
             since = clock.now()
-            finding, why, slow = await _attempt(check, client, level)
+            finding, why = await _attempt(check, client, level)
             is_late = isinstance(finding, Late)
-            is_again = is_late and not slow and not why and client.was_late(since)
+            is_again = is_late and not why and client.was_late(since)
     reason = "" if finding is None else str(finding)
     kinds = {Optional: Result.SKIPPED, Late: Result.SKIPPED, Unusable: Result.NOT_RUN}
     if is_late:
         late = f"this machine was late by {1e3 * client.lag:.0f} ms"
-        reason = f"no verdict in {client.attempts or 1} attempts: {reason}; {slow or late}"
+        reason = (
+            f"no verdict in {client.attempts or 1} attempts: {reason}; {client.slow_reply or late}"
+        )
     if isinstance(finding, Unusable):
         reason = f"not run: {reason}"
     result = CheckResult(
@@ -242,11 +242,8 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
     return result, why and f"not run: after {check.name} {why}"
 
 
-async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, str, str]:
-    """Run the steps once.
-
-    Returns what they found; why nothing more can be run, or ""; which reply is always late, or "".
-    """
+async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, str]:
+    """Run the steps once; return what they found, and why nothing more can be run, or ""."""
     finding: Exception | None = None
     subject: Subject | None = None
     client.heard.clear()
@@ -262,9 +259,12 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
             await subject.watch()
         rows = check.run(subject)
         await (rows if isawaitable(rows) else subject.run(rows))
-        if client.heard:
-            what = "messages that were not asked for"
-            raise Violation(what, expected="none", seen=client.heard[0])
+        expect(
+            not client.heard,
+            "messages that were not asked for",
+            expected="none",
+            seen=client.heard[:1],
+        )
     except (Violation, Optional, Late, Unusable) as found:
         finding = found
     if isinstance(finding, Violation):
@@ -272,7 +272,7 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
         finding.sent = in_words(subject.sent_set) if subject else ""
     left = await _left(check, client, subject, level)
     finding = left if left and not isinstance(finding, Violation) else finding
-    return finding, str(left or ""), subject.slow_reply if subject else ""
+    return finding, str(left or "")
 
 
 async def _left(

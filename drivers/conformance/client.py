@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
-from drivers import clock
+from drivers import clock, trace
 from drivers.errors import LinkError
+from drivers.host.wire import read_nak
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REACTION, REFUSALS
+from drivers.protocol.table import REACTION
 
 
 class Violation(Exception):
@@ -48,6 +49,18 @@ class Late(Exception):
     """This machine was too late for what the check needs: it must be made again."""
 
 
+def require(is_possible: bool, why: str) -> None:
+    """Raise Optional, with the reason, unless the check can be made."""
+    if not is_possible:
+        raise Optional(why)
+
+
+def require_in_time(is_in_time: bool, why: str) -> None:
+    """Raise Late, with the reason, unless this machine was in time."""
+    if not is_in_time:
+        raise Late(why)
+
+
 def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
     """Raise Violation unless the condition holds."""
     if not condition:
@@ -56,24 +69,21 @@ def expect(condition: bool, what: str, *, expected: object, seen: object) -> Non
 
 def expect_equal(seen: object, expected: object, what: str) -> None:
     """Raise Violation unless both are equal."""
-    if seen != expected:
-        raise Violation(what, expected=expected, seen=seen)
+    expect(seen == expected, what, expected=expected, seen=seen)
 
 
 def expect_within(seen: float, low: float, high: float, what: str) -> None:
     """Raise Violation unless a number is within limits."""
-    if not low <= seen <= high:
-        raise Violation(what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
+    expect(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
 
 
 def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
     """Raise Violation unless something is known."""
-    if seen not in known:
-        raise Violation(what, expected=" or ".join(map(str, known)), seen=seen)
+    expect(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
 
 
-MAX_ATTEMPTS = 20
-"""Of a check with all its cases, for which this machine was late."""
+_MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late
+_FEW = 3  # replies, which this machine does not make late by chance
 _MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
 _STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
@@ -82,7 +92,6 @@ GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
-_CODES = {number: name for name, number in REFUSALS.items()}
 
 
 class Port(Protocol):
@@ -160,6 +169,8 @@ class Client(ABC):
 
     port: Port
     """Of its line; given once it is open."""
+    name = ""
+    """Under which its bytes are traced."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -184,7 +195,13 @@ class Client(ABC):
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
+        trace.frame(trace.Direction.IN, data, self.name, str)
         self.came = (self.came + self.hear(data))[-_MAX_SHOWN:]
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; raises LinkError."""
+        trace.frame(trace.Direction.OUT, data, self.name, str)
+        self.port.write(data)
 
     @abstractmethod
     def hear(self, data: bytes) -> bytes:
@@ -215,12 +232,11 @@ class Client(ABC):
 
         Every address is asked where a broadcast would reach it, else until one is free.
         """
+        wait = max(self.quiet, REACTION + self.transit) if self.has_broadcasts else GATEWAY_TIMEOUT
         for address in range(self.addresses, 0, -1) if not self.free else ():
             if address == self.address:
                 continue
-            self.port.write(self.question(address))
-            wait = max(self.quiet, REACTION + self.transit)
-            wait = wait if self.has_broadcasts else GATEWAY_TIMEOUT
+            self.write(self.question(address))
             found = await self.next(lambda each: True, wait)
             if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
                 self._others.add(address)
@@ -232,12 +248,22 @@ class Client(ABC):
         expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
 
+    @property
+    def slow_reply(self) -> str:
+        """Which message it always replies to later than it may, and by when; empty if none."""
+        for name, times in self.reactions.items():
+            if len(times) >= _FEW and (least := min(times)) > REACTION:
+                return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
+        return ""
+
     def was_late(self, since: float) -> bool:
         """Note an attempt from a time on that came too late; returns whether to make it again."""
-        if self.attempts < MAX_ATTEMPTS:
+        if self.slow_reply:
+            return False
+        if self.attempts < _MAX_ATTEMPTS:
             self.attempts += 1
             self.wasted += clock.now() - since
-        return self.attempts < MAX_ATTEMPTS and self.wasted < _MAX_WASTED
+        return self.attempts < _MAX_ATTEMPTS and self.wasted < _MAX_WASTED
 
     @contextmanager
     def watching(self) -> Iterator[None]:
@@ -269,7 +295,7 @@ class Client(ABC):
         """Send bytes; return what is heard until a reply must have come."""
         self.heard.clear()
         self.came = b""
-        self.port.write(data)
+        self.write(data)
         await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []
         return heard
@@ -304,10 +330,9 @@ class Client(ABC):
         """Return the reply to a message that was sent; Violation where none comes."""
         before, self.lag = self.lag, 0.0
         found = await self.next(is_meant, self.timeout)
-        if found is None and self.lag > _STALLED:
-            raise Late(f"no reply came to message {number}")
-        self.lag = max(self.lag, before)
+        is_in_time, self.lag = self.lag <= _STALLED, max(self.lag, before)
         if found is None:
+            require_in_time(is_in_time, f"no reply came to message {number}")
             others = f", but {len(self.came)} other bytes" if self.came else ""
             seen = f"none within {self.timeout:g} s{others}"
             raise Violation(f"reply to message {number}", expected="one", seen=seen)
@@ -315,11 +340,9 @@ class Client(ABC):
 
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""
-        values = read_as("Nak", NAK_RECORD.unpack, words, is_strict=True)
-        expect_equal(values["request"], number, "request that a Nak names")
-        channel = None if values["channel"] == NO_CHANNEL else values["channel"]
-        code = _CODES.get(values["code"], f"code {values['code']}")
-        return Answer(code, channel, (), When(sent, came))
+        nak = read_as("Nak", read_nak, words, is_strict=True)
+        expect_equal(words[0], number, "request that a Nak names")
+        return Answer(nak.code, nak.channel, (), When(sent, came))
 
 
 def altered(data: bytes, at: int) -> bytes:

@@ -1,31 +1,27 @@
 """The judge of an amplifier under conformance: what it finds ends a check."""
 
 from dataclasses import replace
+from functools import partial
 
-from drivers.conformance.client import Late, Violation
+from drivers.conformance.client import Violation, require_in_time
 from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.expected.amplifier import ExpectedAmplifier
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import STATES
 from drivers.uncertain_playback import Interval
-
-NAMES = {number: name for name, number in STATES.items()}
 
 
 class Judge(ExpectedAmplifier):
     """An amplifier with these capabilities since a status at rest. Raises Violation and Late."""
 
     def __init__(self, can: Values, rest: Values, when: Interval) -> None:
-        super().__init__(self._wrong, self._wrong, unclear=self._late, may_fail=False)
+        unclear = partial(require_in_time, False)
+        super().__init__(self._wrong, self._wrong, unclear=unclear, may_fail=False)
         self.identified(can)
         self.check(rest, when)
 
     def _wrong(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
         raise Violation(what, expected=must, seen=seen)
-
-    def _late(self, why: str) -> None:
-        raise Late(why)
 
     def achieved(self, one: LayerSet, shown: Values) -> LayerSet:
         """Return a layer as it plays by a GetAchieved; raises Violation beyond half a step."""

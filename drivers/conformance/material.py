@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
 
-from drivers.conformance.client import Optional
+from drivers.conformance.client import require
 from drivers.conformance.stated import Capabilities
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -82,8 +82,7 @@ class Material:
         """Of driven channels, at most; Optional where it has none so low."""
         limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
         level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
-        if level < step:
-            raise Optional(f"its level_max of {level:g} is below its level_step of {step:g}")
+        require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
         return level
 
     @cached_property
@@ -91,8 +90,7 @@ class Material:
         """The lowest frequency of every channel, in steps; Optional where they share none."""
         limits = [self.can, *self.can["limits"]]
         lowest = max(one["frequency_min"] for one in limits)
-        if lowest > self.highest:
-            raise Optional("its channels have no frequency in common")
+        require(lowest <= self.highest, "its channels have no frequency in common")
         return int(lowest)
 
     @cached_property
@@ -116,6 +114,14 @@ class Material:
         """Whether it states a feature; empty: what all have."""
         return not feature or has_feature(self.can, feature)
 
+    def require(self, feature: str) -> None:
+        """Raise Optional where it does not state a feature."""
+        require(self.has(feature), f"it states no {feature}")
+
+    def require_knots(self) -> None:
+        """Raise Optional where its envelopes have no knots."""
+        require(self.can["knots"] > 0, "it has no knots")
+
     def tone(
         self,
         channel: int = 0,
@@ -124,7 +130,6 @@ class Material:
         *,
         frequency: int = 0,
         keep: bool = False,
-        skip: bool = False,
         onset: Envelope | None = None,
         ending: Envelope | None = None,
     ) -> Command:
@@ -133,10 +138,12 @@ class Material:
         Raises Optional for a level that the amplifier may round to 0.
         """
         level, step = round(fraction * self.level * FULL), self.can["level_step"]
-        if 0 < level < step:
-            raise Optional(f"its steps of level are coarser than {level / FULL:g}; see --level")
-        numbers = level, QUANTITIES["phase"].to_wire(phase)
-        return Command(channel, frequency or self.frequency, *numbers, keep, skip, onset, ending)
+        require(
+            not 0 < level < step,
+            f"its steps of level are coarser than {level / FULL:g}; see --level",
+        )
+        numbers = frequency or self.frequency, level, QUANTITIES["phase"].to_wire(phase)
+        return Command(channel, *numbers, keep, onset=onset, ending=ending)
 
     def one(
         self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0

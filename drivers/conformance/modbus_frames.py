@@ -37,12 +37,12 @@ from drivers.conformance.client import (
     Answer,
     Client,
     Heard,
-    Late,
     When,
     altered,
     expect,
     expect_equal,
     read_as,
+    require_in_time,
 )
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
@@ -99,7 +99,7 @@ class ModbusClient(Client):
         data, sent = self.adu(pdu), clock.now()
         self._buffer = b""
         number = 0 if self.is_rtu else self.number
-        self.port.write(data)
+        self.write(data)
         heard = await self.replied(lambda each: each.number == number or not each.type, pdu[0])
         unit, response = heard.frame
         expect(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
@@ -307,10 +307,9 @@ async def pieces(subject: Subject) -> None:
         cases.append((b"", 0.0, frame() + frame(), 2))
     for first, wait, second, count in cases:
         began = clock.now()
-        client.port.write(first)
+        client.write(first)
         await asyncio.sleep(wait)
-        if wait < limit < clock.now() - began:
-            raise Late("the rest of a frame came too late")
+        require_in_time(not wait < limit < clock.now() - began, "the rest of a frame came too late")
         heard = await client.send(second)
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
         expect_equal(len(heard), count, what)

@@ -6,9 +6,9 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
-from drivers import clock, trace
+from drivers import clock
 from drivers.conformance.can_frames import CanClient
-from drivers.conformance.client import Client, Late, Port, Violation
+from drivers.conformance.client import Client, Late, Violation
 from drivers.conformance.modbus_frames import ModbusClient
 from drivers.conformance.serial_frames import SerialClient
 from drivers.errors import LinkError
@@ -24,18 +24,6 @@ CLIENTS: Mapping[str, Callable[[int], Client]] = {
 """Clients by the protocol that a wire's settings name."""
 
 
-class _TracedPort:
-    """A port whose bytes are traced under a name."""
-
-    def __init__(self, port: Port, name: str) -> None:
-        self._port, self._name = port, name
-
-    def write(self, data: bytes) -> None:
-        """Send bytes."""
-        trace.frame(trace.Direction.OUT, data, self._name, str)
-        self._port.write(data)
-
-
 @asynccontextmanager
 async def opened(url: str) -> AsyncIterator[Client]:
     """The client of an amplifier by its URL while its line is open, and its board has started.
@@ -47,13 +35,8 @@ async def opened(url: str) -> AsyncIterator[Client]:
     if protocol not in CLIENTS:
         raise LinkError(f"{url}: wire must be {', '.join(CLIENTS)}, got {protocol}")
     client = CLIENTS[protocol](address.number)
-
-    def received(data: bytes) -> None:
-        trace.frame(trace.Direction.IN, data, url, str)
-        client.received(data)
-
-    port = await address.open_port(received, client.lost)
-    client.port = _TracedPort(port, url)
+    client.name = url
+    client.port = port = await address.open_port(client.received, client.lost)
     try:
         boots_until = clock.now() + address.boot_time
         while clock.now() < boots_until:  # what a board says while it starts is no reply

@@ -7,7 +7,7 @@ from functools import partial
 
 from drivers import clock
 from drivers.conformance.check import driving
-from drivers.conformance.client import Late, Optional
+from drivers.conformance.client import require, require_in_time
 from drivers.conformance.material import Rows, layer, play, send
 from drivers.conformance.subject import Subject
 from drivers.protocol.table import SHORTENED_FADE
@@ -74,8 +74,7 @@ def after(subject: Subject) -> Rows:
 
     async def achieved() -> None:
         answer = await subject.request("GetAchieved", layer=0)
-        if not subject.shown.outputs.waits(answer.when):
-            raise Late("the onset may have ended")
+        require_in_time(subject.shown.outputs.waits(answer.when), "the onset may have ended")
 
     return [
         (first, newer, waiting, achieved),
@@ -121,15 +120,10 @@ def kept_phase(subject: Subject) -> Rows:
     return [(subject.one(), layer(0, tone, ramp=subject.ramp)) for tone in tones]
 
 
-def _require_knots(subject: Subject) -> None:
-    if not subject.can["knots"]:
-        raise Optional("it has no knots")
-
-
 @driving(_PLACE)
 def onsets(subject: Subject) -> Rows:
     """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
-    _require_knots(subject)
+    subject.require_knots()
     shapes = [
         subject.envelope(0.05, *fractions)
         for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
@@ -143,7 +137,7 @@ def onsets(subject: Subject) -> Rows:
 @driving(_PLACE)
 def endings(subject: Subject) -> Rows:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
-    _require_knots(subject)
+    subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
     tone = subject.tone(last, ending=subject.envelope(0.05, 0.25, 0.75j))
     first, quiet = layer(0, tone), subject.tone(last, 0.0)
@@ -162,7 +156,7 @@ def endings(subject: Subject) -> Rows:
 @driving(_PLACE)
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
-    _require_knots(subject)
+    subject.require_knots()
     knots = math.ceil(subject.slowness)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
@@ -178,7 +172,7 @@ def endings_amid(subject: Subject) -> Rows:
 @driving(_PLACE)
 def extreme_envelopes(subject: Subject) -> Rows:
     """It plays as many knots as it states, along its shortest and longest step."""
-    _require_knots(subject)
+    subject.require_knots()
     count = range(subject.can["knots"])
     levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in count]
     ends = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
@@ -193,8 +187,10 @@ async def phases(subject: Subject) -> None:
     await subject.arm()
     await subject.require_interference()
     silent, slow = play(layer(0), *map(layer, subject.layers[1:])), max(subject.lowest, _SLOW) / 20
-    if subject.exchange_time / subject.client.transactions > 0.25 / slow:
-        raise Optional("the line is too slow to see phases of tones that began apart")
+    require(
+        subject.exchange_time / subject.client.transactions <= 0.25 / slow,
+        "the line is too slow to see phases of tones that began apart",
+    )
     for channel in subject.channels:
         first = layer(0, subject.tone(channel, 0.5, 30.0))
         for number in subject.layers[1:]:
@@ -222,8 +218,10 @@ async def _expect_turned(
     first = await subject.play(layer(0, tone), *([] if keep is None else [layer(1, tone)]))
     await subject.pause(first.when.earliest + time - clock.now())
     second = await subject.play(layer(1, again))
-    if second.when.latest - first.when.earliest > time + 0.25 * 20 / slow:
-        raise Late("two sets were too far apart in time")
+    require_in_time(
+        second.when.latest - first.when.earliest <= time + 0.25 * 20 / slow,
+        "two sets were too far apart in time",
+    )
     await subject.status()
 
 
@@ -244,8 +242,10 @@ async def voices(subject: Subject) -> None:
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
         await asyncio.sleep(pause)
-    if last.when.latest - began > 0.8 * ramp / 1000:
-        raise Late("sets were too far apart for so many voices")
+    require_in_time(
+        last.when.latest - began <= 0.8 * ramp / 1000,
+        "sets were too far apart for so many voices",
+    )
     cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
     others = [play(layer(each, tones[each], ramp=ramp)) for each in subject.layers[1:3]]
@@ -279,9 +279,10 @@ def voices_of_layers(subject: Subject) -> Rows:
 @driving(_PLACE)
 async def limited(subject: Subject) -> None:
     """It limits the sum of its layers to full level, and says once that it was limited."""
-    if subject.level * 2 <= 1.0:
-        raise Optional("tried above half of full level only; see --level")
-    if abs(subject.other - subject.frequency) < subject.can["frequency_step"]:
-        raise Optional("it has one frequency, whose tones interfere")
+    require(subject.level * 2 > 1.0, "tried above half of full level only; see --level")
+    require(
+        abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
+        "it has one frequency, whose tones interfere",
+    )
     over = layer(1, subject.tone(frequency=subject.other))
     await subject.run([subject.arm, subject.one(), over, layer(1), over, layer(1)])

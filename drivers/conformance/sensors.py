@@ -6,7 +6,6 @@ import math
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
     Answer,
-    Optional,
     expect,
     expect_equal,
     expect_one_of,
@@ -33,8 +32,7 @@ _RUNNING = READING_STATES["RUNNING"]
 @driving("protocol.md#messages")
 async def measured(subject: Subject) -> None:
     """It measures voltage and current of every channel, armed or not, more where more plays."""
-    if not subject.has("electrical"):
-        raise Optional("it states no electrical")
+    subject.require("electrical")
 
     async def voltages() -> list[int]:
         rows = (await subject.request("GetMeasured"))["channels"]
@@ -53,8 +51,7 @@ async def measured(subject: Subject) -> None:
 
 async def _described(subject: Subject, first: int = 0) -> list[Values]:
     """Read all descriptions of sensors from one on."""
-    if not subject.has("sensors"):
-        raise Optional("it states no sensors")
+    subject.require("sensors")
     found: list[Values] = []
     while True:
         shown = await subject.request("GetSensors", first=first + len(found))

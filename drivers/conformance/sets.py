@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.conformance.check import driving
-from drivers.conformance.client import Optional, expect_within
+from drivers.conformance.client import expect_within, require
 from drivers.conformance.material import FULL, Rows, Send, layer, play, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
@@ -64,8 +64,7 @@ async def steps_as_stated(subject: Subject) -> None:
     """It rounds to the steps that it states."""
     base = subject.tone(0)
     coarse = [name for name in _TONE if subject.can[f"{name}_step"] > 3]
-    if not coarse:
-        raise Optional("its steps are about those of the wire")
+    require(bool(coarse), "its steps are about those of the wire")
     ranges = {
         "frequency": (subject.lowest, base.frequency, subject.highest),
         "level": (1, base.level - subject.can["level_step"], _LEVEL),

@@ -1,7 +1,7 @@
 """Checks of sets in parts and by tokens: staged, committed once, in their order, for a second."""
 
 from drivers.conformance.check import driving
-from drivers.conformance.client import Optional
+from drivers.conformance.client import require
 from drivers.conformance.material import Material, Rows, layer, play, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
@@ -45,8 +45,10 @@ def long_set(subject: Subject) -> list[LayerSet]:
 
 
 def _require_quick(subject: Subject) -> None:
-    if 16 * subject.exchange_time > STAGED_LIFE:
-        raise Optional("the line is too slow for a set in several parts")
+    require(
+        16 * subject.exchange_time <= STAGED_LIFE,
+        "the line is too slow for a set in several parts",
+    )
 
 
 @driving(_PLACE)

@@ -56,7 +56,6 @@ class Capabilities(dict[str, Any]):
 
     def __init__(self, stated: Values) -> None:
         super().__init__(stated)
-        self.stated = stated
         self.wrong: dict[str, tuple[str, int]] = {}
         for name, low, seen, high in _ranges(stated):
             if not low <= seen <= high:

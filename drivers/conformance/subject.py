@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -14,21 +14,22 @@ from drivers.conformance.client import (
     Answer,
     Client,
     Late,
-    Optional,
     When,
     expect,
     expect_equal,
     expect_one_of,
     read_as,
+    require,
+    require_in_time,
 )
-from drivers.conformance.expected import NAMES, Judge
+from drivers.conformance.expected import Judge
 from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
 from drivers.conformance.stated import STATED, Capabilities
 from drivers.expected.amplifier import OFF
 from drivers.host.wire import reply_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
-from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES
+from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -37,7 +38,6 @@ _PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest t
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
-_FEW = 3  # replies, which this machine does not make late by chance
 _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
@@ -99,7 +99,8 @@ class Subject(Material):
             if answer.code:
                 break
             answer = await self._carried_out(row.name, {"session": self.session, **values}, answer)
-        what = f"{row.name} {row.raw or _brief(values)}"
+        brief = {name: value for name, value in values.items() if name != "stream"}
+        what = f"{row.name} {row.raw or brief}"
         codes = [each or _DONE for each in row.codes]
         expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
         is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
@@ -206,8 +207,7 @@ class Subject(Material):
 
     def _check_fed(self) -> None:
         """Raise Late where this machine may have starved the watchdog."""
-        if self._since_fed > _MAX_WATCHDOG_USE:
-            raise Late("the watchdog was not fed in time")
+        require_in_time(self._since_fed <= _MAX_WATCHDOG_USE, "the watchdog was not fed in time")
 
     @property
     def _since_fed(self) -> float:
@@ -235,9 +235,8 @@ class Subject(Material):
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
-        if others := sorted(self.client.neighbours):
-            where = ", ".join(map(str, others))
-            raise Optional(f"left out, since it would reach others: what is for all ({where})")
+        where = ", ".join(map(str, sorted(self.client.neighbours)))
+        require(not where, f"left out, since it would reach others: what is for all ({where})")
 
     async def watch(self) -> None:
         """Judge all replies from now on, by the status as it is."""
@@ -310,17 +309,17 @@ class Subject(Material):
     def require_ramp(self, duration: float = 0.0) -> None:
         """Raise Optional where no ramp lasts as long as a time [s], or as a few exchanges."""
         duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
-        if self.can["ramp_max"] < 1000 * duration:
-            raise Optional(f"its ramps are shorter than {duration:.2g} s")
+        require(
+            self.can["ramp_max"] >= 1000 * duration, f"its ramps are shorter than {duration:.2g} s"
+        )
 
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
         duration = max(0.2, 16 * min(max(self.exchange_time, self.client.transit / 2), 1.0))
         step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
+        self.require_knots()
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
-        if not count:
-            raise Optional("it has no knots")
         return self.envelope(duration / (count + 1), *([0.5, 1.0] * count)[:count])
 
     async def pause(self, duration: float) -> None:
@@ -333,8 +332,7 @@ class Subject(Material):
             is_fed = self.is_starving or self.shown.state != ENABLED
             await asyncio.sleep(left if is_fed else min(left, self.shown.watchdog / 8))
         self.heard_at = end
-        if clock.now() > end + _OVERSLEPT:
-            raise Late("a pause took too long")
+        require_in_time(clock.now() <= end + _OVERSLEPT, "a pause took too long")
 
     async def settle(self) -> Answer:
         """Read statuses until it is silent and in a state that lasts."""
@@ -343,7 +341,7 @@ class Subject(Material):
             reply = await self.status()
             if not any(reply["levels"]) and reply["state"] not in (*_MOVING, ENABLED):
                 return reply
-            seen = f"{NAMES.get(reply['state'])}, levels {reply['levels']}"
+            seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
             expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
             await asyncio.sleep(_POLL)
 
@@ -364,8 +362,8 @@ class Subject(Material):
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)
             seen += is_narrow
             await asyncio.sleep(pause * is_narrow)
-        if seen < max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2):
-            raise Late(f"only {seen} statuses were in time")
+        needed = max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2)
+        require_in_time(seen >= needed, f"only {seen} statuses were in time")
 
     async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
         """Try a case, each time from rest, until this machine was in time."""
@@ -376,16 +374,8 @@ class Subject(Material):
                 await case()
                 return
             except Late:
-                if self.slow_reply or not self.client.was_late(began):
+                if not self.client.was_late(began):
                     raise
-
-    @property
-    def slow_reply(self) -> str:
-        """Which message it always replies to later than it may, and by when; empty if none."""
-        for name, times in self.client.reactions.items():
-            if len(times) >= _FEW and (least := min(times)) > REACTION:
-                return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
-        return ""
 
     async def require_interference(self) -> None:
         """Raise Optional where levels do not show that tones of one frequency cancel."""
@@ -393,10 +383,8 @@ class Subject(Material):
         await self.play(*(layer(at, each) for at, each in enumerate(halves)))
         level = (await self.request("GetStatus"))["levels"][0]
         await self.play(*map(layer, range(2)))
-        if level > 0.75 * self.level * FULL:  # phases may be rounded
-            raise Optional("its levels do not show that tones of one frequency interfere")
+        require(
+            level <= 0.75 * self.level * FULL,  # phases may be rounded
+            "its levels do not show that tones of one frequency interfere",
+        )
         self.shown.outputs.interferes = True
-
-
-def _brief(values: Mapping[str, object]) -> dict[str, object]:
-    return {name: value for name, value in values.items() if name != "stream"}

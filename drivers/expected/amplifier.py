@@ -21,7 +21,7 @@ from drivers.protocol.table import (
     MESSAGES,
     QUANTITIES,
     STATES,
-    STATUS_FLAGS,
+    has_flag,
     name_of,
 )
 from drivers.uncertain_playback import Interval
@@ -378,10 +378,10 @@ class ExpectedAmplifier:
         must_be = self.state in (ENABLED, _SWITCHED_ON)
         where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
         if must_be:
-            is_open = flag(shown, "interlock_open")
+            is_open = has_flag(shown, "interlock_open")
             self._expect("high_voltage", end, f"interlock_open {where}", False, is_open)
         if must_be or self._is_silent(when):
-            is_on = flag(shown, "high_voltage")
+            is_on = has_flag(shown, "high_voltage")
             self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
 
     def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
@@ -429,8 +429,3 @@ class ExpectedAmplifier:
     ) -> None:
         """Take silence where there must be none, which a fault that is not shown would explain."""
         self.report(rule, time, what, must=must, seen=seen)
-
-
-def flag(status: Values, name: str) -> bool:
-    """Whether a flag of a status is set."""
-    return bool(status["flags"] >> STATUS_FLAGS[name] & 1)

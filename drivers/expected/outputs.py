@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias
 from drivers.playback import Playback, playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES, STATUS_FLAGS
+from drivers.protocol.table import QUANTITIES, has_flag
 from drivers.uncertain_playback import Interval, UncertainPlayback
 
 _LATE = 0.002  # s; by which a set may begin later
@@ -193,7 +193,7 @@ class ExpectedOutputs:
                 if token not in possible:
                     what = f"token of layer {layer}, {self._since(when)}"
                     self._report("token", when[1], what, must=one_of(possible), seen=token)
-            is_limited = bool(shown["flags"] >> STATUS_FLAGS["limited"] & 1)
+            is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             must_be = is_beyond and self.is_exact and not self.may_derate
             if must_be > is_limited or (is_limited and self._highest < 1):
@@ -226,7 +226,7 @@ class ExpectedOutputs:
             self._check_levels(levels, when, report_low)
         lag = self._plays.lag + self._slack
         for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
-            voices = self.playback.voices_of(channel)
+            voices = self.playback.all_voices[channel]
             lasting = sorted({each.frequency for each in voices if not each.has_ended})
             is_settled = all(each.transition.end < time - lag for each in voices)
             if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):

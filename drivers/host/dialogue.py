@@ -20,9 +20,6 @@ from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.reports import (
-    HIGH_VOLTAGE,
-    HOT,
-    INTERLOCK,
     REPORT_LIFE,
     REPORTS,
     ReportKind,
@@ -340,8 +337,7 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        if (flags := reply["flags"]) & ~HIGH_VOLTAGE or reply["temperature"] > HOT:
-            self._note_reports(reply, now)
+        self._note_reports(reply, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -357,9 +353,7 @@ class Dialogue:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
         tells = not fed and self.feeding.tells(sent_at)
-        problem, is_voltage_on = None, flags & (HIGH_VOLTAGE | INTERLOCK) == HIGH_VOLTAGE
-        if not is_voltage_on or reply["fault"] or reply["latch"] != self.armed_latch:
-            problem = armed_problem(reply, self.armed_latch)
+        problem = armed_problem(reply, self.armed_latch)
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)

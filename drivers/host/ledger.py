@@ -15,7 +15,15 @@ from typing import NamedTuple
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.bounds import Bounds
-from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
+from drivers.host.limits import (
+    COMMIT_DELAY,
+    TOLERANCE,
+    Budget,
+    Rounding,
+    Vibration,
+    refused,
+    wire_limits,
+)
 from drivers.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
@@ -249,17 +257,17 @@ class Ledger:
         for channel, level in enumerate(levels):
             rise = 0.0 if self.limits.slew == math.inf else bounds.rise(channel)
             if rise > self.limits.slew * TOLERANCE:
-                text = (
+                return refused(
+                    channel,
                     f"level must rise by at most {self.limits.slew:g} per second, got "
-                    f"{rise:g} per second; use a longer ramp"
+                    f"{rise:g} per second; use a longer ramp",
                 )
-                return CommandRefused(f"channel {channel}: {text}", channel=channel)
             if level > highest * TOLERANCE:
-                text = (
+                return refused(
+                    channel,
                     f"level of all layers must be at most {highest:g}, got {level:g}; lower the "
-                    "levels, or let what plays end first"
+                    "levels, or let what plays end first",
                 )
-                return CommandRefused(f"channel {channel}: {text}", channel=channel)
         if power > self.limits.power * TOLERANCE:
             return CommandRefused(
                 f"sum of squared levels must be at most {self.limits.power:g}, got {power:g}; "

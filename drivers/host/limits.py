@@ -129,8 +129,9 @@ class Rounding:
         if not 0 <= ramp <= self._ramp_max:  # nor NaN
             raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
         if not 0 <= valid_for <= _VALID_FOR_MAX:
-            text = f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
-            raise CommandRefused(text)
+            raise CommandRefused(
+                f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
+            )
         if layer.renew and (layer.tones or layer.after):
             raise CommandRefused("renew must be without tones and after")
         if layer.after and not layer.tones:
@@ -152,22 +153,24 @@ class Rounding:
         for tone in tones:
             channel, level, onset = index(tone.channel), tone.level, tone.onset
             if not 0 <= channel < self._channels:
-                text = f"channel must be 0 to {self._channels - 1}, got {channel!r}"
-                raise CommandRefused(text, channel=channel)
+                raise CommandRefused(
+                    f"channel must be 0 to {self._channels - 1}, got {channel!r}", channel=channel
+                )
             if channel in commands:
-                raise _refused(channel, "must occur once in a layer")
+                raise refused(channel, "must occur once in a layer")
             if not 0 <= level <= self._level_max * TOLERANCE:  # nor NaN
                 raise self._level_refused(channel, "level", level)
             if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
                 values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
-                raise _refused(channel, f"frequency and phase must be finite numbers, got {values}")
+                raise refused(channel, f"frequency and phase must be finite numbers, got {values}")
             frequency = round(tone.frequency * _FREQUENCY.per_unit)
             if level == 0 and onset is None:
                 frequency = limits.frequency_min
             if not limits.frequency_min <= frequency <= limits.frequency_max:
                 low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
-                text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
-                raise _refused(channel, text)
+                raise refused(
+                    channel, f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
+                )
             phase = round(tone.phase * _PHASE.per_unit)
             if not _PHASE.minimum <= phase <= _PHASE.maximum:
                 phase = _PHASE.to_wire(float(tone.phase))
@@ -184,7 +187,7 @@ class Rounding:
         return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
-        return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
+        return refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
 
     def _check_envelopes(self, tones: Sequence[Tone]) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
@@ -196,11 +199,14 @@ class Rounding:
                 if envelope is None:
                     continue
                 if not low <= (step := envelope.step) <= high:
-                    text = f"step of an envelope must be {low} to {high} (0.1 ms), got {step}"
-                    raise _refused(tone.channel, text)
+                    raise refused(
+                        tone.channel,
+                        f"step of an envelope must be {low} to {high} (0.1 ms), got {step}",
+                    )
                 if (count := len(envelope.knots)) > limit:
-                    text = f"knots of an envelope must be at most {limit}, got {count}"
-                    raise _refused(tone.channel, text)
+                    raise refused(
+                        tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
+                    )
                 knots += envelope.knots
         if not knots:
             return
@@ -213,10 +219,11 @@ class Rounding:
                 self._check_envelopes([one])  # which of them
             if isinstance(error, CommandRefused):
                 raise
-            raise _refused(tone.channel, f"knot of an envelope: {error}") from error
+            raise refused(tone.channel, f"knot of an envelope: {error}") from error
 
 
-def _refused(channel: int, text: str) -> CommandRefused:
+def refused(channel: int, text: str) -> CommandRefused:
+    """Return the error of a channel that must not play something: why, as `X must be Y`."""
     return CommandRefused(f"channel {channel}: {text}", channel=channel)
 
 

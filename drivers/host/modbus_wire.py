@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import (
+    WRITE,
     ModbusResponse,
     RequestAdu,
     ResponseReader,
@@ -168,7 +169,7 @@ class ModbusWire(Wire):
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
         unit = request.adu.unit
-        if request.adu.is_write:
+        if request.adu.head[0] == WRITE:
             first = MESSAGES[request.name].number * BOX + REPLY
             count = HEAD + reply_words(request.name, *self._sizes[unit])
             request.adu = self._adu(unit, first, count)

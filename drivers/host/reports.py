@@ -4,15 +4,11 @@ from collections.abc import Iterable
 from typing import Literal
 
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
+from drivers.protocol.table import FAULTS, QUANTITIES, has_flag, name_of
 
-_HOT = 70.0
-HOT = QUANTITIES["temperature"].to_wire(_HOT)
-"""Temperature of the wire above which it is said; one that must not go on reports a fault."""
+_HOT = 70.0  # °C, above which it is said; one that must not go on reports a fault
 REPORT_LIFE = 10.0
 """For how long [s] a report is shown after the last status that had it."""
-HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
-INTERLOCK, _LIMITED = 1 << STATUS_FLAGS["interlock_open"], 1 << STATUS_FLAGS["limited"]
 
 ReportKind = Literal["limited", "interlock_open", "hot"]
 
@@ -33,9 +29,12 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
 
 def reports_of(status: Values) -> Iterable[ReportKind]:
     """Return the kinds of reports of a status."""
-    flags = status["flags"]
-    shown = (flags & _LIMITED, flags & INTERLOCK, status["temperature"] > HOT)
-    return [kind for kind, is_shown in zip(REPORTS, shown, strict=True) if is_shown]
+    shown = {
+        "limited": has_flag(status, "limited"),
+        "interlock_open": has_flag(status, "interlock_open"),
+        "hot": QUANTITIES["temperature"].from_wire(status["temperature"]) > _HOT,
+    }
+    return [kind for kind in REPORTS if shown[kind]]
 
 
 def armed_problem(status: Values, latch: int | None) -> str | None:
@@ -43,9 +42,9 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
 
     latch: that of the reply to Arm, None before: a stop or fault since would have disarmed it.
     """
-    if not status["flags"] & HIGH_VOLTAGE:
+    if not has_flag(status, "high_voltage"):
         return "high voltage must be on, got off"
-    if status["flags"] & INTERLOCK:
+    if has_flag(status, "interlock_open"):
         return "interlock must be closed while armed, got open"
     if status["fault"]:
         return f"fault must be NONE while armed, got {name_of(FAULTS, status['fault'])}"

@@ -37,13 +37,10 @@ class Stopped:
     def rows(self, now: float) -> dict[str, Any]:
         """Return it in words at a time [s]: `silence`, `may_play_for_s` and `cause`."""
         left = self.may_play_until - now
-        if self.is_confirmed:
-            silence = "confirmed_silent"
-        else:
-            silence = "may_play" if left > 0 else "watchdog_elapsed"
+        silence = "may_play" if left > 0 else "watchdog_elapsed"
         is_bounded = not self.is_confirmed and left < math.inf
         return {
-            "silence": silence,
+            "silence": "confirmed_silent" if self.is_confirmed else silence,
             "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
             "cause": self.cause,
         }

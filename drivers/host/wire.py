@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeAlias
 
+from drivers.host.timing import TAKEN_WORDS, set_words
 from drivers.protocol.records import (
     TEXT_MAX,
     Number,
@@ -114,9 +115,9 @@ def read_event(
     return [Event(address, values)]
 
 
-def read_nak(words: Sequence[int]) -> Nak:
-    """Read the words of a Nak; raises Refusal."""
-    values = NAK_RECORD.unpack(words, is_strict=False)
+def read_nak(words: Sequence[int], *, is_strict: bool = False) -> Nak:
+    """Read the words of a Nak; is_strict: nothing may follow them. Raises Refusal."""
+    values = NAK_RECORD.unpack(words, is_strict=is_strict)
     channel = None if values["channel"] == NO_CHANNEL else values["channel"]
     return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
 
@@ -188,3 +189,7 @@ class Wire(Protocol):
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and a reply of so many words take [s]; 0 if unknown."""
         return self.transit(words) + self.transit(reply)
+
+    def set_time(self, channels: int) -> float:
+        """Return how long a set of so many channels and its reply take [s]; 0 if unknown."""
+        return self.exchange_time(set_words(channels), TAKEN_WORDS)

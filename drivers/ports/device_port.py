@@ -18,7 +18,8 @@ class DevicePort(ABC):
     """A device of this name, which may hang; implements `Port`.
 
     descriptor: watched by the event loop; None where a thread must read, which may block.
-    on_data: called with what is received; on_loss: called once with the cause of a loss.
+    on_data: called with what is received; on_loss: called once with the cause of a loss; shut:
+    closes the device, also a lost one.
     """
 
     kind: ClassVar[str]
@@ -31,12 +32,13 @@ class DevicePort(ABC):
         descriptor: int | None,
         on_data: Callable[[bytes], None],
         on_loss: Callable[[str], None],
+        shut: Callable[[], None],
     ) -> None:
         self.name = name
         self.loop = asyncio.get_running_loop()
         self.closing = threading.Event()
         self.descriptor = descriptor
-        self._on_data, self._on_loss = on_data, on_loss
+        self._on_data, self._on_loss, self._shut = on_data, on_loss, shut
         self._thread: threading.Thread | None = None
         if descriptor is not None:
             self.loop.add_reader(descriptor, self.poll)
@@ -54,10 +56,6 @@ class DevicePort(ABC):
         Of a device without a descriptor.
         """
         raise NotImplementedError
-
-    @abstractmethod
-    def shut(self) -> None:
-        """Close the device, also a lost one."""
 
     def poll(self) -> None:
         """Hand over what has come and was not read yet; a reader thread has done so."""
@@ -96,13 +94,13 @@ class DevicePort(ABC):
     async def wait_closed(self) -> None:
         """Wait until it is closed, but not for a device that hangs."""
         # The system waits half a minute for a device that takes no more bytes.
-        await close_in_thread(self._shut, name=f"era-close {self.name}")
+        await close_in_thread(self._close_device, name=f"era-close {self.name}")
 
-    def _shut(self) -> None:
+    def _close_device(self) -> None:
         if self._thread is not None:
             self._thread.join()
         with contextlib.suppress(*self.failures):
-            self.shut()
+            self._shut()
 
     def _run(self) -> None:
         """Read until the port is closed or lost; reader thread."""

@@ -113,9 +113,8 @@ class SerialPort(DevicePort):
         on_data: Callable[[bytes], None],
         on_loss: Callable[[str], None],
     ) -> None:
-        self._port = port
         self._unsent = b""
-        super().__init__(name, port.fileno(), on_data, on_loss)
+        super().__init__(name, port.fileno(), on_data, on_loss, port.close)
 
     @property
     def is_blocked(self) -> bool:
@@ -149,10 +148,6 @@ class SerialPort(DevicePort):
             if state.poll(0):
                 raise OSError("end of file")
         return data
-
-    def shut(self) -> None:
-        """Close the port."""
-        self._port.close()
 
     def _send(self) -> None:
         """Write what the descriptor takes; raises LinkError."""

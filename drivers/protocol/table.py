@@ -301,6 +301,11 @@ def has_feature(capabilities: Values, name: str) -> bool:
     return bool(capabilities["features"] >> FEATURES[name] & 1)
 
 
+def has_flag(status: Values, name: str) -> bool:
+    """Whether a status shows a flag, of STATUS_FLAGS."""
+    return bool(status["flags"] >> STATUS_FLAGS[name] & 1)
+
+
 def name_of(names: Mapping[str, int], number: int) -> str:
     """Return the name of a number of the table, or the number."""
     return next((name for name, each in names.items() if each == number), str(number))

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 
 from drivers.errors import LinkError
 from drivers.hardware import Port
-from drivers.host.timing import TAKEN_WORDS, set_words
 from drivers.host.wire import Wire
 
 
@@ -29,10 +28,6 @@ class WireAddress(ABC):
     @abstractmethod
     def make_wire(self) -> Wire:
         """Make the host's side of the wire, without I/O."""
-
-    def set_time(self, channels: int) -> float:
-        """Return how long a set of these channels and its reply take [s]; 0 if unknown."""
-        return self.make_wire().exchange_time(set_words(channels), TAKEN_WORDS)
 
     def check_agrees(self, settings: Mapping[str, object]) -> None:
         """Raise LinkError unless its settings are those of the others on its line."""

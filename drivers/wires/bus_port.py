@@ -79,7 +79,7 @@ class BusPort(DevicePort):
         self._given_up_at = 0.0
         self._is_full = False
         self._timer: asyncio.TimerHandle | None = None
-        super().__init__(name, bus.fileno() if is_watched else None, on_data, on_loss)
+        super().__init__(name, bus.fileno() if is_watched else None, on_data, on_loss, bus.shutdown)
 
     @property
     def is_blocked(self) -> bool:
@@ -116,10 +116,6 @@ class BusPort(DevicePort):
         """Stop reading and writing; `wait_closed` closes the bus."""
         self._unsent.clear()
         super().close()
-
-    def shut(self) -> None:
-        """Close the bus."""
-        self._bus.shutdown()
 
     def _send(self) -> None:
         """Send frames until the adapter takes no more, then again after a pause."""

@@ -92,10 +92,11 @@ class PythonCanAddress(CanAddress):
             parsed.check_path(parsed.path, _NODE)
         else:
             channel = parsed.path.removeprefix("/")
-            if not interface or interface in _OTHERS:
-                raise parsed.refused(f"interface must be one of python-can, got {interface!r}")
-        if not channel.strip("/"):
-            raise parsed.refused("bus must be given")
+            parsed.require(
+                interface not in ("", *_OTHERS),
+                f"interface must be one of python-can, got {interface!r}",
+            )
+        parsed.require(bool(channel.strip("/")), "bus must be given")
         chosen = {
             name: _number_or_text(parsed.options[name])
             for name in options
@@ -195,8 +196,10 @@ class SlcanAddress(CanAddress):
             delay=NETWORK_DELAY if self.place.host else 0.0,
             settings={"baud": self.place.baud},
         )
-        if self.bitrate not in SLCAN_RATES:
-            raise parsed.refused(f"bitrate must be one of {', '.join(map(str, SLCAN_RATES))}")
+        parsed.require(
+            self.bitrate in SLCAN_RATES,
+            f"bitrate must be one of {', '.join(map(str, SLCAN_RATES))}",
+        )
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
@@ -229,8 +232,7 @@ class SocketcandAddress(CanAddress):
         self.place, path = parsed.server(), parsed.path.strip("/")
         self.channel, _, rest = path.partition("/")
         parsed.check_path(rest, _NODE)
-        if not self.channel:
-            raise parsed.refused("bus must be given behind the host")
+        parsed.require(bool(self.channel), "bus must be given behind the host")
         line = f"can+socketcand://{self.place.name}/{self.channel}"
         super().__init__(parsed, line, delay=NETWORK_DELAY, settings={})
 

@@ -97,12 +97,14 @@ class ModbusAddress(WireAddress):
             unit = parsed.number
         else:
             parsed = AmplifierUrl(url, _TCP_FORM, known=("baud",))
-            if parsed.number:
-                raise parsed.refused(f"unit must be given as /{parsed.number} behind the host")
+            parsed.require(
+                not parsed.number, f"unit must be given as /{parsed.number} behind the host"
+            )
             place, unit = parsed.server(port=_TCP_PORT), parsed.path.strip("/")
         parity = parsed.options.get("parity", "even")
-        if parity not in _PARITIES:
-            raise parsed.refused(f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}")
+        parsed.require(
+            parity in _PARITIES, f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}"
+        )
         stop = parsed.whole_option("stop", 1, 2)
         self.place = replace(place, parity=_PARITIES[parity], stop=stop)
         self.number = parsed.whole(unit, "unit", ADDRESS_MAX) if unit else ADDRESS

@@ -24,10 +24,9 @@ class SerialAddress(WireAddress):
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _FORM, known=("baud", "address"))
-        if parsed.number:
-            raise parsed.refused(f"address must be given as ?address={parsed.number}")
-        is_server = parsed.scheme == "serial+tcp"
         number = "address must be given as ?address={}"
+        parsed.require(not parsed.number, number.format(parsed.number))
+        is_server = parsed.scheme == "serial+tcp"
         self.place = parsed.server(number=number) if is_server else parsed.device(BAUD)
         self.number = parsed.whole_option("address", ADDRESS, ADDRESS_MAX)
         self.line = self.place.name

@@ -124,7 +124,7 @@ def measured(playback: Playback, now: float) -> Iterator[Values]:
         level = min(playback.level(channel, now), 1.0)
         # Force goes with the voltage squared, at half the frequency.
         voltage = HIGH_VOLTAGE * math.sqrt(level / 2)
-        frequencies = [voice.frequency for voice in playback.voices_of(channel)]
+        frequencies = [voice.frequency for voice in playback.all_voices[channel]]
         omega = math.pi * max(frequencies, default=0.0)
         yield {
             "channel_voltage": _Q["channel_voltage"].to_wire(voltage),
@@ -135,7 +135,7 @@ def measured(playback: Playback, now: float) -> Iterator[Values]:
 def exceeds_full(playback: Playback, channel: int, now: float) -> bool:
     """Whether a channel's sum exceeds full level by a step or more from now on."""
     times = {now}
-    for voice in playback.voices_of(channel):
+    for voice in playback.all_voices[channel]:
         length = voice.transition.end - now
         times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
     return any(playback.level(channel, at) > LIMITED for at in times if at >= now)

@@ -25,12 +25,12 @@ def tone(channel: int = 0, frequency: int = 2000, level: int = 5000, **other: ob
 
 def amplitudes(playback: Playback, time: float) -> list[complex]:
     """The amplitude of each voice of channel 0."""
-    return [voice.transition.at(time) for voice in playback.voices_of(0)]
+    return [voice.transition.at(time) for voice in playback.all_voices[0]]
 
 
 def slope_of(playback: Playback, time: float) -> float:
     """The steepest change of channel 0 from a time on."""
-    return sum(voice.transition.slope(time) for voice in playback.voices_of(0))
+    return sum(voice.transition.slope(time) for voice in playback.all_voices[0])
 
 
 def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
@@ -40,7 +40,7 @@ def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() ->
     playback.commit([layer(0, tone(level=0, onset=short), tone(1, onset=long))], 1, 0.0)
     playback.commit([layer(0, tone(keep_phase=True), after=True)], 2, 0.01)
     playback.advance(1.0)
-    assert [voice.origin for voice in playback.voices_of(0)] == pytest.approx([0.04])
+    assert [voice.origin for voice in playback.all_voices[0]] == pytest.approx([0.04])
 
 
 def test_random_sets_never_jump_and_keep_their_bounds() -> None:
@@ -56,12 +56,12 @@ def test_random_sets_never_jump_and_keep_their_bounds() -> None:
             else:
                 token += 1
                 playback.commit([_random_layer(chance)], token, time)
-            peak = sum(voice.transition.peak(time) for voice in playback.voices_of(0))
+            peak = sum(voice.transition.peak(time) for voice in playback.all_voices[0])
             slope = slope_of(playback, time)
-            before = _field(playback.voices_of(0), time)
+            before = _field(playback.all_voices[0], time)
             for _ in range(12):
                 later = time + chance.random() * 5e-4
-                after = _field(playback.voices_of(0), later)
+                after = _field(playback.all_voices[0], later)
                 assert playback.level(0, later) <= peak + 1e-9
                 assert abs(after - before) <= slope * (later - time) + 1e-9
 
@@ -93,5 +93,5 @@ def test_fade_that_is_cut_short_is_as_fast_as_the_amplifier_can() -> None:
         for n in range(9):
             played = replace(layer(0, tone(frequency=3000 + n)), ramp=1000)
             playback.commit([played], 2 + n, 1.0 + 1e-6 * n)
-        first = playback.voices_of(0)[0].transition
+        first = playback.all_voices[0][0].transition
         assert first.end - first.start == pytest.approx(length, rel=1e-3)

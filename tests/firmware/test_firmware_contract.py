@@ -66,7 +66,7 @@ def agree(name: str, ours: object, theirs: object) -> bool:
 def value_at(amplifier: Amplifier, channel: int, time: float) -> float:
     """What it plays at a time [s]: Im[A(t) exp(2 pi i f (t - origin))], limited."""
     total = 0.0
-    for voice in amplifier.playback.voices_of(channel):
+    for voice in amplifier.playback.all_voices[channel]:
         turned = cmath.exp(2j * math.pi * voice.frequency * (time - voice.origin))
         total += (voice.transition.at(time) * turned).imag
     return min(max(total, -1.0), 1.0)

@@ -79,12 +79,13 @@ class TextReader:
         self, form: TextFormat, on_other: Callable[[bytes], None] = lambda text: None
     ) -> None:
         self._form, self._on_other = form, on_other
-        self._rest = b""
+        self.rest = b""
+        """What may be the beginning of a text."""
 
     def feed(self, data: bytes) -> Iterator[CanFrame]:
         """Yield the frames that these bytes complete."""
-        *texts, rest = self._form.end.split(self._rest + data)
-        self._rest = rest if len(rest) <= _MAX_LENGTH else b""
+        *texts, rest = self._form.end.split(self.rest + data)
+        self.rest = rest if len(rest) <= _MAX_LENGTH else b""
         for text in texts:
             frame = self._form.decode(text)
             if frame is None:

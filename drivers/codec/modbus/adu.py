@@ -146,11 +146,6 @@ class RequestAdu:
     head: bytes
     size: int
 
-    @property
-    def is_write(self) -> bool:
-        """Whether it writes registers, else it reads some."""
-        return self.head[0] == WRITE
-
 
 @dataclass(frozen=True)
 class ModbusResponse:

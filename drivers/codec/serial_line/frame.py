@@ -83,18 +83,14 @@ class FrameReader:
 
     def __init__(self, *, on_invalid: Callable[[bytes], None] = lambda piece: None) -> None:
         self._on_invalid = on_invalid
-        self._rest = b""
-        self._is_skipping = False  # to the end of an overlong piece
-
-    @property
-    def rest(self) -> bytes:
+        self.rest = b""
         """What may be the beginning of a frame."""
-        return self._rest
+        self._is_skipping = False  # to the end of an overlong piece
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete, in order."""
         frames = []
-        *ended, rest = (self._rest + data).split(b"\0")
+        *ended, rest = (self.rest + data).split(b"\0")
         for piece in ended:
             is_read = piece and not self._is_skipping  # a leading zero has nothing before it
             self._is_skipping = False
@@ -113,7 +109,7 @@ class FrameReader:
         if len(rest) > _STUFFED_MAX and not self._is_skipping:
             self._on_invalid(rest[:_STUFFED_MAX])
             self._is_skipping = True
-        self._rest = b"" if self._is_skipping else rest
+        self.rest = b"" if self._is_skipping else rest
         return frames
 
 

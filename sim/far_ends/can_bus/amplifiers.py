@@ -22,16 +22,18 @@ from drivers.protocol.table import (
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
+    FAULTS,
     HELLO,
     IDENTITY,
     NAK,
     QUANTITIES,
     nak_of,
+    name_of,
     read_request,
 )
 from drivers.statistics import WireCounters
 from sim.amplifier.contract import SILENCING_RAMP
-from sim.far_ends.can_bus.word_objects import FAULT_NAMES, ObjectServer
+from sim.far_ends.can_bus.word_objects import ObjectServer
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
@@ -204,7 +206,7 @@ class _Node:
         """Send an event, with an emergency where a fault comes or goes."""
         if self.is_listening:
             self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
-        fault = FAULT_NAMES[event["fault"]]
+        fault = name_of(FAULTS, event["fault"])
         is_faulty = fault != "NONE"
         is_mute = self._state == _STOPPED or not self._amplifier.is_answering
         if (is_faulty or self._was_faulty) and not is_mute:

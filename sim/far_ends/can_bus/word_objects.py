@@ -9,7 +9,7 @@ import struct
 import zlib
 
 from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, cob_id
-from drivers.protocol.table import FAULTS, MESSAGES
+from drivers.protocol.table import MESSAGES
 from sim.transport.far_end import AmplifierPort
 
 TOGGLE = 0x0503_0000
@@ -30,7 +30,6 @@ class SdoAbort(Exception):
         self.code = code
 
 
-FAULT_NAMES = {number: name for name, number in FAULTS.items()}
 _INDEX = CANOPEN["objects"]
 _TEXTS = ("vendor", "product", "serial_number", "firmware")
 

@@ -90,7 +90,7 @@ def test_stream_without_an_end_takes_no_memory(stream: Stream) -> None:
     feed = stream.feed()
     assert [one for _ in range(256) for one in feed(b"t1818" * 820)] == []
     reader = feed.__self__  # type: ignore[attr-defined]
-    assert len(reader._rest) <= 512
+    assert len(reader.rest) <= 512
 
 
 def cobs_by_hand(data: bytes) -> bytes:

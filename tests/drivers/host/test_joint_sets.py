@@ -40,7 +40,7 @@ def timed_line(name: str, amplifier: str) -> MemoryLine:
 
 def started(end: MemoryLine) -> list[float]:
     """When the tones of all amplifiers of a line began."""
-    return [voice.origin for far in end.far.values() for voice in far.playback.voices_of(0)]
+    return [voice.origin for far in end.far.values() for voice in far.playback.all_voices[0]]
 
 
 @pytest.mark.parametrize("names", [*combinations(LINES, 2)], ids="-".join)
@@ -171,12 +171,12 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     await group.apply(
         {"a": [loud(0, 0.5)], "b": [loud(each, 0.1) for each in layers] or [Layer(0)]}
     )
-    before = ends[1].far["b"].playback.voices_of(0)
+    before = ends[1].far["b"].playback.all_voices[0]
     for count in range(1, 17):
         group.token = 4096 * count % 65536 or 1
         await group.apply({"a": [loud(0, 0.5)]})
         await group.beat()
-    after = ends[1].far["b"].playback.voices_of(0)
+    after = ends[1].far["b"].playback.all_voices[0]
     assert [(each.origin, each.layer) for each in after] == [
         (each.origin, each.layer) for each in before
     ]

@@ -246,11 +246,11 @@ def test_base_moves_by_its_voices(seed: int, late: float) -> None:
         )
         ramp = random_.choice((0, 5, 30))
         playback.commit([LayerSet(random_.randrange(2), ramp, 0, (command,))], token, now)
-        motion = motion_of(delayed(playback.voices_of(0), late), stroke=STROKE)
+        motion = motion_of(delayed(playback.all_voices[0], late), stroke=STROKE)
         for _ in range(5):
             now += random_.uniform(0.0005, 0.004)
             moved = sampled(motion, np.array([now + late]))[0]
-            assert moved == pytest.approx(defined(playback.voices_of(0), now), abs=1e-16)
+            assert moved == pytest.approx(defined(playback.all_voices[0], now), abs=1e-16)
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.1, 23193.384082])

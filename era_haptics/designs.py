@@ -6,7 +6,7 @@ from os import PathLike
 
 from era_haptics.arguments import expect_rig
 from model.arguments import (
-    expect_at_least,
+    expect_between,
     expect_number,
     expect_path,
     is_whole,
@@ -73,10 +73,10 @@ def design(
     for name, value in {**counts, "seed": seed}.items():
         if not is_whole(value):
             raise InputError(f"{name} must be a whole number, got {shown(value)}")
-        expect_at_least(value, int(name in counts), what=name)
+        expect_between(value, int(name in counts), what=name)
     for name, number, unit in (("apart", apart, "metres"), ("lowest", lowest, "hertz")):
         expect_number(number, what=name, unit=unit)
-    expect_at_least(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
+    expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
     path = None if contacts is None else expect_path(contacts, what="contacts")
     area = area_of(str(expect_path(where, what="where")), rig.plate)
     rule = contact_rule(path, rig.plate, contents)

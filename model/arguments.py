@@ -27,10 +27,10 @@ def expect_number(value: object, *, what: str, unit: str) -> None:
         raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
 
 
-def expect_at_least(value: float, least: float, *, what: str) -> None:
-    """Raise InputError for a value that is not finite or below the least."""
-    if not least <= value <= MAX_VALUE:
-        raise InputError(f"{what} must be from {least:g} to {MAX_VALUE:g}, got {value}")
+def expect_between(value: float, least: float, most: float = MAX_VALUE, *, what: str) -> None:
+    """Raise InputError for a value below the least, above the most, or NaN."""
+    if not least <= value <= most:
+        raise InputError(f"{what} must be from {least:g} to {most:g}, got {value}")
 
 
 def expect_values(
@@ -43,7 +43,7 @@ def expect_values(
     for name in f"{above} {at_least} {finite}".split():
         value, is_above = getattr(of, name), name in above.split()
         least = -MAX_VALUE if name in finite.split() else 0.0
-        expect_at_least(value, least, what=f"{what}: {name}")
+        expect_between(value, least, what=f"{what}: {name}")
         if is_above and value < 1 / MAX_VALUE:
             raise InputError(f"{what}: {name} must be above zero, got {value}")
 

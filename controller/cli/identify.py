@@ -193,7 +193,7 @@ def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
 
     Raises InputError, also where the daemon runs: it holds the amplifiers.
     """
-    from controller.daemon.config import daemon_config_of, is_daemon_document, rig_file_of
+    from controller.daemon.config import daemon_config_of, file_of, is_daemon_document
     from controller.daemon.socket_lock import SocketLock
     from model.config.document import read_document
     from model.rig.file import rig_of
@@ -202,7 +202,7 @@ def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
     if not is_daemon_document(document):
         yield document, rig_of(document)
         return
-    config, rig_file = daemon_config_of(document), rig_file_of(document)
+    config, rig_file = daemon_config_of(document), file_of(document, "rig")
     assert rig_file is not None  # noqa: S101  else a problem was reported
     lock = SocketLock(config.socket)
     try:

@@ -1,12 +1,9 @@
 """Loads and validates a daemon's configuration and the files that it names; what may change."""
 
-import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import quote
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
@@ -27,6 +24,7 @@ from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.identification.learned_file import was_learned
 from model.rig.file import rig_of
+from model.rig.kind import whole_url
 from model.rig.rig import Rig
 from model.structure.support import check_supported
 
@@ -86,21 +84,21 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     """Load what a daemon's file names; raises as `load_daemon_config`."""
     _check_kind(document)
     validation = Validation(document, DaemonSection)
-    rig_file = rig_file_of(document)
+    rig_file = file_of(document, "rig")
     rig, rig_text = _rig(validation, rig_file)
     urls = _urls(validation, rig, rig_file)
     touch = _touch(validation, document, rig)
-    table = _file(document, "table")
+    table = file_of(document, "table")
     if table is not None and not table.is_file():
         validation.add(("table",), f"file not found: {table}; check name and folder")
     layout = _layout(validation, document, rig)
     _check_serial_numbers(validation, rig)
-    log_file = _file(document, "log", "file")
-    dump_folder = _file(document, "dumps", "folder")
-    learn = _file(document, "learn")
+    log_file = file_of(document, "log", "file")
+    dump_folder = file_of(document, "dumps", "folder")
+    learn = file_of(document, "learn")
     _check_folders(validation, log_file, dump_folder)
     _check_learn(validation, learn)
-    socket = _file(document, "socket") or default_socket()
+    socket = file_of(document, "socket") or default_socket()
     try:
         check_socket_path(socket)
     except (InputError, OSError) as error:
@@ -153,11 +151,6 @@ def is_daemon_document(document: Document) -> bool:
     return bool(keys & DaemonSection.model_fields.keys()) and "plate" not in keys
 
 
-def rig_file_of(document: Document) -> Path | None:
-    """The path of the rig that a daemon's file names; None if it names none."""
-    return _file(document, "rig")
-
-
 def _check_kind(document: Document) -> None:
     """Refuse another kind of file as a whole instead of reporting each unknown key."""
     if "rig" in document.data:
@@ -171,8 +164,8 @@ def _check_kind(document: Document) -> None:
         )
 
 
-def _file(document: Document, *keys: str) -> Path | None:
-    """The path at nested keys, relative to the configuration's folder; None if it has none."""
+def file_of(document: Document, *keys: str) -> Path | None:
+    """The path at nested keys of a daemon's file, relative to its folder; None if it has none."""
     value: object = document.data
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
@@ -201,7 +194,7 @@ def _layout(
     validation: Validation[DaemonSection], document: Document, rig: Rig | None
 ) -> SurfaceLayout | None:
     """Load the surface layout; problems are reported at the key that names it."""
-    file = _file(document, "layout")
+    file = file_of(document, "layout")
     if file is None:
         return None
     level = validation.field(("level_db_sl",), DaemonSection)
@@ -223,13 +216,8 @@ def _urls(
     """The URL of each amplifier; `sim://` becomes a simulated one under this rig's plate."""
     if rig is None or rig_file is None:
         return {}
-    here = quote(os.fsencode(rig_file.resolve()))
-    urls = {
-        name: f"sim://{here}?amplifier={quote(name)}" if url == "sim://" else url
-        for name, url in rig.amplifiers.items()
-    }
-    wired = Counter(channel.amplifier for channel in rig.wiring.values())
-    errors, _ = check_links(urls, channels=wired, limits=rig.limits)
+    urls = {name: whole_url(url, rig_file.resolve(), name) for name, url in rig.amplifiers.items()}
+    errors, _ = check_links(urls, channels=rig.channel_counts, limits=rig.limits)
     for name, error in errors.items():
         validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
     if len({url.startswith("sim://") for url in urls.values()}) > 1:

@@ -1,6 +1,5 @@
 """Daemon files as a kind of configuration for `era config`."""
 
-from collections import Counter
 from pathlib import Path
 
 from controller.daemon.config import daemon_config_of, is_daemon_document
@@ -15,8 +14,7 @@ def _check(document: Document) -> CheckedFile:
     """Check a file and the files that it names; return a one-line summary."""
     config = daemon_config_of(document)
     rig = config.rig
-    wired = Counter(channel.amplifier for channel in rig.wiring.values())
-    _, warnings = check_links(config.urls, channels=wired, limits=rig.limits)
+    _, warnings = check_links(config.urls, channels=rig.channel_counts, limits=rig.limits)
     daemon = f"era daemon {document.source}"
     hint = "" if config.table is None else f". {daemon} --check reads its table, too"
     line = (

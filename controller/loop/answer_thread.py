@@ -33,7 +33,6 @@ class AnswerThread(Generic[T]):
         self._arrived, self._freed = arrived, freed
         self._threads = DaemonThreads()
         self._answer: asyncio.Future[T] | None = None
-        self._limit: asyncio.TimerHandle | None = None
         self._late = set[asyncio.Future[T]]()  # given up, and still computed
 
     @property
@@ -51,7 +50,7 @@ class AnswerThread(Generic[T]):
         loop = asyncio.get_running_loop()
         self._answer = loop.run_in_executor(self._threads, question)
         self._answer.add_done_callback(self._note)
-        self._limit = loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
+        loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
 
     def take(self) -> T | None:
         """Return the answer that was not taken yet; None without any; raises its error."""
@@ -59,8 +58,6 @@ class AnswerThread(Generic[T]):
         if answer is None or not answer.done():
             return None
         self._answer = None
-        if self._limit is not None:
-            self._limit.cancel()
         return None if answer.cancelled() else answer.result()
 
     def _give_up(self, answer: "asyncio.Future[T]", instead: T) -> None:

@@ -62,6 +62,11 @@ class Requested:
     is_moving: bool = False
     is_rested: bool = False
 
+    def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
+        """Return the contacts that are to feel nothing of what these targets feel."""
+        keys = {contact.key for contact, _ in targets}
+        return tuple([each for each in self.contacts if each.key not in keys])
+
 
 @dataclass(frozen=True)
 class Chosen:
@@ -136,14 +141,12 @@ class Chooser:
 
         beside: what a pulse is felt beside; None for what lasts.
         """
-        keys = {contact.key for contact, _ in targets}
-        quiet = tuple([each for each in requested.contacts if each.key not in keys])
         try:
             if requested.takes_long and beside is None:
                 found = query_jointly(
                     self.table,
                     targets,
-                    quiet,
+                    requested.quiet_beside(targets),
                     capabilities,
                     before=requested.before,
                     shape=self.shape,
@@ -151,7 +154,7 @@ class Chooser:
                     is_moving=requested.is_moving,
                 )
             else:
-                found = self._alone(requested, targets, quiet, capabilities, beside or ())
+                found = self._alone(requested, targets, capabilities, beside or ())
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -165,13 +168,12 @@ class Chooser:
         self,
         requested: Requested,
         targets: Targets,
-        quiet: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
         beside: Sequence[Selection],
     ) -> Selection:
         """Choose for the only target beside others; raises InputError."""
         ((contact, target),) = targets
-        key = contact.key
+        key, quiet = contact.key, requested.quiet_beside(targets)
         heard = [each.quiet_levels[key] for each in beside if key in each.quiet_levels]
         before = requested.before.get((key, 0))
         answer = self._query(contact, target, quiet, capabilities, before)
@@ -267,7 +269,6 @@ def unanswered(requested: Requested, reason: str) -> Chosen:
 
 def silent(requested: Requested, targets: Targets, reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
-    keys = {contact.key for contact, _ in targets}
-    quiet = tuple([each for each in requested.contacts if each.key not in keys])
+    quiet = requested.quiet_beside(targets)
     skipped = tuple(not_served(contact, reason) for contact, _ in targets)
     return Selection(targets, quiet, (), reason, skipped, protected=requested.protected)

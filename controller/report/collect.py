@@ -23,7 +23,7 @@ from pydantic.json_schema import models_json_schema
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
-from controller.daemon.config import is_daemon_document
+from controller.daemon.config import file_of, is_daemon_document
 from controller.daemon.config_sections import DaemonSection
 from controller.daemon.dumps import DUMP_PATTERN
 from controller.effects.layout_file import LayoutSection
@@ -146,15 +146,11 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         return
     if not is_daemon_document(document):
         return
-    for key in _NAMED:
-        value = document.data.get(key)
-        if isinstance(value, str):
-            yield document.beside(value)
-    dumps = document.data.get("dumps")
-    folder = dumps.get("folder") if isinstance(dumps, dict) else None
-    if isinstance(folder, str):
-        found = document.beside(folder).glob(DUMP_PATTERN)
-        yield from sorted(found, key=lambda file: file.name)[-MAX_DUMPS:]
+    yield from filter(None, [file_of(document, key) for key in _NAMED])
+    folder = file_of(document, "dumps", "folder")
+    if folder is not None:
+        dumps = sorted(folder.glob(DUMP_PATTERN), key=lambda file: file.name)
+        yield from dumps[-MAX_DUMPS:]
 
 
 def _include(path: Path, files: dict[str, str], missing: list[str]) -> None:

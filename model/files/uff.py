@@ -263,7 +263,13 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
     is_complex, is_even = found["ord_data_type"] in (5, 6), found["abscissa_spacing"] == 1
     shape = (count, 1 + is_complex + (not is_even))
     read = _bytes_of if block.is_binary else _numbers_of
-    values = read(path, block, found, math.prod(shape)).reshape(shape)
+    values = read(path, block, found, math.prod(shape))
+    if len(values) < math.prod(shape):
+        raise InputError(
+            f"{place}: record must have {math.prod(shape)} numbers, as its header says, got "
+            f"{len(values)}; the file is damaged, export it again"
+        )
+    values = values.reshape(shape)
     if not np.isfinite(values).all():
         raise InputError(f"{place}: values of the record must be finite; measure it again")
     x = (
@@ -290,22 +296,21 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
 
 
 def _bytes_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
-    """So many numbers of a binary record."""
+    """So many numbers of a binary record, or all that it has."""
     data = block.content.split(b"\n", _HEADER_LINES)[-1]
     order = "<" if found["byte_ordering"] == 1 else ">"
     size = 8 if found["ord_data_type"] in (4, 6) else 4
-    if len(data) < count * size:
-        raise _too_few(path, block.line, count, len(data) // size)
     if data[count * size :].strip(b"\0 \t\r\n"):
         raise InputError(
             f"{path}:{block.line}: record must end behind {count} numbers, as its header says, got "
             f"{len(data) - count * size} bytes more; export it again, and copy it as a binary file"
         )
-    return np.frombuffer(data[: count * size], dtype=f"{order}f{size}").astype(float)
+    whole = min(count, len(data) // size) * size
+    return np.frombuffer(data[:whole], dtype=f"{order}f{size}").astype(float)
 
 
 def _numbers_of(path: Path, block: _Block, found: Mapping[str, Any], count: int) -> FloatArray:
-    """So many numbers of a record in ASCII; what fills their last line is left out."""
+    """So many numbers of a record in ASCII, or all; what fills their last line is left out."""
     numbers: list[float] = []
     for line, row in enumerate(block.rows[_HEADER_LINES:], start=block.line + 1 + _HEADER_LINES):
         if _NUMBER.sub(b"", row).strip() or (len(numbers) >= count and row.strip()):
@@ -317,16 +322,7 @@ def _numbers_of(path: Path, block: _Block, found: Mapping[str, Any], count: int)
         for word in _NUMBER.findall(row):
             plain = word.upper().replace(b"D", b"E")
             numbers.append(float(_NO_LETTER.sub(b"E", plain)))
-    if len(numbers) < count:
-        raise _too_few(path, block.line, count, len(numbers))
     return np.array(numbers[:count])
-
-
-def _too_few(path: Path, line: int, count: int, got: int) -> InputError:
-    return InputError(
-        f"{path}:{line}: record must have {count} numbers, as its header says, got {got}; the file "
-        "is damaged, export it again"
-    )
 
 
 def _lengths_in_si(place: str, found: Mapping[str, Any]) -> float:

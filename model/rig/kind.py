@@ -9,6 +9,7 @@ import math
 import os
 from collections import Counter
 from itertools import pairwise
+from pathlib import Path
 from pkgutil import resolve_name
 from urllib.parse import quote
 
@@ -172,9 +173,9 @@ errors by the amplifier's name, and warnings, and opens none.
 def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
     """Problems and warnings; rig: of the document, None if it is invalid."""
     urls = _urls(document)
-    wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
+    counts = rig.channel_counts if rig else Counter[str]()
     limits = rig.limits if rig else limits_of(LimitsSection())
-    wrong, warnings = resolve_name(_CHECK)(urls, channels=wired, limits=limits)
+    wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
     problems = [
         document.problem(("amplifiers", amplifier, "url"), what)
         for amplifier, what in wrong.items()
@@ -183,12 +184,18 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
 
 
 def _urls(document: Document) -> dict[str, str]:
-    """All URLs that are text; `sim://` becomes a simulated amplifier over this rig."""
+    """All URLs that are text."""
     amplifiers = document.data.get("amplifiers")
     urls = {}
     for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():
         url = amplifier.get("url") if isinstance(amplifier, dict) else None
         if isinstance(url, str):
-            here = f"sim://{quote(os.fsencode(document.source))}?amplifier={quote(str(name))}"
-            urls[name] = here if url == "sim://" else url
+            urls[name] = whole_url(url, document.source, str(name))
     return urls
+
+
+def whole_url(url: str, rig_file: str | Path, amplifier: str) -> str:
+    """The URL of an amplifier; `sim://` alone becomes a simulated one over this rig's plate."""
+    if url != "sim://":
+        return url
+    return f"sim://{quote(os.fsencode(rig_file))}?amplifier={quote(amplifier)}"

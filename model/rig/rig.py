@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from numbers import Real
@@ -85,6 +86,11 @@ class Rig:
             meant = did_you_mean(str(name), eras)
             raise InputError(f"unknown ERA {name!r}; {meant}choose from {', '.join(eras)}")
         return eras[name]
+
+    @property
+    def channel_counts(self) -> Counter[str]:
+        """Numbers of channels that are wired, by the amplifier's name."""
+        return Counter(channel.amplifier for channel in self.wiring.values())
 
     @property
     def fingerprint(self) -> str:

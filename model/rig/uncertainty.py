@@ -3,8 +3,7 @@
 import math
 from dataclasses import asdict, dataclass, fields
 
-from model.arguments import expect_at_least
-from model.errors import InputError
+from model.arguments import expect_between
 
 MAX_UNCERTAINTY = 1000.0
 """Of any of them; what a rig file may state is less."""
@@ -35,9 +34,8 @@ class Uncertainty:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
         for key in (each.name for each in fields(self)):
             least = 1.0 if key == "damping" else 0.0
-            expect_at_least(getattr(self, key), least, what=f"uncertainty: {key}")
-            if getattr(self, key) > MAX_UNCERTAINTY:
-                raise InputError(f"uncertainty: {key} must be up to {MAX_UNCERTAINTY}")
+            value = getattr(self, key)
+            expect_between(value, least, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
 
     @classmethod
     def none(cls) -> "Uncertainty":

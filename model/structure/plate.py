@@ -35,7 +35,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from model.arguments import expect_values
+from model.arguments import expect_between, expect_values
 from model.errors import InputError
 
 
@@ -254,11 +254,8 @@ class Plate(Sheet):
             raise InputError(
                 f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
             )
-        if not abs(self.loss_exponent) <= MAX_LOSS_EXPONENT:
-            raise InputError(
-                f"plate: loss_exponent must be from -{MAX_LOSS_EXPONENT:g} to "
-                f"{MAX_LOSS_EXPONENT:g}, got {self.loss_exponent}"
-            )
+        bounds = -MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT
+        expect_between(self.loss_exponent, *bounds, what="plate: loss_exponent")
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)
         object.__setattr__(self, "mode_deviations", deviations)

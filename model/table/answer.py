@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from model.arguments import expect_at_least
+from model.arguments import expect_between
 from model.choice import best_by, best_of
 from model.errors import InputError
 from model.table.contents import Contents, Stream, Tones
@@ -63,7 +63,7 @@ def answer(
     priority the louder ones first.
     Raises InputError for requests that contradict each other, and a band without frequencies.
     """
-    expect_at_least(apart_hz, 0.0, what="apart_hz")
+    expect_between(apart_hz, 0.0, what="apart_hz")
     check_requests(requests, fingers, table.plate)
     answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
     found = with_modulation(table, answering.answer(min_contrast_db), playable=playable)

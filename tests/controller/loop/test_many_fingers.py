@@ -45,7 +45,7 @@ async def test_all_fingers_of_a_region_feel_its_effect(count: int) -> None:
             fingers.must_be_felt = False
             fingers.at[21] = (0.15, 0.21)
             await fingers.hold(0.1)
-            assert fingers.controller.rejected_touches["too_many"] >= 1
+            assert fingers.controller.rejects.counts["too_many"] >= 1
             assert len(fingers.applied[-1].contacts) == 20
 
 

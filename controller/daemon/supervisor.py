@@ -177,6 +177,7 @@ class Supervisor(Operator):
             await self._pause(pause)
         while self.assume_energised(clock.now()) and not self._closing.is_set():
             await self._pause(_RECHECK)
+            await self.controller.group.statuses()  # what was loud may be silent by now
         if self.controller.group.is_open:  # none was lost again
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 

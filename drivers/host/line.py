@@ -378,6 +378,11 @@ class Line:
             self._repeat(job, member)
             return
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
+        before = member.counts.last_round_trip or 0.0
+        if not remark and before > job.timeout:
+            remark = (
+                f"the reply before took {1e3 * before:.0f} ms: check what delays frames on the way"
+            )
         came = f", but {remark}" if remark else "; check that the amplifier is switched on"
         cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms{came}"
         if is_first and self._boot_time:

@@ -47,6 +47,7 @@ _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
 _SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
+_NO_SUCH_REGISTERS = (1, 2, 3, 4)
 _GATEWAY = {10: "path to", 11: "response of"}
 
 
@@ -165,6 +166,12 @@ class ModbusWire(Wire):
             return None
         if response.exception:
             self._request = None
+            if request.name == "Hello" and response.exception in _NO_SUCH_REGISTERS:
+                return Broken(
+                    f"unit {request.adu.unit} is no amplifier of this protocol: its identity "
+                    f"cannot be read (Modbus exception {response.exception}); check address and "
+                    "unit"
+                )
             if (refusal := EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")

@@ -206,6 +206,15 @@ async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None
         await host.read_status()
 
 
+@in_virtual_time
+async def test_error_of_late_replies_names_the_delay() -> None:
+    """The first request waits longer than the next, whose replies come after all attempts."""
+    end = MemoryLine("tcp", "a")
+    end.outward = lambda name, data: [(0.2, data)]
+    with pytest.raises(LinkTimeout, match="30 ms, but the reply before took 200 ms"):
+        await end.hosts["a"].open()
+
+
 @pytest.mark.parametrize(("wire", "named"), [("serial", "flow control"), ("can", "acknowledges")])
 @in_virtual_time
 async def test_error_of_a_port_that_takes_nothing_names_what_to_check(

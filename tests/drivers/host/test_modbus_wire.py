@@ -142,6 +142,16 @@ def test_exceptions_are_refusals_or_no_response(exception: int, expected: list[o
     assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
 
 
+@pytest.mark.parametrize("exception", [1, 2, 3, 4])
+def test_device_without_an_identity_is_no_amplifier(exception: int) -> None:
+    """As another Modbus device at this address, which has no such registers."""
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    wire.request(7, "Hello", {})
+    (arrival,) = wire.received(bytes([0, 1, 0, 0, 0, 3, 7, 0x84, exception]))
+    assert isinstance(arrival, Broken)
+    assert "unit 7 is no amplifier" in arrival.reason
+
+
 @pytest.mark.parametrize("is_rtu", [True, False])
 def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
     """It wrote the same message before the reply was read; the next attempt has it."""

@@ -14,7 +14,7 @@ from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.hardware import OpenPort
 from drivers.host.jobs import Job, JobQueue, JointStart, Priority
-from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
+from drivers.host.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import BROADCAST
@@ -33,6 +33,8 @@ MAX_LATE = 0.032
 An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
+_UNFED = 2 * HEARTBEAT  # s; an amplifier of a line that was not surely fed since waits too long
+_OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
@@ -130,7 +132,7 @@ class Line:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
-            late = self.time() - job.sent_at - member.exchange_time(job.name)
+            late = self.time() - job.begun_at - member.exchange_time(job.name)
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
@@ -207,6 +209,8 @@ class Line:
         address = BROADCAST if member is None else member.address
         try:
             if not rest:
+                if member is not None and job.start is None and job.priority in _OF_LOOP:
+                    self._feed_all()
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
                 if job.parts:
@@ -221,7 +225,7 @@ class Line:
             now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
             if not rest:
-                job.sent_at, job.due = now, 0.0
+                job.sent_at, job.begun_at, job.due = now, begins, 0.0
                 for each in self.members.values():
                     if address in (BROADCAST, each.address):
                         each.note_sent(job.name, job.values, now, begins + self.wire.takes)
@@ -256,6 +260,31 @@ class Line:
         self._current = job
         if self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
+
+    def _feed_all(self) -> None:
+        """Feed all amplifiers of the line ahead of a request of the control loop to one.
+
+        Where one was surely fed long ago: each exchange on a line whose replies come late may take
+        a third of a watchdog. By a broadcast Commit of what all have committed last, which changes
+        nothing that plays or is staged.
+        """
+        members = [*self.members.values()]
+        unfed_since = self.time() - (HEARTBEAT if self.late > GRACE else _UNFED)
+        if len(members) == 1 or min(each.feeding.since for each in members) >= unfed_since:
+            return
+        committed = {(each.session, each.committed) for each in members}
+        session, token = committed.pop()
+        if committed or not token:
+            return
+
+        def make() -> Values:
+            values = {"session": session, "token": token}
+            for each in members:
+                each.next_request("Ping", values, Priority.HEARTBEAT)
+            return values
+
+        result = self._loop.create_future()
+        self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, make, 0.0, self.time(), result))
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""

@@ -178,7 +178,8 @@ class Group(Members):
                 is_due = may_read and now >= self._running_due.get(name, 0.0)
                 if not each.committed and len(each.line.members) > 1:
                     token = first[each.line] = first.get(each.line) or self._first_token(each.line)
-                    feeding.append(each.stage(token, [Layer(0)], now=True))
+                    layers, priority = [Layer(0)], Priority.HEARTBEAT
+                    feeding.append(each.stage(token, layers, now=True, priority=priority))
                 elif is_due and each.feeding.tells(now):
                     pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
                     self._running_due[name] = now + max(pause, _STATUS_INTERVAL)

@@ -17,6 +17,7 @@ from drivers.host.jobs import Job, JobQueue, JointStart, Priority
 from drivers.host.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
+from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import BROADCAST
 from drivers.trace import Direction
 
@@ -126,6 +127,7 @@ class Line:
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
+                self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
                 if self._must_yield(job):
                     self._not_answered(job)
                 else:
@@ -265,26 +267,28 @@ class Line:
         """Feed all amplifiers of the line ahead of a request of the control loop to one.
 
         Where one was surely fed long ago: each exchange on a line whose replies come late may take
-        a third of a watchdog. By a broadcast Commit of what all have committed last, which changes
-        nothing that plays or is staged.
+        a third of a watchdog. By a broadcast Commit of the newest token: it changes nothing on
+        those that have committed it, and the others may have their commit now.
         """
         members = [*self.members.values()]
         unfed_since = self.time() - (HEARTBEAT if self.late > GRACE else _UNFED)
         if len(members) == 1 or min(each.feeding.since for each in members) >= unfed_since:
             return
-        committed = {(each.session, each.committed) for each in members}
-        session, token = committed.pop()
-        if committed or not token:
-            return
+        session, token = members[0].session, 0
+        for each in members:
+            if each.committed and is_newer_token(each.committed, token):
+                token = each.committed
 
         def make() -> Values:
             values = {"session": session, "token": token}
             for each in members:
-                each.next_request("Ping", values, Priority.HEARTBEAT)
+                name = "Ping" if each.committed == token else "Commit"
+                each.next_request(name, values, Priority.SET)
             return values
 
-        result = self._loop.create_future()
-        self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, make, 0.0, self.time(), result))
+        if token and all(each.session == session for each in members):
+            result = self._loop.create_future()
+            self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, make, 0.0, self.time(), result))
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
@@ -350,10 +354,12 @@ class Line:
         if current.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
-        free_at = max(self.time(), self._free_at)
-        if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
+        free_at, most_urgent = max(self.time(), self._free_at), min(waiting, default=8)
+        # Where replies come late one that is cut short would never end.
+        yields_to = Priority.SET if self.late <= GRACE else Priority.SILENCE
+        if current.priority is Priority.READING and most_urgent <= yields_to:
             current.due = min(current.due, free_at)
-        elif min(waiting, default=8) <= Priority.SILENCE:
+        elif most_urgent <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
         if self._timer is not None and self._timer.when() > current.due:
             self._timer.cancel()

@@ -166,16 +166,15 @@ class Group(Members):
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
-        lines, first = set[Line](), dict[Line, int]()
+        first: dict[Line, int] = {}
+        # Where no more statuses are read: one that may reply again is to be heard before.
+        busy = {each.line for each in self.amplifiers.values() if each.silence_cause is not None}
         feeding: list[Awaitable[Values | Staged]] = []
         for name in self.by_need:
             each = self.amplifiers[name]
             if each.silence_cause is None:
                 now = each.line.time()
-                # Where replies come late one of a line alone: none waits for long to be fed.
-                may_read = each.line not in lines or each.line.late <= GRACE
-                lines.add(each.line)
-                is_due = may_read and now >= self._running_due.get(name, 0.0)
+                is_due = each.line not in busy and now >= self._running_due.get(name, 0.0)
                 if not each.committed and len(each.line.members) > 1:
                     token = first[each.line] = first.get(each.line) or self._first_token(each.line)
                     layers, priority = [Layer(0)], Priority.HEARTBEAT
@@ -183,6 +182,8 @@ class Group(Members):
                 elif is_due and each.feeding.tells(now):
                     pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
                     self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
+                    if each.line.late > GRACE:  # one alone: none waits for long to be fed
+                        busy.add(each.line)
                     feeding.append(self._read_and_feed(each, self.epoch))
                 else:
                     feeding.append(each.ping())

@@ -34,7 +34,7 @@ MAX_LATE = 0.032
 An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
-_UNFED = 2 * HEARTBEAT  # s; an amplifier of a line that was not surely fed since waits too long
+_UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
 _OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
@@ -271,8 +271,12 @@ class Line:
         those that have committed it, and the others may have their commit now.
         """
         members = [*self.members.values()]
-        unfed_since = self.time() - (HEARTBEAT if self.late > GRACE else _UNFED)
-        if len(members) == 1 or min(each.feeding.since for each in members) >= unfed_since:
+        if len(members) == 1:
+            return
+        longest = HEARTBEAT
+        if self.late <= GRACE:
+            longest = _UNFED + sum(each.exchange_time("Set") for each in members)
+        if self.time() - min(each.feeding.since for each in members) <= longest:
             return
         session, token = members[0].session, 0
         for each in members:
@@ -354,12 +358,12 @@ class Line:
         if current.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
-        free_at, most_urgent = max(self.time(), self._free_at), min(waiting, default=8)
+        free_at = max(self.time(), self._free_at)
         # Where replies come late one that is cut short would never end.
         yields_to = Priority.SET if self.late <= GRACE else Priority.SILENCE
-        if current.priority is Priority.READING and most_urgent <= yields_to:
+        if current.priority is Priority.READING and min(waiting, default=8) <= yields_to:
             current.due = min(current.due, free_at)
-        elif most_urgent <= Priority.SILENCE:
+        elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
         if self._timer is not None and self._timer.when() > current.due:
             self._timer.cancel()

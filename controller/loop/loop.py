@@ -158,7 +158,9 @@ class Controller:
         self._lines_if_open = lines
         try:
             async with self._sending:  # to those of before
-                self.group = Group(self._opened, watchdog=self.watchdog)
+                self.group = Group(
+                    self._opened, watchdog=self.watchdog, restored=self._feed_at_once
+                )
             opening = [self._amplifier(lines, name) for name in self.urls]
             results = await asyncio.gather(*opening, return_exceptions=True)
             by_name = zip(self.urls, results, strict=True)
@@ -331,13 +333,14 @@ class Controller:
                     await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
-                    began = clock.now()
+                    # From its beginning: the watchdog has run since its request was sent.
+                    due = self._heartbeat_due = clock.now() + HEARTBEAT
                     try:
                         await self.group.beat()
                     finally:
-                        # From its beginning: the watchdog has run since its request was sent.
-                        rest = HEARTBEAT / 2  # on a slow wire
-                        self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
+                        if self._heartbeat_due == due:  # none replies again since
+                            rest = HEARTBEAT / 2  # on a slow wire
+                            self._heartbeat_due = max(due, clock.now() + rest)
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
         except LinkError as error:
@@ -366,6 +369,10 @@ class Controller:
             await self._end_only(decider, decision)
         else:
             await self._execute(decider, decision)
+
+    def _feed_at_once(self) -> None:
+        self._heartbeat_due = clock.now()
+        self._wake.set()
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""

@@ -191,14 +191,22 @@ class Dialogue:
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
 
-    async def stage(self, token: int, layers: Sequence[Layer], *, now: bool = False) -> Staged:
+    async def stage(
+        self,
+        token: int,
+        layers: Sequence[Layer],
+        *,
+        now: bool = False,
+        priority: Priority | None = None,
+    ) -> Staged:
         """Stage a set under a token, or play it at once.
 
-        It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
-        the reason; Preempted where a stop came first; FrameError for two replies in a row with
-        another token.
+        priority: None for that of a set, or of what silences. It is admitted by the ledger when
+        its turn on the line has come. Raises CommandRefused with the reason; Preempted where a stop
+        came first; FrameError for two replies in a row with another token.
         """
-        priority = Priority.SILENCE if is_silence(layers) else Priority.SET
+        if priority is None:
+            priority = Priority.SILENCE if is_silence(layers) else Priority.SET
         for _ in range(MAX_CONTRADICTIONS):
             cuts: list[Values] = []
             admitted: list[Staged] = []

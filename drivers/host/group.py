@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 from drivers import clock
+from drivers.contents import Layer
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -19,12 +20,14 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
+from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
-from drivers.host.line import Line
+from drivers.host.line import GRACE, Line
 from drivers.host.members import GroupState, Members, is_lost
 from drivers.host.stop import Stopped, what_may_play
-from drivers.host.timing import STOP_RAMP, check_watchdog
+from drivers.host.timing import HEARTBEAT, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
+from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED, QUANTITIES
 
 _T = TypeVar("_T")
@@ -40,6 +43,7 @@ class Group(Members):
     """Amplifiers by name, their lines open. A failure of one stops all; nothing arms by itself.
 
     A stop runs to completion even if its caller is cancelled. watchdog [s]: of armed amplifiers.
+    restored: called where one that did not reply does again; its watchdog has run down meanwhile.
     draw: of session numbers and of the first token, so that none of an earlier host is repeated.
     """
 
@@ -48,10 +52,11 @@ class Group(Members):
         amplifiers: Mapping[str, Amplifier],
         *,
         watchdog: float = WATCHDOG,
+        restored: Callable[[], None] = lambda: None,
         draw: Callable[[int, int], int] = random.randint,
     ) -> None:
         super().__init__(amplifiers, draw(_TOKEN.minimum, _TOKEN.maximum))
-        self._watchdog = watchdog
+        self._watchdog, self._restored = watchdog, restored
         self._draw = draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
@@ -146,63 +151,85 @@ class Group(Members):
         if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
             await self.stop()
 
-    def beat(self) -> Coroutine[Any, Any, list[Values]]:
+    def beat(self) -> Coroutine[Any, Any, Sequence[Values | Staged]]:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
         play its set. A watchdog that runs down, and starts anew with each heartbeat, shows that it
         would silence the amplifier: so its status is read just before it is fed, five times a
-        second, and less often on a slow wire or where replies come late.
+        second, and less often on a slow wire or where replies come late. On a shared line one that
+        has committed nothing since it was armed is fed by a silent set, so that all have committed
+        the same: the line feeds them together by that.
         """
         return self._exchange(self._beat)
 
-    def _beat(self) -> Awaitable[list[Values]]:
+    def _beat(self) -> Awaitable[Sequence[Values | Staged]]:
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
-        running: dict[str, asyncio.Future[Values]] = {}
-        late = self._feed_together(partial(self._read_one, running))
-        feeding: list[Awaitable[Values]] = []
-        for name in self.by_need:
+        first: dict[Line, int] = {}
+        running = self._read_running()
+        feeding: list[Awaitable[Values | Staged]] = []
+        order = self.by_need
+        for line in {each.line for each in self.amplifiers.values() if each.line.late > GRACE}:
+            # A late line feeds all again ahead of each: after that the last one's status tells.
+            of_line = [name for name in order if self.amplifiers[name].line is line]
+            next_read = min(of_line, key=lambda name: self._running_due.get(name, 0.0))
+            order.remove(next_read)
+            order.append(next_read)
+        for name in order:
             each = self.amplifiers[name]
             if each.silence_cause is None:
                 if name in running:
                     feeding.append(self._read_and_feed(each, self.epoch, running[name]))
-                elif each.line not in late and self._is_running_due(each):
-                    feeding.append(self._read_and_feed(each, self.epoch))
+                elif not each.committed and len(each.line.members) > 1:
+                    token = first[each.line] = first.get(each.line) or self._first_token(each.line)
+                    layers, priority = [Layer(0)], Priority.HEARTBEAT
+                    feeding.append(each.stage(token, layers, now=True, priority=priority))
                 else:
                     feeding.append(each.ping())
             elif name not in self._readings or self._readings[name].done():
-                reading = each.read_status(Priority.READING)
-                reading.add_done_callback(_seen)
-                self._readings[name] = reading
+                read = partial(each.read_status, Priority.READING)
+                self._readings[name] = asyncio.ensure_future(self._retried(each, read))
+                self._readings[name].add_done_callback(self._has_replied)
         return self.all(feeding)
 
-    def _is_running_due(self, amplifier: Amplifier) -> bool:
-        """Whether a status is due that shows if a watchdog runs down; if so, the next is later."""
-        now = amplifier.line.time()
-        if now < self._running_due.get(amplifier.name, 0.0) or not amplifier.feeding.tells(now):
-            return False
-        pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-        self._running_due[amplifier.name] = now + max(pause, _STATUS_INTERVAL)
-        return True
+    def _read_running(self) -> dict[str, "asyncio.Future[Values]"]:
+        """Read statuses that show how a watchdog runs down, before any of their line are fed.
 
-    def _read_one(
-        self, running: dict[str, "asyncio.Future[Values]"], members: Sequence[Amplifier]
-    ) -> None:
-        """Read the status of one amplifier alone, before all are fed: none waits for long."""
-        for each in sorted(members, key=lambda one: one.feeding.since):
-            if each.silence_cause is None and self._is_running_due(each):
-                running[each.name] = each.read_status(Priority.HEARTBEAT)
-                return
+        On a line that is slow or late of one alone, so that none waits for long; of none where one
+        may reply again, which is to be heard before.
+        """
+        busy = {each.line for each in self.amplifiers.values() if each.silence_cause is not None}
+        running: dict[str, asyncio.Future[Values]] = {}
+        for name in self.by_need:
+            each = self.amplifiers[name]
+            now, line = each.line.time(), each.line
+            is_due = line not in busy and now >= self._running_due.get(name, 0.0)
+            if is_due and each.committed and each.feeding.tells(now):
+                pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
+                self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
+                all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
+                if line.late > GRACE or all_of_line > HEARTBEAT:
+                    busy.add(line)
+                running[name] = each.read_status(Priority.HEARTBEAT)
+        return running
+
+    def _has_replied(self, reading: "asyncio.Future[Values]") -> None:
+        _seen(reading)
+        if not reading.cancelled() and reading.exception() is None:
+            self._restored()
+
+    def _first_token(self, line: Line) -> int:
+        """Return the token that one of a line has committed, or else a new one."""
+        committed = max(each.committed for each in line.members.values())
+        self.token = self.token if committed else token_after(self.token)
+        return committed or self.token
 
     async def _read_and_feed(
-        self,
-        amplifier: Amplifier,
-        before: int,
-        reading: "asyncio.Future[Values] | None" = None,
+        self, amplifier: Amplifier, before: int, reading: "asyncio.Future[Values]"
     ) -> Values:
-        await (reading or amplifier.read_status(Priority.HEARTBEAT))
+        await reading
         self.check_none_since(before)
         return await amplifier.ping()
 

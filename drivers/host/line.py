@@ -14,9 +14,10 @@ from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.hardware import OpenPort
 from drivers.host.jobs import Job, JobQueue, JointStart, Priority
-from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
+from drivers.host.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
+from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import BROADCAST
 from drivers.trace import Direction
 
@@ -33,6 +34,8 @@ MAX_LATE = 0.032
 An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
+_UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
+_OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
@@ -124,13 +127,14 @@ class Line:
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
+                self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
                 if self._must_yield(job):
                     self._not_answered(job)
                 else:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
-            late = self.time() - job.sent_at - member.exchange_time(job.name)
+            late = self.time() - job.begun_at - member.exchange_time(job.name)
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
@@ -207,6 +211,11 @@ class Line:
         address = BROADCAST if member is None else member.address
         try:
             if not rest:
+                # A status shows how a watchdog runs down only if none was fed before it.
+                is_reading = job.name == "GetStatus" and job.priority is Priority.HEARTBEAT
+                is_one = member is not None and job.start is None
+                if is_one and job.priority in _OF_LOOP and not is_reading:
+                    self._feed_all()
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
                 if job.parts:
@@ -221,7 +230,7 @@ class Line:
             now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
             if not rest:
-                job.sent_at, job.due = now, 0.0
+                job.sent_at, job.begun_at, job.due = now, begins, 0.0
                 for each in self.members.values():
                     if address in (BROADCAST, each.address):
                         each.note_sent(job.name, job.values, now, begins + self.wire.takes)
@@ -256,6 +265,37 @@ class Line:
         self._current = job
         if self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
+
+    def _feed_all(self) -> None:
+        """Feed all amplifiers of the line ahead of a request of the control loop to one.
+
+        Where one was surely fed long ago: each exchange on a line whose replies come late may take
+        a third of a watchdog. By a broadcast Commit of the newest token: it changes nothing on
+        those that have committed it, and the others may have their commit now.
+        """
+        members = [*self.members.values()]
+        if len(members) == 1:
+            return
+        longest = HEARTBEAT
+        if self.late <= GRACE:
+            longest = _UNFED + sum(each.exchange_time("Set") for each in members)
+        if self.time() - min(each.feeding.since for each in members) <= longest:
+            return
+        session, token = members[0].session, 0
+        for each in members:
+            if each.committed and is_newer_token(each.committed, token):
+                token = each.committed
+
+        def make() -> Values:
+            values = {"session": session, "token": token}
+            for each in members:
+                name = "Ping" if each.committed == token else "Commit"
+                each.next_request(name, values, Priority.SET)
+            return values
+
+        if token and all(each.session == session for each in members):
+            result = self._loop.create_future()
+            self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, make, 0.0, self.time(), result))
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
@@ -322,7 +362,9 @@ class Line:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         free_at = max(self.time(), self._free_at)
-        if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
+        # Where replies come late one that is cut short would never end.
+        yields_to = Priority.SET if self.late <= GRACE else Priority.SILENCE
+        if current.priority is Priority.READING and min(waiting, default=8) <= yields_to:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)

@@ -27,7 +27,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
-from drivers.host.line import GRACE, Line
+from drivers.host.line import Line
 from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP
 from drivers.protocol.records import Values
@@ -263,7 +263,6 @@ class Members:
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
         """
         before = self.epoch
-        self._feed_together()
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
@@ -348,29 +347,6 @@ class Members:
         for name, status in zip(requests, statuses, strict=False):
             await _check_plays(self.amplifiers[name], status, token)
 
-    def _feed_together(
-        self, before: Callable[[Sequence[Amplifier]], None] = lambda members: None
-    ) -> set[Line]:
-        """Feed all amplifiers of a line at once whose replies come late, before each in its turn.
-
-        By a commit of the set that all have committed last, which changes nothing; where they have
-        not committed the same it is left out. before: called with the amplifiers of a line that is
-        fed next. Returns the lines whose replies come late.
-        """
-        late = set[Line]()
-        for line in {each.line for each in self.amplifiers.values()}:
-            members = [each for each in self.amplifiers.values() if each.line is line]
-            tokens = {each.committed for each in members}
-            if line.late <= GRACE or len(members) == 1:
-                continue
-            late.add(line)
-            if len(tokens) > 1 or 0 in tokens:
-                continue
-            before(members)
-            make = partial(_commit_of, members, tokens.pop(), "Ping")
-            line.submit(None, Priority.HEARTBEAT, "Commit", {}, make=make)
-        return late
-
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""
         unchanged = []
@@ -401,14 +377,11 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
-def _commit_of(several: Sequence[Amplifier], token: int, like: str = "Commit") -> Values:
-    """Return the commit of all amplifiers of a line.
-
-    Raises unless each may have it now; like: "Ping" where it only feeds.
-    """
+def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
+    """Return the commit of all amplifiers of a line; raises unless each may have it now."""
     values = {"session": several[0].session, "token": token}
     for amplifier in several:
-        amplifier.next_request(like, values, Priority.SET)
+        amplifier.next_request("Commit", values, Priority.SET)
     return values
 
 

@@ -25,7 +25,16 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import MESSAGES, STATES
 from virtual_loop import in_virtual_time
-from words_line import MemoryLine, grouped, layer, losing, tone, unaltered, with_group
+from words_line import (
+    MemoryLine,
+    group_of,
+    grouped,
+    layer,
+    losing,
+    tone,
+    unaltered,
+    with_group,
+)
 
 LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", "b"),)}
 
@@ -451,6 +460,26 @@ async def test_set_that_would_be_committed_too_late_is_not(
     assert (group.is_armed, group.is_set_incomplete) == (True, False)
     await group.apply({name: [layer(0, tone())] for name in "ab"})
     await group.beat()
+
+
+@in_virtual_time
+async def test_copy_of_an_old_status_is_no_reply(wire: str) -> None:
+    """All replies from before it was armed come once more, amid readings and heartbeats."""
+    end, kept = MemoryLine(wire, "a"), list[bytes]()
+    group, (host,) = await group_of(end, is_armed=False), end.hosts.values()
+    end.outward = lambda name, data: kept.append(data) or unaltered(name, data)
+    await host.read_status()
+    await group.arm()
+    end.outward = lambda name, data: [(0.004, data)]
+    for request in (host.read_status, host.ping, host.read_status, group.beat):
+        replying = asyncio.ensure_future(request())
+        await asyncio.sleep(0.001)
+        for data in kept:
+            end.line.received(data)
+        await replying
+        assert host.status is not None
+        assert host.status["state"] == STATES["OPERATION_ENABLED"]
+    assert group.is_armed
 
 
 @grouped(("a",), wire="serial")

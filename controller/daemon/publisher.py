@@ -24,7 +24,6 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
-    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
@@ -102,14 +101,12 @@ class EventPublisher:
         if new.state is DaemonState.OPERATION_ENABLED:
             return
         # The control loop does not report the end of what others have silenced.
-        applied, self.view.applied, self.view.silenced = self.view.applied, None, None
-        if applied is not None:
-            silence = SilenceEvent(
-                contacts=self.view.contact_statuses(),
-                reason=new.cause,
-                latency_ms=None,
-            )
-            self.hub.publish("silence", lambda: silence)
+        view = self.view
+        was_playing, view.applied = view.applied is not None, None
+        silenced = Silenced(view.contacts, (), new.cause, None, clock.now())
+        view.silenced = None if new.state is DaemonState.SWITCHED_ON else silenced  # decided next
+        if was_playing:
+            self.hub.publish("silence", view.silence_event)
 
     def _why_not(self, key: ContactKey) -> str:
         """Why a contact feels nothing of its own that the control loop has not reported."""

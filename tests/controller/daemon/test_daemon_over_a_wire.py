@@ -204,15 +204,15 @@ async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_
         await era.subscribe("silence")
         told = (await next_event(era, "silence")).data["reason"]
         assert told == (await era.status()).cause
-        expected = bench.daemon._controller._serial_numbers
-        expected["main"] = "A1"  # another one is connected in its place
+        amplifier = bench.far.amplifier
+        amplifier.identity["serial_number"] = "A1"  # another one is connected in its place
         bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         assert "no reply" in (await era.status()).cause
         bench.far.device.recover()
         await until(lambda: "A1" in bench.daemon._supervisor.operation.cause)
         assert "cables" not in ((await era.status()).remedy or "")
-        expected["main"] = "SIM-main"
+        amplifier.identity["serial_number"] = "SIM-main"
         seen = []
         await era.subscribe("state")
         while not seen or seen[-1]["new"] != READY:

@@ -25,7 +25,6 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
-    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event

@@ -42,6 +42,11 @@ _DISPLACEMENT_UNITS = {
     **dict.fromkeys(("um", "micron"), 1e-6),
     **dict.fromkeys(("in", "inch"), 0.0254),
 }
+_FREQUENCY_UNITS = {
+    **dict.fromkeys(("", "hz", "hertz", "1/s", "s-1", "cps"), 1.0),
+    "khz": 1e3,
+    "rad/s": 0.5 / math.pi,
+}
 _SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
 
 
@@ -146,6 +151,7 @@ def _uff_values(
         )
     scale = _unit(place, function.units[0], _ACCELERATION_UNITS)
     scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
+    hertz = _unit(place, function.abscissa_unit, _FREQUENCY_UNITS)
     if not np.iscomplexobj(function.data):
         raise InputError(f"{place}: response must be complex, got real; export it with phases")
     if any(abs(direction) not in (0, _UP) for direction in function.directions):
@@ -170,7 +176,7 @@ def _uff_values(
             name,
             (float(x), float(y)),
             era_point,
-            frequency,
+            hertz * frequency,
             scale * value,
             place,
         )

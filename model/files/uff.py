@@ -50,7 +50,8 @@ class Function:
 
     place: file and line, for errors; response, reference: nodes, each with a name ("" without one)
     and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; data_types: codes of
-    abscissa, ordinate and denominator; units: labels of ordinate and denominator.
+    abscissa, ordinate and denominator; units: labels of ordinate and denominator; abscissa_unit:
+    that of a file.
     """
 
     place: str
@@ -63,6 +64,7 @@ class Function:
     data: NDArray[Any]
     data_types: tuple[int, int, int]
     units: tuple[str, str]
+    abscissa_unit: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,6 +294,7 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
         data,
         tuple(found[f"{axis}_spec_data_type"] for axis in ("abscissa", "ordinate", "orddenom")),
         (_name(found["ordinate_axis_units_lab"]), _name(found["orddenom_axis_units_lab"])),
+        _name(found["abscissa_axis_units_lab"]),
     )
 
 

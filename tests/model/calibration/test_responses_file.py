@@ -247,6 +247,24 @@ def test_read_measured_reads_uff_of_analysers(
     np.testing.assert_allclose(back.values[:, :, order], factor * responses.values, rtol=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("label", "factor"), [("NONE", 1.0), ("kHz", 1000.0), ("rad/s", 0.15915494309), ("RPM", None)]
+)
+def test_frequencies_of_uff_are_in_the_unit_of_their_label(
+    responses, coarse_rig, tmp_path, label, factor
+):
+    """One radian a second is 1/(2 pi) Hz; a unit that is not known is refused."""
+    path = tmp_path / "measured.uff"
+    write_responses_uff(path, responses, coarse_rig)
+    path.write_text(path.read_text("ascii").replace("Hz   ", label.ljust(5)), "ascii")
+    if factor is None:
+        with pytest.raises(InputError, match=r"uff:\d+: unit must be .*'RPM'"):
+            read_measured(path)
+        return
+    found = sorted({value.frequency for value in read_measured(path)})
+    np.testing.assert_allclose(found, factor * responses.frequencies, rtol=1e-9)
+
+
 def test_values_beyond_the_limits_are_left_out(responses, coarse_rig, tmp_path, caplog):
     """An analyser's line of 0 Hz, and all beyond its rig's highest frequency, are counted."""
     path = tmp_path / "measured.csv"

@@ -27,10 +27,10 @@ def expect_number(value: object, *, what: str, unit: str) -> None:
         raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
 
 
-def expect_between(value: float, least: float, most: float = MAX_VALUE, *, what: str) -> None:
-    """Raise InputError for a value below the least, above the most, or NaN."""
-    if not least <= value <= most:
-        raise InputError(f"{what} must be from {least:g} to {most:g}, got {value}")
+def expect_between(value: float, low: float, high: float = MAX_VALUE, *, what: str) -> None:
+    """Raise InputError for a value beyond these bounds, and for NaN."""
+    if not low <= value <= high:
+        raise InputError(f"{what} must be from {low:g} to {high:g}, got {value}")
 
 
 def expect_values(

@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperCommand
 
 from drivers.errors import CommandRefused, LinkError
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, print_report
 from model.errors import InputError
 from registry.suggestions import did_you_mean
 
@@ -272,9 +272,5 @@ def _print_state(era: "Client", *, as_json: bool) -> None:
     from controller.api.schema import headline
 
     status = era.status()
-    if as_json:
-        typer.echo(
-            json.dumps({"state": status.state, "cause": status.cause, "remedy": status.remedy})
-        )
-    else:
-        typer.echo(headline(status.state, status.cause))
+    answer = {"state": status.state, "cause": status.cause, "remedy": status.remedy}
+    print_report([headline(status.state, status.cause)], answer, as_json=as_json)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.options import next_line
+from model.commands.options import JsonOption, next_line, print_report
 from model.errors import InputError
 from model.files.replacing import check_ending
 
@@ -38,7 +38,7 @@ def init(
 @config_app.command()
 def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to check.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check a rig, daemon or layout file.
 
@@ -57,17 +57,11 @@ def check(
             {"line": problem.line, "key": problem.key, "message": problem.message}
             for problem in error.problems
         ]
-        typer.echo(
-            json.dumps({"ok": False, "errors": problems, "warnings": []}) if as_json else str(error)
-        )
+        answer = {"ok": False, "errors": problems, "warnings": []}
+        print_report([str(error)], answer, as_json=as_json)
         raise typer.Exit(1) from error
-    if as_json:
-        answer = {"ok": True, "errors": [], "warnings": warnings}
-        typer.echo(json.dumps(answer))
-        return
-    typer.echo(f"{file}: {good.line}")
-    for warning in warnings:
-        typer.echo(f"warning: {warning}")
+    rows = [f"{file}: {good.line}", *(f"warning: {warning}" for warning in warnings)]
+    print_report(rows, {"ok": True, "errors": [], "warnings": warnings}, as_json=as_json)
 
 
 def _write_new(path: Path, text: str) -> None:

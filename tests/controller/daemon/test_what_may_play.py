@@ -138,16 +138,3 @@ async def test_stop_says_what_is_known(state: str) -> None:
             assert "cable" not in (operation.remedy or "")
         daemon.obey()
         await daemon.waits(8)
-
-
-@in_virtual_time
-async def test_end_does_not_wait_for_a_mute_amplifier() -> None:
-    """Armed, on a network that may deliver for 1 s: it is stopped, and all ends within a second."""
-    async with watched(wire="modbus-tcp", breaks="plate") as daemon:
-        await daemon.does("ARM")
-        await daemon.take(MUTE)
-        await daemon.waits(0.1)
-        began = clock.now()
-        await daemon.supervisor.close("the end")
-        assert clock.now() - began < 0.9
-        daemon.recovers()

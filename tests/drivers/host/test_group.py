@@ -140,21 +140,6 @@ async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> 
         await host.open()
 
 
-@in_virtual_time
-async def test_opening_disarms_what_an_earlier_host_left_armed(wire: str) -> None:
-    """It plays on until then, with a watchdog of 2 s."""
-    end = MemoryLine(wire, "a")
-    (host,) = end.hosts.values()
-    await host.open()
-    await host.arm(9, 2.0)
-    await host.stage(7, [layer(0, tone())], now=True)
-    await asyncio.sleep(0.02)  # its ramp
-    assert end.levels("a") == [0.5, 0.0]
-    await host.open()
-    assert end.levels("a") == [0.0, 0.0]
-    assert end.far["a"].state == "SWITCH_ON_DISABLED"
-
-
 @grouped(("a",), wire="serial")
 async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]) -> None:
     """An amplifier that commits one of two layers says the token of the set all the same.

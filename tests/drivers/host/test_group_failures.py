@@ -140,24 +140,6 @@ async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
 
 
 @pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
-@grouped(("a", "b"))
-async def test_failed_arming_leaves_another_hosts_amplifier_alone(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """It answers at the address of one of ours, under another serial number."""
-    await group.disarm()
-    (end,) = ends
-    far = end.far["b"]
-    far.identity = {**far.identity, "serial_number": "OTHER"}
-    far.handle("Arm", {"session": 4242, "watchdog": 1000}, end.loop.time())
-    with pytest.raises(DriverError):
-        await group.arm()
-    await group.close()
-    assert far.state == "OPERATION_ENABLED"
-    assert end.far["a"].state != "OPERATION_ENABLED"
-
-
-@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
 @grouped(("a",))
 async def test_reading_that_gives_way_to_a_set_is_no_silence(
     group: Group, ends: list[MemoryLine]

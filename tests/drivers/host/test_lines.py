@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -37,19 +38,21 @@ class OnLines(Taken):
     since: float = 0.0
 
     @property
-    def far(self) -> dict[str, Any]:
+    def far(self) -> SimpleNamespace:
         """The amplifiers by name."""
-        return {name: far for line in self.lines for name, far in line.far.items()}
+        return SimpleNamespace(
+            **{name: far for line in self.lines for name, far in line.far.items()}
+        )
+
+    @property
+    def hosts(self) -> SimpleNamespace:
+        """What the host has of them, by name."""
+        return SimpleNamespace(**self.group.amplifiers)
 
     @property
     def levels(self) -> dict[str, list[float]]:
         """What channels play now."""
         return {name: line.levels(name) for line in self.lines for name in line.far}
-
-    @property
-    def states(self) -> dict[str, str]:
-        """Of the amplifiers."""
-        return {name: far.state for name, far in self.far.items()}
 
     @property
     def sent(self) -> list[list[str]]:
@@ -100,15 +103,7 @@ class OnLines(Taken):
 
     async def plays(self, level: float) -> None:
         """Play 100 Hz at a level on the first channel of all amplifiers, in layer 0."""
-        await self.applies(**{name: [(0, 0, level, 100.0)] for name in self.far})
-
-    async def stages(self, name: str) -> None:
-        """Stage a tone on an amplifier alone."""
-        await self.group.amplifiers[name].stage(1, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
-
-    async def pings(self, name: str) -> None:
-        """Send a heartbeat to one."""
-        await self.group.amplifiers[name].ping()
+        await self.applies(**{name: [(0, 0, level, 100.0)] for name in self.group.amplifiers})
 
     async def reads(self, name: str, times: int = 1) -> None:
         """Read the status of one, so often at once."""
@@ -171,14 +166,14 @@ class OnLines(Taken):
 
     def lies(self, **said: Any) -> None:
         """Let the first amplifier say something else in each status."""
-        far = next(iter(self.far.values()))
+        far = self.far.a
         status = far.status
         said |= {"state": STATES[said["state"]]} if "state" in said else {}
         far.status = lambda now: {**status(now), **said}
 
     def obeys_instead(self, **instead: str) -> None:
         """Let the first amplifier take requests of some names for others."""
-        far = next(iter(self.far.values()))
+        far = self.far.a
         handle = far.handle
 
         def obey(name: str, values: Values, now: float) -> Any:
@@ -188,15 +183,23 @@ class OnLines(Taken):
 
     def trips(self, name: str, fault: str) -> None:
         """Let an amplifier trip."""
-        self.far[name].trip(fault, self.lines[0].loop.time())
+        getattr(self.far, name).trip(fault, self.lines[0].loop.time())
 
     def heats(self, celsius: float) -> None:
         """Let the first amplifier be so warm."""
-        next(iter(self.far.values())).set_temperature(celsius, self.lines[0].loop.time())
+        self.far.a.set_temperature(celsius, self.lines[0].loop.time())
 
     def had_another_session(self) -> None:
         """Let the first have been armed by another: that of these tests is not taken twice."""
-        next(iter(self.far.values())).session = 1
+        self.far.a.session = 1
+
+    def asks(self, name: str, request: str, **values: int) -> None:
+        """Let another host ask something of an amplifier."""
+        getattr(self.far, name).handle(request, values, self.lines[0].loop.time())
+
+    def becomes(self, name: str, serial_number: str) -> None:
+        """Have another amplifier in its place."""
+        getattr(self.far, name).identity["serial_number"] = serial_number
 
     def sleeps(self, seconds: float) -> None:
         """Let this machine sleep."""
@@ -208,10 +211,11 @@ class OnLines(Taken):
 
 
 @asynccontextmanager
-async def on_lines(*names: str, wire: str) -> AsyncIterator[OnLines]:
-    """An armed group; names: of the amplifiers on each line, a letter each."""
+async def on_lines(*names: str, **options: Any) -> AsyncIterator[OnLines]:
+    """An armed group; names: of the amplifiers on each line, a letter each; wire, is_armed."""
+    wire = options.pop("wire")
     made = OnLines(lines=[MemoryLine(wire, *each) for each in names])
-    made.group = await group_of(*made.lines)
+    made.group = await group_of(*made.lines, **options)
     yield made
 
 

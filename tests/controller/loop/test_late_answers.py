@@ -56,20 +56,6 @@ async def test_an_answer_given_up_holds_up_nothing_and_is_never_played(
 
 
 @in_virtual_time
-async def test_fingers_that_rest_are_asked_for_again_once_a_late_answer_has_ended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A machine that stalled for 1.5 s: felt after it, for the fingers as they are by then."""
-    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
-        asked = answers_take(monkeypatch, 1.5, 0.02)
-        fingers.at[2] = RIGHT
-        await fingers.hold(1.7)
-        assert asked[1] - asked[0] == pytest.approx(1.5, abs=0.001)
-        assert said(fingers) == {1: None, 2: None}
-        assert fingers.applied[-1].time - asked[1] <= 0.035
-
-
-@in_virtual_time
 async def test_answers_that_hang_are_bounded_and_that_is_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

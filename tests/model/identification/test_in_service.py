@@ -1,0 +1,96 @@
+"""A plate in service: a thin plate, whose theory is not the model's, that changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden
+from model.identification.in_service import Known, LivePlate
+from settled_patterns import played, settled_patterns
+
+NE = 2  # number of that ERA
+
+
+def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> None:
+    """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
+    live = LivePlate(known)
+    quiet = played(live.take, hidden, hidden.mounted, count=10)
+    assert not any(report.alarm for report in quiet)
+    assert np.mean([report.nis / report.count for report in quiet]) < 1.5
+    factors = np.where(np.arange(4) == NE, 0.8, 1.0)
+    loose = replace(hidden.mounted, stiffness=factors * hidden.mounted.stiffness)
+    after = played(live.take, hidden, loose, count=8, start=10)
+    assert any(report.alarm for report in after)
+    (explanation,) = (each.explanation for each in after if each.explanation)
+    assert explanation.name == "stiffness NE"
+    assert explanation.change == pytest.approx(np.log(0.8), abs=0.03)
+    assert live.known.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
+    assert not live.known.change
+
+
+def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
+    known: Known,
+) -> None:
+    """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
+    live = LivePlate(replace(known, time=0.0))
+    space = live.known.model.space
+
+    def known(kind: str, hours: float) -> float:
+        after = np.sqrt(np.diag(live._drifted(3600.0 * hours).covariance))
+        return float(np.max((space.std * after)[space.groups[kind]]))
+
+    begun = known("thickness", 0.0)
+    assert begun < 0.01
+    assert known("thickness", 1.0) == pytest.approx(np.hypot(begun, 0.01), rel=1e-6)
+    assert known("thickness", 336.0) == pytest.approx(0.02, rel=1e-6)
+    assert known("stiffness", 336.0) == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.long
+def test_sticker_is_named_in_its_place(hidden: Hidden, known: Known) -> None:
+    """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
+    live = LivePlate(known)
+    played(live.take, hidden, hidden.mounted, count=10)
+    sticker = np.array([0.11, 0.16, 3e-3])
+    changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
+    after = played(live.take, hidden, changed, count=10, start=10)
+    (explanation,) = (each.explanation for each in after if each.explanation)
+    assert explanation.name == "a mass"
+    added = live.known.rig.masses[-1]
+    assert added.mass == pytest.approx(3e-3, abs=0.6e-3)
+    assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
+
+
+def test_heavy_finger_is_no_change(hidden: Hidden, known: Known) -> None:
+    """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
+    live = LivePlate(known)
+    heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
+    assert not any(live.take(each).alarm for each in heavy)
+
+
+def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: Known) -> None:
+    """After an identification with chi² above 2 patterns leave the state as it was."""
+    live = LivePlate(replace(known, is_explained=False))
+    before = live.known.state
+    played(live.take, hidden, hidden.mounted, count=2)
+    assert live.known.state is before
+
+
+@pytest.mark.long
+def test_change_that_nothing_explains_is_said(hidden: Hidden, known: Known) -> None:
+    """Two mounts and a gain at once are no known change: the state stays and says so."""
+    live = LivePlate(known)
+    mounted = hidden.mounted
+    odd = replace(
+        mounted,
+        stiffness=mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
+        gain=mounted.gain * [1.0, 0.5j, 1.0, 1.0],
+    )
+    before = live.known.state
+    reports = played(live.take, hidden, odd, count=6)
+    assert reports[1].alarm
+    assert reports[-1].explanation is not None
+    assert reports[-1].explanation.name == ""
+    assert live.known.change
+    assert live.known.state is before

@@ -91,9 +91,11 @@ fault-test: .venv/installed-test
 	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
 
 # Ten thousand stops while frames are lost, late and doubled, two thousand with an exception on
-# their way, and two thousand by command after a killed host; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
+# their way, and as many by command after a killed host; `make test` takes some hundreds. Others: make stop-test STOPS=100000 FIRST=7
+STOPS := 10000
+FIRST := 0
 stop-test: .venv/installed-test
-	$(BIN)/python tests/support/group_stops.py $(STOPS)
+	STOPS=$(STOPS) FIRST=$(FIRST) $(BIN)/pytest -q tests/drivers/host/test_group_stops.py
 
 # Ten thousand taps while every frame is late by up to 16 ms, with one and three amplifiers on a line;
 # `make test` takes some. Others: make late-test LATE='--taps 100000'

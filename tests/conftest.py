@@ -45,7 +45,6 @@ SLOWEST = (
     "test_daemon_over_a_wire.py",
     "test_soak.py",
     "test_soft_amp_sound.py",
-    "test_nothing_is_lost.py",
     "test_group_stops.py",
     "test_convergence.py",
     "test_table_commands.py",

@@ -25,6 +25,7 @@ from controller.api.topics import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
+    SilenceEvent,
     StateEvent,
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event

@@ -1,12 +1,16 @@
 """Work in threads, finished or cancelled."""
 
 import asyncio
+import gc
 import subprocess
 import sys
 import threading
+from itertools import islice
 
 import pytest
 
+from drivers.garbage_collection import no_long_collections, without_collections
+from drivers.pauses import Backoff, pauses
 from drivers.threads import in_thread
 
 
@@ -78,3 +82,37 @@ async def main():
 asyncio.run(main())
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_pauses_grow_up_to_a_limit() -> None:
+    """Each twice the one before: 0.1, 0.2, ... 5 s."""
+    assert list(islice(pauses(), 8)) == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0])
+
+
+def test_backoff_resets_after_a_good_minute() -> None:
+    """1, 2, 4, 5, 5 s, and 1 s again after what ran for a minute."""
+    backoff = Backoff(first=1.0, maximum=5.0)
+    assert [backoff.pause(ran_for=59.9) for _ in range(5)] == [1, 2, 4, 5, 5]
+    assert [backoff.pause(ran_for=each) for each in (60.0, 0.0)] == [1, 2]
+
+
+def test_present_objects_are_frozen_during_the_context() -> None:
+    """All objects present at its start, and none afterwards."""
+    with no_long_collections():
+        assert gc.get_freeze_count() > 1000
+    assert gc.get_freeze_count() == 0
+
+
+def test_objects_built_without_collections_are_never_visited() -> None:
+    """Many are frozen; of few nothing is, or the garbage of repeated failures would pile up."""
+    try:
+        for count, is_frozen in ((1_000, False), (100_000, True)):
+            gc.collect()
+            gc.unfreeze()
+            with without_collections():
+                assert not gc.isenabled()
+                built = [[number] for number in range(count)]
+            assert gc.isenabled()
+            assert (gc.get_freeze_count() >= len(built)) is is_frozen
+    finally:
+        gc.unfreeze()

@@ -1,10 +1,14 @@
-"""A rig's amplifiers from a script."""
+"""A rig's amplifiers, drives and places from a script."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import era_haptics as era
+from era_haptics.arguments import as_points
+from era_haptics.drive import excitation_of
 from model.rig.rig import Channel
 from paper_plate import make_paper_rig
 
@@ -49,3 +53,75 @@ def test_open_amplifier_needs_a_name_when_there_are_several() -> None:
     for name in (None, "c"):
         with pytest.raises(era.InputError, match="a, b"):
             era.open_amplifier(rig, name)
+
+
+def test_excitation_of_accepts_frequency_drive_and_tone() -> None:
+    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept."""
+    tone = era.Tone(250.0, 3e-5, 0.1)
+    drives = {"SW": 110, "SE": era.Drive(110, level=0.25, phase_deg=-90), "NE": tone}
+    assert excitation_of(drives, RIG) == {
+        "SW": era.Tone(110, 1e-4, 0.0),
+        "SE": era.Tone(110, 0.25e-4, -math.pi / 2),
+        "NE": tone,
+    }
+
+
+def test_excitation_of_converts_numbers_of_numpy() -> None:
+    """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
+    drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
+    tone = excitation_of({"SW": drive}, RIG)["SW"]
+    assert tone == era.Tone(110.5, 0.25e-4, 0.0)
+    assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
+
+
+@pytest.mark.parametrize(
+    ("drives", "message"),
+    [
+        ({"XX": 110}, "XX'; known are SW, SE, NE, NW"),
+        ({"XX": era.Tone(110, 1e-4)}, "XX'; known are SW, SE, NE, NW"),
+        ({"SW": 0}, "frequency.* got 0 Hz"),
+        ({"SW": math.inf}, "frequency.* got inf Hz"),
+        ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
+    ],
+)
+def test_excitation_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:
+    """Unknown ERAs and frequencies that are not positive numbers."""
+    with pytest.raises(era.InputError, match=message):
+        excitation_of(drives, RIG)
+
+
+@pytest.mark.parametrize(
+    ("level", "phase", "message"),
+    [
+        (1.1, 0, "level.* got 1.1"),
+        (math.nan, 0, "level.* got nan"),
+        (1, math.inf, "phase.* got inf"),
+    ],
+)
+def test_drive_refuses_an_invalid_level_or_phase(level: float, phase: float, message: str) -> None:
+    """Beyond full stroke, and not finite."""
+    with pytest.raises(era.InputError, match=message):
+        era.Drive(110, level=level, phase_deg=phase)
+
+
+@pytest.mark.parametrize(
+    "places",
+    [(0.1, 0.2), [0.1, 0.2], [(0.1, 0.2)], np.array([0.1, 0.2]), np.array([[0.1, 0.2]])],
+)
+def test_as_points_reads_one_place(places: object) -> None:
+    """One alone or in a list, as an array or not."""
+    assert as_points(places, what="target") == ((0.1, 0.2),)
+
+
+def test_as_points_reads_several_places_or_none() -> None:
+    """A list of places keeps their order, and any empty one, an array too, is no place."""
+    assert as_points([(0.1, 0.2), (0.3, 0.1)], what="quiet") == ((0.1, 0.2), (0.3, 0.1))
+    for nothing in ((), [], np.empty((0, 2))):
+        assert as_points(nothing, what="quiet") == ()
+
+
+@pytest.mark.parametrize("places", [(0.1,), (0.1, 0.2, 0.3), "SW", [(0.1, 0.2), (0.3,)], 0.1, None])
+def test_as_points_refuses_other_values(places: object) -> None:
+    """The error names the argument."""
+    with pytest.raises(era.InputError, match="target"):
+        as_points(places, what="target")

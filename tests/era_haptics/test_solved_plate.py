@@ -1,12 +1,14 @@
-"""A plate solved once, against direct solves and another program."""
+"""A plate solved once, calibrated and designed from Python, against direct solves."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import era_haptics as era
+from model.design import problem
 from model.structure.attachments import PointLoad
 from model.vibration.maps import plate_map
 from paper_plate import make_paper_rig
@@ -99,3 +101,60 @@ def test_solved_plate_with_a_seed_is_another_one(plate: era.SolvedPlate) -> None
     for wrong in (-1, 0.5, "1"):
         with pytest.raises(era.InputError, match="seed"):
             era.SolvedPlate(plate.rig, seed=wrong)  # type: ignore[arg-type]
+
+
+MEASURED = Path(__file__).parents[2] / "examples" / "measured.csv"
+
+
+def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
+    """Of two frequencies; a drive of another phase turns its own field by that phase."""
+    plate = era.SolvedPlate(era.load_rig(era.example_rig_path()))
+    drive = {"SW": era.Drive(110, level=0.5), "NE": era.Drive(150, level=0.2)}
+    found = plate.map(drive, raster=(7, 5))
+    assert found.frequencies.tolist() == [110, 150]
+    assert found.field.shape == (2, 5, 7)
+    np.testing.assert_allclose(np.abs(found.field).sum(axis=0), found.peak)
+    turned = plate.map({"SW": era.Drive(110, level=0.5, phase_deg=90)}, raster=(7, 5))
+    np.testing.assert_allclose(turned.field[0], 1j * found.field[0], rtol=1e-9)
+
+
+@pytest.mark.long
+def test_calibrate_finds_the_values_of_the_example() -> None:
+    """Loss factor 0.013 and SW at 19.04 kN/m, as examples/make_measured.py has them."""
+    found = era.calibrate(era.load_rig(era.example_rig_path()), MEASURED)
+    assert found.is_good
+    assert found.rig.plate.loss_factor == pytest.approx(0.013, rel=0.01)
+    assert found.rig.era("SW").stiffness == pytest.approx(19040, rel=0.02)
+    assert found.rig.uncertainty.thickness < 0.005
+
+
+def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judged ones first, in the order of their contrast, then by score, unsupported ones last."""
+    monkeypatch.setattr(problem, "JUDGED_SETS", 3)
+    monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
+    found = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2)
+    assert len(found) == 8
+    contrasts = [each.contrast for each in found]
+    assert contrasts[2:] == [None] * 6
+    assert contrasts[0] >= contrasts[1]
+    scores = [each.expected_contrast for each in found[2:] if each.expected_contrast is not None]
+    assert scores == sorted(scores, reverse=True)
+    assert all(len(each.eras) == 4 for each in found)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"eras": 2},
+        {"eras": 4.5},
+        {"layouts": "random:0"},
+        {"layouts": "nosuch.yaml"},
+        {"layouts": "random:3", "finalists": 0},
+        {"lowest": 0.5},
+        {"apart": "wide"},
+    ],
+)
+def test_design_refuses(wrong: dict[str, object]) -> None:
+    """Too few ERAs, no whole number, no layouts, no file, no finalists, too low a mode, a word."""
+    with pytest.raises(era.InputError):
+        era.design(make_paper_rig(12, 9), **wrong)  # type: ignore[arg-type]

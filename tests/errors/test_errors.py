@@ -1,12 +1,26 @@
-"""Errors as a user meets them: exit status, place, remedy, nothing written, no traceback."""
+"""Errors as a user meets them, and commands that are interrupted or find no room."""
 
+import contextlib
+import io
 import re
+import resource
+import shlex
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from error_cases import Case, Outcome, Quotation, cases, filled, provoke, quotations
+from controller.cli.main import run
+from error_cases import RIG, Case, Outcome, Quotation, cases, filled, provoke, quotations
+from full_disk import full_disk
+from interrupted import interrupted
+from long_form import shortly
+from model.calibration import calibrate
 
 INTERNALS = re.compile(
     r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"
@@ -68,3 +82,168 @@ def test_page_quotes_message_and_remedy(
 def test_page_quotes_every_case_that_is_shown() -> None:
     """Each shown case has a box of its own."""
     assert sorted(tuple(quoted.typed) for quoted in quotations()) == sorted(SHOWN)
+
+
+WRITING = {
+    "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
+        "model.table.build.solve_table"
+    ),
+    "table export table.npz --format csv -o out.csv": "model.table.export.export_csv",
+    "table export table.npz --format mat -o out.mat": "model.table.export.export_mat",
+    "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.maps.plate_map",
+    "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
+    "figure 10 rig.yaml -o figures": "model.figures.paper.paper_figures",
+    "design rig.yaml -o design --layouts random:2": "model.design.run.rank_layouts",
+    "report rig.yaml -o out.zip": "controller.report.collect.collect",
+}
+"""Commands that write a file, or several into a folder, each with its slow function."""
+
+QUICK = [
+    *(command for command in WRITING if command.startswith(("table", "report"))),
+    "config init out.yaml",
+]
+"""Those that `make test` lets write to a full disk: all replace files in the same way."""
+
+LONG = {
+    "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
+    "table show table.npz": "model.table.overview.find_overview",
+    "table verify table.npz rig.yaml": "model.table.verify.verify_table",
+    "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
+    "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
+    "demo --wire sim": "model.table.table_cache.cached_table",
+}
+"""Other slow commands, with their slow function."""
+
+
+def furnish(folder: Path, shelf: Path) -> None:
+    """Write a rig, a table, and every fourth frequency of a measurement."""
+    rig = RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
+    (folder / "rig.yaml").write_text(rig, encoding="utf-8")
+    (folder / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
+    head, *rows = (shelf / "measured.csv").read_text("utf-8").splitlines(keepends=True)
+    frequencies = list(dict.fromkeys(row.split(",")[6] for row in rows))[::4]
+    measured = head + "".join(row for row in rows if row.split(",")[6] in frequencies)
+    (folder / "measured.csv").write_text(measured, encoding="utf-8")
+
+
+@pytest.fixture
+def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a rig, a table and a measurement."""
+    furnish(tmp_path, shelf)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / ".cache"))
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Files of a folder, without the cache."""
+    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {
+        name: path.read_bytes() for name, path in found.items() if not name.startswith(".cache/")
+    }
+
+
+def outcome_of(command: str) -> tuple[int, str]:
+    """Exit status of a command, and its standard error."""
+    err = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
+        status = run(shlex.split(command))
+    return status, err.getvalue()
+
+
+@pytest.mark.parametrize(
+    "commands",
+    [
+        {command: WRITING[command] for command in QUICK if command in WRITING},
+        pytest.param(WRITING | LONG, marks=pytest.mark.long),
+    ],
+    ids=["some", "all"],
+)
+def test_interrupted_commands_keep_previous_output(home: Path, commands: dict[str, str]) -> None:
+    """The exit status is 130, without a traceback, and the files are unchanged."""
+    for command in commands:
+        target = home / [*command.split("-o "), "-"][1].split()[0]
+        if target.suffix:
+            target.write_bytes(b"")
+    before = files(home)
+    for status, said in interrupted(commands, home).values():
+        assert status == 130, said
+        assert "Traceback" not in said
+        assert "error" not in said
+    assert files(home) == before
+
+
+@pytest.mark.parametrize("command", shortly([*WRITING, "config init out.yaml"], QUICK))
+def test_command_keeps_previous_output_when_the_disk_is_full(
+    command: str, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It prints one line of error, and the files are unchanged."""
+    fit, fitted = calibrate.calibrate, []
+
+    def fit_once(*arguments: Any, **keywords: Any) -> Any:
+        if not fitted:
+            fitted.append(fit(*arguments, **keywords))
+        return fitted[0]
+
+    monkeypatch.setattr(calibrate, "calibrate", fit_once)
+    if not command.startswith(("report", "config")):  # these replace nothing
+        status, said = outcome_of(command)
+        assert status == 0, said
+    before = files(home)
+    with full_disk():
+        status, said = outcome_of(command)
+    assert status == 2
+    (line,) = (one for one in said.splitlines() if not re.match(r"\d+ of \d+ ", one))  # progress
+    assert line.startswith("era: error: "), said
+    assert files(home) == before
+
+
+def recorded(pid: int) -> int:
+    """Size [bytes] of the unnamed file that a process writes; 0 before there is one."""
+    for path in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if "(deleted)" in str(path.readlink()):
+                return path.stat().st_size
+    return 0
+
+
+def fill_disk(pid: int) -> None:
+    """Limit the file that a process writes to a little more than it has, until that is reached.
+
+    A file that was longer than the limit at once would say nothing about a write that fails.
+    """
+    end, limit = time.monotonic() + 120, -1
+    while (size := recorded(pid)) != limit:
+        if size > limit:
+            limit = size + 8199  # more than comes while this is done
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        assert time.monotonic() < end, "no recording"
+        time.sleep(0.01)
+
+
+def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> None:
+    """`era sim` reports the error at its end, and leaves no partial recording."""
+    (home / "rig.yaml").write_text(RIG, encoding="utf-8")
+    era = Path(sys.executable).with_name("era")
+    with subprocess.Popen(
+        # -B: bytecode would be cut off, too, and Python does not notice
+        [
+            *(sys.executable, "-B", era, "sim", "rig.yaml", "--serial"),
+            *("--finger", "0.1,0.1", "--record", "run.wav"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert "serial://" in process.stdout.readline()
+        try:
+            fill_disk(process.pid)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 2
+    assert said.startswith("era: error: run.wav"), said
+    assert len(said.splitlines()) == 1
+    assert not list(home.glob("*run*"))

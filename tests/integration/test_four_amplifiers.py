@@ -6,17 +6,22 @@ which every ERA plays, stands for the search.
 
 import asyncio
 import math
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import model
 from chain import Chain
 from controller.diagnosis.tone_player import TonePlayer
-from drivers.errors import LinkError
+from daemon_bench import READY, daemon_at, far_end, until_state
+from drivers import clock
+from drivers.by_hand import actions
+from drivers.conformance.opening import opened
+from drivers.errors import LinkError, LinkTimeout
 from drivers.host.members import GroupState
 from drivers.opening import Lines
 from long_form import in_turn, shortly
@@ -24,8 +29,9 @@ from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
-from rig_on_wire import WIRES
-from set_table import SetTable
+from registry.limits import GuardLimits
+from rig_on_wire import WIRES, far_side
+from set_table import SetTable, make_rig
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
@@ -153,3 +159,57 @@ async def test_motion_and_output_are_not_taken_for_each_other(
             with pytest.raises(LinkError, match="full level must be"):
                 await each.open()
             await each.close()
+
+
+RIG = make_rig("a", GuardLimits(20.0, 1000.0, 1.0))
+SERIAL = ["serial", "modbus+rtu", "can+slcan"]
+
+
+@pytest.mark.parametrize(("boots", "openings"), [(0.8, 1), (5.0, 1), (9.0, 2)])
+@in_virtual_time
+async def test_daemon_reaches_it_at_the_first_opening(
+    boots: float, openings: int, tmp_path: Path
+) -> None:
+    """Within 6 s (docs/reference/urls.md), else while the port stays open; also after a loss."""
+    async with far_end(tmp_path) as far:
+        assert far.machine is not None
+        far.machine.boots = boots
+        async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
+            await until_state(era, READY)
+            assert [*far.machine.attempts.values()] == [openings]
+            far.device.inject_fault(FaultWindow("unplug"))
+            await until_state(era, "COMM_LOST")
+            far.device.recover()
+            await until_state(era, READY)
+
+
+async def _conformance(url: str) -> Any:
+    async with opened(url) as client:
+        return await client.hello()
+
+
+@pytest.mark.parametrize("action", [actions.identify, actions.status, actions.stop, _conformance])
+@pytest.mark.parametrize("wire", SERIAL)
+@in_virtual_time
+async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[Any]]) -> None:
+    """Each opens the port for itself; a stop is confirmed as soon as the board has started."""
+    async with far_side(WIRES[wire], RIG) as far:
+        assert far.machine is not None
+        far.machine.boots = 5.0
+        began = clock.now()
+        found = await action(far.url)
+        assert clock.now() - began < 7.0
+        assert found.get("silence", "confirmed_silent") == "confirmed_silent"
+
+
+@pytest.mark.parametrize(("wire", "told_after"), [("serial", 6.0), ("modbus+tcp", 1.5)])
+@in_virtual_time
+async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float) -> None:
+    """That of a board that restarts, or three attempts of 0.5 s; the error names the remedy."""
+    async with far_side(WIRES[wire], RIG) as far:
+        far.device.inject_fault(FaultWindow("hang"))
+        began = clock.now()
+        with pytest.raises(LinkTimeout) as told:
+            await actions.identify(far.url)
+        assert clock.now() - began == pytest.approx(told_after, abs=0.6)
+        assert ("restarts" in str(told.value)) is (wire == "serial")

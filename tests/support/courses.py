@@ -1,4 +1,4 @@
-"""Courses of a chain in virtual time: lists of steps in a YAML file, by the sentence they prove.
+"""Courses in virtual time: lists of steps in a YAML file, by the sentence that they prove.
 
 A step is a method of what is played or, with dots, of its parts; or `is`: values of properties.
 """
@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from chain import Chain
-from drivers import clock
+from drivers import clock, errors
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
@@ -42,13 +42,83 @@ class Planted(Exception):
 
 
 @dataclass
-class Acted(Chain):
-    """A chain that takes the steps of courses.
-
-    under_way: steps that have begun; whole: methods that fail, as they are.
-    """
+class Taken:
+    """What takes the steps of courses; under_way: those that have begun; error: the last of one."""
 
     under_way: dict[str, "asyncio.Task[None]"] = field(default_factory=dict)
+    error: Exception | None = None
+
+    async def waits(self, seconds: float) -> None:
+        """Let time pass."""
+        await asyncio.sleep(seconds)
+
+    async def begins(self, step: Step) -> None:
+        """Begin a step, and let the loop turn."""
+        self.under_way[str(step)] = asyncio.create_task(self.take(step))
+        await asyncio.sleep(0)
+
+    async def ends(self, step: Step) -> None:
+        """Wait until a step was taken."""
+        await self.under_way.pop(str(step))
+
+    async def ends_anyhow(self, step: Step) -> None:
+        """Wait until a step was taken, or refused."""
+        await asyncio.gather(self.under_way.pop(str(step)), return_exceptions=True)
+
+    def cancels(self, step: Step) -> None:
+        """Cancel a step that has begun."""
+        self.under_way[str(step)].cancel()
+
+    def says(self, what: str, text: str) -> None:
+        """Require a part of a text."""
+        assert text in attrgetter(what)(self)
+
+    def counts(self, **numbers: int) -> None:
+        """Require the numbers of what was reported."""
+        found = {what: len(attrgetter(what)(self)) for what in numbers}
+        assert found == numbers
+
+    async def refuses(self, step: Step) -> None:
+        """Require that a step is refused."""
+        await self.refuses_saying(".", step)
+
+    async def refuses_saying(self, text: str, step: Step) -> None:
+        """Require that a step is refused, with this text."""
+        with pytest.raises((CommandError, CommandRefused), match=text):
+            await self.take(step)
+
+    async def take(self, step: Step) -> None:
+        """Take a step."""
+        ((name, given),) = step.items() if isinstance(step, Mapping) else [(step, [])]
+        if name == "is":
+            found = {what: attrgetter(what)(self) for what in given}
+            assert found == {**given}, found
+            return
+        method = attrgetter(name.replace(" ", "_"))(self)
+        if name in _OF_A_STEP or not isinstance(given, list | Mapping):
+            done = method(given)
+        else:
+            done = method(**given) if isinstance(given, Mapping) else method(*given)
+        if inspect.isawaitable(done):
+            await done
+
+    async def raises(self, error: str, step: Step, text: str = ".") -> None:
+        """Require that a step raises an error of the drivers, by its name, with this text."""
+        with pytest.raises(getattr(errors, error), match=text) as caught:
+            await self.take(step)
+        self.error = caught.value
+
+    async def takes(self, least: float, most: float, step: Step) -> None:
+        """Require that a step takes so many seconds."""
+        began = clock.now()
+        await self.take(step)
+        assert least <= clock.now() - began <= most
+
+
+@dataclass
+class Acted(Taken, Chain):
+    """A chain that takes the steps of courses; whole: methods that fail, as they are."""
+
     whole: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -105,10 +175,6 @@ class Acted(Chain):
         """Of each set that vibrates, that of the first channel [0.05 Hz]."""
         return [commands[0].frequency for commands in self.played()]
 
-    async def waits(self, seconds: float) -> None:
-        """Let time pass."""
-        await asyncio.sleep(seconds)
-
     def touch(self, *fingers: str, ago: float = 0.0) -> None:
         """Put fingers down in place of all that are, once."""
         self.put(*(FINGERS[each] for each in fingers), ago=ago)
@@ -139,23 +205,6 @@ class Acted(Chain):
         """Let methods that fail work again."""
         for method in methods:
             setattr(self.controller, method, self.whole.pop(method))
-
-    async def begins(self, step: Step) -> None:
-        """Begin a step, and let the loop turn."""
-        self.under_way[str(step)] = asyncio.create_task(self.take(step))
-        await asyncio.sleep(0)
-
-    async def ends(self, step: Step) -> None:
-        """Wait until a step was taken."""
-        await self.under_way.pop(str(step))
-
-    async def ends_anyhow(self, step: Step) -> None:
-        """Wait until a step was taken, or refused."""
-        await asyncio.gather(self.under_way.pop(str(step)), return_exceptions=True)
-
-    def cancels(self, step: Step) -> None:
-        """Cancel a step that has begun."""
-        self.under_way[str(step)].cancel()
 
     async def is_late_for(self, kind: str, seconds: float) -> None:
         """Wait for a request of a kind; its reply, and those after it, leave so much later."""
@@ -258,39 +307,6 @@ class Acted(Chain):
         found = [kinds.index(name) for name in names]
         assert found == sorted(found), kinds
 
-    def says(self, what: str, text: str) -> None:
-        """Require a part of a text."""
-        assert text in attrgetter(what)(self)
-
-    def counts(self, **numbers: int) -> None:
-        """Require the numbers of what was reported."""
-        found = {what: len(attrgetter(what)(self)) for what in numbers}
-        assert found == numbers
-
-    async def refuses(self, step: Step) -> None:
-        """Require that a step is refused."""
-        await self.refuses_saying(".", step)
-
-    async def refuses_saying(self, text: str, step: Step) -> None:
-        """Require that a step is refused, with this text."""
-        with pytest.raises((CommandError, CommandRefused), match=text):
-            await self.take(step)
-
-    async def take(self, step: Step) -> None:
-        """Take a step."""
-        ((name, given),) = step.items() if isinstance(step, Mapping) else [(step, [])]
-        if name == "is":
-            found = {what: attrgetter(what)(self) for what in given}
-            assert found == {**given}, (found, self.far_end.names()[-5:])
-            return
-        method = attrgetter(name.replace(" ", "_"))(self)
-        if name in _OF_A_STEP or not isinstance(given, list | Mapping):
-            done = method(given)
-        else:
-            done = method(**given) if isinstance(given, Mapping) else method(*given)
-        if inspect.isawaitable(done):
-            await done
-
 
 _OF_A_STEP = ("refuses", "begins", "ends", "ends anyhow", "cancels")
 
@@ -307,7 +323,7 @@ def courses(path: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def follow(
-    course: Mapping[str, Any], made: Callable[..., AbstractAsyncContextManager[Acted]]
+    course: Mapping[str, Any], made: Callable[..., AbstractAsyncContextManager[Taken]]
 ) -> None:
     """Take all steps of a course, in virtual time, on what is made with its options."""
     given = {**course}

@@ -1,6 +1,4 @@
-"""Stops of groups by the thousand: is an amplifier silent whenever a stop says so?
-
-    python tests/support/group_stops.py [--stops N] [--exceptions N] [--killed N] [--first SEED]
+"""Stops of groups: is an amplifier silent whenever a stop says so? `make stop-test` has thousands.
 
 Over every wire of protocol 3, in virtual time. First frames are lost, late and doubled at random
 while all is stopped, at any moment of what a host does. Then one exception is raised on the way of
@@ -9,9 +7,7 @@ amplifiers stopped by `era amp stop`. Whatever happens, a stop ends in time, and
 each amplifier agrees with what its channels play.
 """
 
-import argparse
 import asyncio
-import logging
 import random
 import sys
 import types
@@ -75,15 +71,6 @@ class Tally:
     def total(self, what: str) -> int:
         """The sum over all wires."""
         return sum(count for (_, name), count in self.counts.items() if name == what)
-
-    def table(self) -> str:
-        """A row for each wire."""
-        columns = ("stops", "confirmed", "may play", "raised")
-        rows = [f"{'':<20}" + "".join(f"{name:>12}" for name in columns)]
-        for wire in dict.fromkeys(wire for wire, _ in self.counts):
-            cells = "".join(f"{self.counts[wire, name]:>12}" for name in columns)
-            rows.append(f"{wire:<20}{cells}")
-        return "\n".join(rows)
 
 
 @dataclass
@@ -357,31 +344,3 @@ def play(programme: str, seed: int, tally: Tally) -> None:
     except Stuck as problem:
         found = [str(problem)]
     tally.found += [f"seed {seed} on {wire}: {one}" for one in found]
-
-
-def main() -> int:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--stops", type=int, default=10_000, help="with faults of frames")
-    parser.add_argument("--exceptions", type=int, default=2_000, help="with an exception each")
-    parser.add_argument("--killed", type=int, default=2_000, help="by command, of a killed host")
-    parser.add_argument("--first", type=int, default=0, help="the first seed of each")
-    options = parser.parse_args()
-    logging.disable(logging.CRITICAL)
-    failed = 0
-    limits = (options.stops, options.exceptions, options.killed)
-    for name, limit in zip(PROGRAMMES, limits, strict=True):
-        tally = Tally()
-        seed = options.first
-        while tally.total("stops") < limit:
-            play(name, seed, tally)
-            seed += 1
-        lines = (name, tally.table(), *tally.found, f"untrue or endless: {len(tally.found)}")
-        sys.stdout.write("\n".join(lines) + "\n\n")
-        sys.stdout.flush()
-        failed += len(tally.found)
-    return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -21,7 +21,6 @@ from daemon_bench import (
     holding,
     next_event,
     ready_daemon,
-    running_daemon,
     until,
     until_state,
 )
@@ -172,15 +171,6 @@ def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:
     *_, option, file = gateway_options("127.0.0.1:0", tmp_path / "era.sock")
     assert option == "--token-file"
     assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read
-
-
-@in_virtual_time
-async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Path) -> None:
-    """It searches for the other one; the cause names both serial numbers."""
-    more = "serial_numbers: {main: A1}\n"
-    async with running_daemon(tmp_path, more) as bench, await bench.client() as era:
-        await until_state(era, "COMM_LOST")
-        assert re.search(r"A1.*SIM-main", (await era.status()).cause)
 
 
 @in_virtual_time

@@ -236,28 +236,3 @@ async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixtur
         daemon.obey()
         await asyncio.sleep(11)
         assert not reports()
-
-
-@in_virtual_time
-async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Silent before the watchdog expires, latched, and once cleared it plays again."""
-    async with watched() as daemon:
-        await daemon.handle(ARM)
-
-        def fail(*_: object, **__: object) -> None:
-            raise ZeroDivisionError("a bug")
-
-        with monkeypatch.context() as planted:
-            planted.setattr("controller.loop.loop.applied_by", fail)
-            daemon.touch("finger")
-            await asyncio.sleep(0.1)
-        assert daemon.state is DaemonState.FAULT
-        assert "a bug" in daemon.supervisor.operation.cause
-        assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
-        await daemon.handle(CLEAR)
-        await daemon.handle(ARM)
-        daemon.touch("elsewhere")
-        await asyncio.sleep(0.1)
-        assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
+from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
@@ -25,23 +25,6 @@ def altered(
     """Have a far end reply by a function of the request, its time, and what it does itself."""
     handle = far.handle
     far.handle = lambda name, values, now: change(name, values, now, handle)  # type: ignore[method-assign]
-
-
-@grouped(("a",), ("b",), wire="serial")
-async def test_nothing_is_sent_to_play_behind_a_status_that_shows_a_fault(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """A set that waits behind the reading does not go out, and the others are stopped."""
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-    reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
-    await asyncio.sleep(0)
-    ends[1].sent.clear()
-    with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
-        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-    await reading
-    assert [each for _, each in ends[1].sent if each in ("1:5", "1:6")] == []
-    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
 
 
 @grouped(("a",), ("b",), wire="serial")
@@ -135,39 +118,6 @@ async def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be(
     assert ends[0].far["a"].state != "OPERATION_ENABLED"
 
 
-@grouped(("a",), ("b",), wire="serial")
-async def test_arming_anew_stops_what_cannot_be_disarmed(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """One has tripped, so the other is to be disarmed first; it ignores that and is stopped."""
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-
-    def ignore(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-        return handle("GetStatus" if name == "Disarm" else name, values, now)
-
-    altered(ends[0].far["a"], ignore)
-    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-    with pytest.raises(DriverError):
-        await group.arm()
-    assert ends[0].levels("a") == [0.0, 0.0]
-
-
-@grouped(("a",), ("b",), wire="serial")
-async def test_set_in_the_moment_of_a_loss_says_that_it_is_lost(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Before any heartbeat has found it: a loop that goes on would wait for ever."""
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    ends[1].outward = lambda name, data: []
-    with pytest.raises(LinkDegraded):
-        await group.beat()
-    await asyncio.sleep(group.lost_from - ends[0].loop.time())
-    with pytest.raises(LinkError) as lost:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-    assert not isinstance(lost.value, LinkDegraded)
-    assert (ends[0].levels("a"), group.is_open) == ([0.0, 0.0], False)
-
-
 @grouped(("a",), wire="serial")
 async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
     group: Group, ends: list[MemoryLine]
@@ -190,40 +140,6 @@ async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
 
 
 @pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
-@grouped(("a", "b"))
-async def test_failed_arming_leaves_another_hosts_amplifier_alone(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """It answers at the address of one of ours, under another serial number."""
-    await group.disarm()
-    (end,) = ends
-    far = end.far["b"]
-    far.identity = {**far.identity, "serial_number": "OTHER"}
-    far.handle("Arm", {"session": 4242, "watchdog": 1000}, end.loop.time())
-    with pytest.raises(DriverError):
-        await group.arm()
-    await group.close()
-    assert far.state == "OPERATION_ENABLED"
-    assert end.far["a"].state != "OPERATION_ENABLED"
-
-
-@grouped(("a",), wire="serial")
-async def test_nothing_is_armed_by_a_machine_that_slept(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """It wakes half a minute after it began to arm: whoever asked for it may have gone."""
-    await group.disarm()
-    (end,) = ends
-    end.far["a"].session = 1
-    arming = asyncio.ensure_future(group.arm())
-    await asyncio.sleep(0.001)
-    end.loop.now += 30.0
-    with pytest.raises(DriverError):
-        await arming
-    assert end.far["a"].state != "OPERATION_ENABLED"
-
-
-@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
 @grouped(("a",))
 async def test_reading_that_gives_way_to_a_set_is_no_silence(
     group: Group, ends: list[MemoryLine]
@@ -237,21 +153,6 @@ async def test_reading_that_gives_way_to_a_set_is_no_silence(
     await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
     assert not group.degraded
     await reading
-
-
-@grouped(("a", "b", "c"), wire="serial")
-async def test_silence_is_repeated_however_long_the_others_of_a_line_keep_it(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """No reply for 130 ms, and 30 ms for each of three: behind 0.1 s it is sent, not refused."""
-    (end,) = ends
-    await group.apply({name: [layer(0, tone())] for name in "abc"})
-    since = end.loop.time()
-    end.outward = lambda _, data: [] if end.loop.time() < since + 0.13 else [(0.0, data)]
-    await group.apply({name: [layer(0)] for name in "abc"})
-    assert group.is_armed
-    await asyncio.sleep(0.05)
-    assert [end.levels(name) for name in "abc"] == [[0.0, 0.0]] * 3
 
 
 @grouped(("a",), wire="serial")

@@ -125,9 +125,8 @@ def damage(path: Path, before: str, after: str) -> None:
     path.write_bytes(text.replace(before, after, 1).encode("latin-1"))
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "named"),
-    [
+DAMAGED = {
+    "csv": [
         ("x_m,y_m,freq", "x_mm,y_mm,freq", r":1: .*x_m, y_m missing.*'x_mm'"),
         ("real_1_s2", "real_g_m", r":1: .*real_1_s2 missing; 'real_g_m' unknown"),
         ("era_x_m", "sensor", r":1: "),
@@ -141,19 +140,7 @@ def damage(path: Path, before: str, after: str) -> None:
         ("\nSW,", '\n"SW,', r":\d+: "),
         ("\nSW,", "\n\0SW,", "zero bytes"),
     ],
-)
-def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, before, after, named):
-    """Wrong units, unknown columns, bad values: file and line."""
-    path = tmp_path / "measured.csv"
-    write_responses_csv(path, responses, coarse_rig)
-    damage(path, before, after)
-    with pytest.raises(InputError, match=rf"measured\.csv.*{named}"):
-        responses_of(read_measured(path), coarse_rig)
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "named"),
-    [
+    "uff": [
         ("m/s^2", "cm/s2", r":\d+: .*'cm/s2'"),
         ("        12    0", "        11    0", r":\d+: .*11 over 8"),
         ("         8    0", "        13    0", r":\d+: .*12 over 13"),
@@ -164,17 +151,26 @@ def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, befo
         ("\n    -1\n", "\n    -3\n", r":\d+: "),
         ("NONE", "\n    -1\n    -1\n    58\nNONE", r":\d+: "),  # a record without its header
     ],
+}
+"""What is replaced in a file, and the place and the cause that are named; none if it is read."""
+
+
+@pytest.mark.parametrize(
+    ("ending", "before", "after", "named"),
+    [(ending, *row) for ending, rows in DAMAGED.items() for row in rows],
 )
-def test_read_measured_refuses_damaged_uff(responses, coarse_rig, tmp_path, before, after, named):
-    """Wrong units and kinds, broken records: file and line; other functions are skipped."""
-    path = tmp_path / "measured.uff"
-    write_responses_uff(path, responses, coarse_rig)
+def test_read_measured_refuses_damaged_files(
+    responses, coarse_rig, tmp_path, ending, before, after, named
+):
+    """Wrong units, unknown columns, bad values, broken records; other functions are skipped."""
+    path = tmp_path / f"measured.{ending}"
+    WRITERS[ending](path, responses, coarse_rig)
     damage(path, before, after)
     if not named:
         assert len(read_measured(path)) == 17 - 3
         return
-    with pytest.raises(InputError, match=rf"measured\.uff{named}"):
-        read_measured(path)
+    with pytest.raises(InputError, match=rf"measured\.{ending}.*{named}"):
+        responses_of(read_measured(path), coarse_rig)
 
 
 def test_comma_may_separate_thousands(responses, coarse_rig, tmp_path):

@@ -20,6 +20,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
+from drivers.host.jobs import Priority
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -460,6 +461,18 @@ async def test_set_that_would_be_committed_too_late_is_not(
     assert (group.is_armed, group.is_set_incomplete) == (True, False)
     await group.apply({name: [layer(0, tone())] for name in "ab"})
     await group.beat()
+
+
+@grouped(("a", "b"), wire="rtu")
+async def test_status_on_a_late_line_is_not_cut_short(group: Group, ends: list[MemoryLine]) -> None:
+    """A heartbeat waits for it: one that may reply again would else never be heard."""
+    first, second = group.amplifiers.values()
+    ends[0].outward = lambda name, data: [(0.02, data)]
+    await second.ping()
+    reading, feeding = first.read_status(Priority.READING), second.ping()
+    await reading
+    assert not feeding.done()
+    await feeding
 
 
 @in_virtual_time

@@ -9,7 +9,7 @@ from late_taps import AMPLIFIERS, WIRES, play
 _ROWS = [(wire, amplifiers, 1) for wire in WIRES for amplifiers in AMPLIFIERS]
 
 
-# The others: a line of three that is not fed in time, and one that replies again but is not heard.
+# The others: three on a line were not fed in time, or one that replied again was not heard.
 @pytest.mark.parametrize(
     ("wire", "amplifiers", "seed"), [*_ROWS, ("modbus", 3, 12), ("modbus", 3, 64)]
 )

@@ -12,7 +12,7 @@ from virtual_loop import in_virtual_time
 _ROWS = [(wire, amplifiers, 1) for wire in WIRES for amplifiers in AMPLIFIERS]
 
 
-# The others: a line of three that is not fed in time, and one that replies again but is not heard.
+# The others: three on a line were not fed in time, or one that replied again was not heard.
 @pytest.mark.parametrize(
     ("wire", "amplifiers", "seed"), [*_ROWS, ("modbus", 3, 12), ("modbus", 3, 64)]
 )

@@ -206,7 +206,8 @@ class Group(Members):
             each = self.amplifiers[name]
             now, line = each.line.time(), each.line
             is_due = line not in busy and now >= self._running_due.get(name, 0.0)
-            if is_due and each.committed and each.feeding.tells(now):
+            is_first = not each.committed and len(line.members) > 1  # it is fed by a set
+            if is_due and not is_first and each.feeding.tells(now):
                 pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
                 self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
                 all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)

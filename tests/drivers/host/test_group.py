@@ -17,6 +17,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
+from drivers.host.jobs import Priority
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -216,3 +217,15 @@ async def test_copy_of_an_old_status_is_no_reply(wire: str) -> None:
         assert host.status is not None
         assert host.status["state"] == STATES["OPERATION_ENABLED"]
     assert group.is_armed
+
+
+@grouped(("a", "b"), wire="rtu")
+async def test_status_on_a_late_line_is_not_cut_short(group: Group, ends: list[MemoryLine]) -> None:
+    """A heartbeat waits for it: one that may reply again would else never be heard."""
+    first, second = group.amplifiers.values()
+    ends[0].outward = lambda name, data: [(0.02, data)]
+    await second.ping()
+    reading, feeding = first.read_status(Priority.READING), second.ping()
+    await reading
+    assert not feeding.done()
+    await feeding

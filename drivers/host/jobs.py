@@ -128,7 +128,7 @@ class Job:
     make: values of each attempt, in its turn; raises CommandRefused. parts: values of
     the messages of a request, those without a reply, where there are several: known once `make`
     has returned the first. attempts: left. start: of a commit that goes out together with those of
-    other lines, until it was sent: is_held for them, then is_released. begun_at [s]: when it went
+    other lines, until it was sent: is_held for them, then is_released. started_at [s]: when it went
     out behind what was sent before. longer: than on a fast wire
     its reply may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an
     earlier attempt.
@@ -149,7 +149,7 @@ class Job:
     is_released: bool = False
     not_before: float = 0.0
     sent_at: float = 0.0
-    begun_at: float = 0.0
+    started_at: float = 0.0
     due: float = 0.0
     longer: float = 0.0
     delays: int = 0

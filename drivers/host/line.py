@@ -134,7 +134,7 @@ class Line:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
-            late = self.time() - job.begun_at - member.exchange_time(job.name)
+            late = self.time() - job.started_at - member.exchange_time(job.name)
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
@@ -230,7 +230,7 @@ class Line:
             now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
             if not rest:
-                job.sent_at, job.begun_at, job.due = now, begins, 0.0
+                job.sent_at, job.started_at, job.due = now, begins, 0.0
                 for each in self.members.values():
                     if address in (BROADCAST, each.address):
                         each.note_sent(job.name, job.values, now, begins + self.wire.takes)
@@ -276,10 +276,10 @@ class Line:
         members = [*self.members.values()]
         if len(members) == 1:
             return
-        longest = HEARTBEAT
+        limit = HEARTBEAT
         if self.late <= GRACE:
-            longest = _UNFED + sum(each.exchange_time("Set") for each in members)
-        if self.time() - min(each.feeding.since for each in members) <= longest:
+            limit = _UNFED + sum(each.exchange_time("Set") for each in members)
+        if self.time() - min(each.feeding.since for each in members) <= limit:
             return
         session, token = members[0].session, 0
         for each in members:

@@ -50,10 +50,10 @@ from controller.loop.loop import Controller
 from controller.loop.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
-from drivers import clock
 from drivers.host.stop import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
+from registry import clock
 
 _logger = logging.getLogger(__name__)
 

@@ -32,15 +32,15 @@ from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Applied, Silenced
 from controller.loop.plate_set import Drive
 from controller.sources.contacts import Contact, ContactKey
-from drivers import clock
+from drivers.counters import LinkStatistics
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.stop import Stopped
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, has_flag, name_of
-from drivers.statistics import LinkStatistics
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
+from registry import clock
 
 _LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
 _VOLTAGE = QUANTITIES["voltage"]

@@ -25,14 +25,14 @@ from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
-from drivers import clock
-from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
-from drivers.threads import DaemonThreads, in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
+from registry.garbage_collection import no_long_collections, without_collections
+from registry.threads import DaemonThreads, in_thread
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from controller.daemon.states import DaemonState, Operation
-from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
+from registry import clock
 
 DUMP_PATTERN = "era-fault-*.jsonl"
 """File names of dumps."""

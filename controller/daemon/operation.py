@@ -27,7 +27,6 @@ from controller.daemon.states import (
     step,
 )
 from controller.loop.loop import Controller
-from drivers import clock
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -37,6 +36,7 @@ from drivers.errors import (
     WrongAmplifier,
 )
 from drivers.host.stop import Stopped
+from registry import clock
 from registry.plugins import failure_text
 
 _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON

@@ -36,7 +36,7 @@ from controller.effects.player import EffectPlayer
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
-from drivers import clock
+from registry import clock
 
 _MAX_MESSAGE = 1000  # characters
 

@@ -20,14 +20,14 @@ from controller.daemon.states import (
     Trigger,
 )
 from controller.loop.observer import Observer
-from drivers import clock
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import GroupState
-from drivers.pauses import pauses
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
 from model.errors import InputError
+from registry import clock
+from registry.pauses import pauses
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed

@@ -12,11 +12,11 @@ from controller.api.topics import InputsEvent
 from controller.daemon.config import TouchInput
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
-from drivers import clock
-from drivers.pauses import Backoff
-from drivers.threads import in_thread
 from model.errors import InputError
+from registry import clock
+from registry.pauses import Backoff
 from registry.plugins import failure_text
+from registry.threads import in_thread
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s

@@ -21,8 +21,8 @@ from controller.loop.content import HELD_BACK, Prediction
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.loop.playing import PlayedContent
 from controller.sources.contacts import Change, Contact, ContactKey
-from drivers import clock
 from model.transients.measures import ONSET_WINDOW
+from registry import clock
 
 STEADY_WINDOW = 0.25
 """Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.

@@ -24,12 +24,12 @@ from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
 from controller.effects.layout import BUZZ
 from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
-from drivers import clock
 from drivers.errors import LinkError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+from registry import clock
 
 MIN_ERAS_FOR_THREE = 8
 """Number of ERAs from which three people have contents of their own, else two."""

@@ -26,12 +26,12 @@ from controller.learning.settled_readings import SettledReadings
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.contacts import Change, Contact
-from drivers import clock
 from drivers.errors import CommandError, DriverError
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
 from registry.plugins import failure_text
 
 ROBUST_AFTER = 60.0

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from drivers.threads import DaemonThreads
+from registry.threads import DaemonThreads
 
 T = TypeVar("T")
 

@@ -15,7 +15,6 @@ from controller.loop.plate_set import PlateSet
 from controller.sources.contacts import Change, ContactTracker
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame
-from drivers import clock
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -28,14 +27,15 @@ from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
 from drivers.host.members import GroupState, Played
 from drivers.host.stop import UNREACHED, Stopped, what_may_play
-from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
+from drivers.protocol.timing import HEARTBEAT, REPLY_TIMEOUT
 from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 

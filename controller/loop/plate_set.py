@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from controller.loop.capabilities import EnvelopeSupport
-from drivers.contents import Layer, Tone
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from model.errors import InputError

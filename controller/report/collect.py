@@ -32,8 +32,8 @@ from drivers.protocol.records import Record, Rows
 from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.config.document import read_document
 from model.errors import InputError
-from model.files.regular_file import regular_file
 from model.rig.sections import RigSection
+from registry.regular_file import regular_file
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5

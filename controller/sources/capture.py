@@ -16,7 +16,7 @@ from pathlib import Path
 
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
-from model.files.regular_file import regular_file
+from registry.regular_file import regular_file
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)

@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 
-from drivers import clock
+from registry import clock
 
 LOG_INTERVAL = 1.0  # s
 

@@ -19,8 +19,8 @@ from controller.sources.datagrams import Datagram, Peer, listen
 from controller.sources.osc import Argument, OscError, osc_messages, read_message
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
-from drivers import clock
 from model.errors import InputError
+from registry import clock
 
 ADDRESS = "/tuio/2Dcur"
 DEFAULT_HOST = "127.0.0.1"

@@ -7,8 +7,8 @@ from controller.sources.contacts import Change, Contact, ContactKey, ContactTrac
 from controller.sources.datagrams import Datagram, Datagrams, listen
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
-from drivers.clock import now
 from model.errors import InputError
+from registry.clock import now
 
 __all__ = [
     "Change",

@@ -25,12 +25,12 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from drivers import clock
 from drivers.host.amplifier import WATCHDOG
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from plate_judge import PlateJudge
+from registry import clock
 from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
 from small_table import small_table

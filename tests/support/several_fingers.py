@@ -18,7 +18,6 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.loop.observer import Applied
-from drivers import clock
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
@@ -27,8 +26,9 @@ from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_table import smooth_rig
+from registry import clock
 from rig_on_wire import after_each
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from virtual_loop import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)

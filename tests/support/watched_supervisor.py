@@ -11,8 +11,8 @@ from controller.daemon.states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.daemon.supervisor import Supervisor
 from controller.loop.observer import Observer
 from courses import Acted, Planted, Step
-from drivers import clock
 from drivers.errors import LinkError
+from registry import clock
 from set_chain import set_chain
 
 

@@ -25,8 +25,8 @@ from daemon_bench import (
     until_state,
 )
 from daemon_process import Journal, energised, silent_from
-from drivers import clock
 from drivers.host.amplifier import WATCHDOG
+from registry import clock
 from rig_files import TWO_AMPLIFIERS
 from several_fingers import answers_take
 from sim.faults.fault_window import FaultWindow

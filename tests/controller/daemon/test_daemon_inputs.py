@@ -23,9 +23,9 @@ from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource, turned
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
-from drivers import clock
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
+from registry import clock
 from tuio_messages import bundle, free_port, message, panel
 from virtual_loop import in_virtual_time
 from witness_config import tell_first

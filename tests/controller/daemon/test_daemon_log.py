@@ -25,9 +25,9 @@ from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.publisher import LatencyStatistics
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.states import DaemonState, Operation
-from drivers import clock
-from drivers.host.wire import Reply
+from drivers.wires.wire import Reply
 from gateway_bench import wait_for
+from registry import clock
 from set_chain import set_chain
 from virtual_loop import in_virtual_time
 

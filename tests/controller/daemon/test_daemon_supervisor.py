@@ -10,11 +10,11 @@ from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
 from courses import courses, follow
-from drivers import clock
 from drivers.errors import CommandRefused
 from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
+from registry import clock
 from virtual_loop import in_virtual_time
 from watched_supervisor import Watched, watched
 

@@ -8,9 +8,9 @@ import pytest
 
 from controller.daemon.api_views import amplifier_statuses
 from courses import Step
-from drivers import clock
 from drivers.errors import DriverError
 from long_form import shortly
+from registry import clock
 from virtual_loop import in_virtual_time, run_virtual
 from watched_supervisor import Watched, watched
 

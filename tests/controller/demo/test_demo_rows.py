@@ -27,10 +27,10 @@ from controller.loop.content import Prediction, not_served
 from controller.loop.observer import Applied, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
-from drivers import clock
 from drivers.errors import LinkError
 from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path
+from registry import clock
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 

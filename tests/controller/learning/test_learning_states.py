@@ -30,8 +30,8 @@ from controller.learning.messages import (
     unpacked,
 )
 from controller.loop.loop import Controller
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError
+from drivers.playing.contents import Layer, Tone
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.learned_table import LearnedTable

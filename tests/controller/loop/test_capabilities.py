@@ -14,9 +14,9 @@ from controller.loop.capabilities import (
     playback_capabilities,
 )
 from controller.loop.plate_set import on_wire, route, thinned, tones_by_era
-from drivers.contents import Layer
-from drivers.contents import Tone as Played
 from drivers.host.ledger import Ledger
+from drivers.playing.contents import Layer
+from drivers.playing.contents import Tone as Played
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.errors import InputError

@@ -20,9 +20,9 @@ from controller.loop.observer import Applied
 from controller.loop.plate_set import PlateSet
 from controller.loop.playing import PlayedContent
 from controller.sources.contacts import Contact, ContactKey
-from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
+from drivers.playing.contents import Layer
 from model.arrays import Complex64Array
 from model.errors import InputError
 from model.table.pattern import Pattern

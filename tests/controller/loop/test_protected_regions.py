@@ -14,9 +14,9 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
-from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
+from drivers.playing.contents import Layer
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time

@@ -50,7 +50,7 @@ class AmplifierSession:
     is_identified: bool | None = None
     is_open: bool = True
     is_stopped: bool = False
-    is_asked: bool = False  # whether it is latched, by a host that has opened the wire since
+    is_requested: bool = False  # whether it is latched, by a host that has opened the wire since
     armed_at: float = -math.inf
     stop_requested_at: float | None = None
     first_stop: float | None = None  # that is not confirmed yet

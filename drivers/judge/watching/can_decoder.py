@@ -57,8 +57,8 @@ class CanDecoder(Decoder):
             take = self._from_host if direction == "amplifier" else self._from_bus
             message = take(time, frame, sender)
             if sender.cut_short is not None:
-                number, begun = sender.cut_short
-                seen.append((b"", damaged(f"message {number} without all frames", begun)))
+                number, started_at = sender.cut_short
+                seen.append((b"", damaged(f"message {number} without all frames", started_at)))
                 sender.cut_short = None
             seen.append((piece, message))
         return seen
@@ -76,7 +76,7 @@ class CanDecoder(Decoder):
         if not isinstance(words, Words):
             return words
         key = (node, words.number, words.type) if node else None
-        return request_of(words.type, words.words, node, key, sender.begun)
+        return request_of(words.type, words.words, node, key, sender.started_at)
 
     def _from_bus(self, time: float, frame: CanFrame, sender: "_Sender") -> Message | None:
         node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
@@ -95,13 +95,13 @@ class CanDecoder(Decoder):
 
 
 class _Sender:
-    """Messages of one identifier; begun: time of the first frame of the last one [s].
+    """Messages of one identifier; started_at: time of the first frame of the last one [s].
 
     cut_short: number and begin of a message that the last frame ended before it was whole.
     """
 
     def __init__(self, *, is_numbered: bool) -> None:
-        self.begun = 0.0
+        self.started_at = 0.0
         self.cut_short: tuple[int | None, float] | None = None
         self._counters = WireCounters()
         self._assembler = Assembler(self._counters, is_numbered=is_numbered)
@@ -113,8 +113,8 @@ class _Sender:
         if len(data) != BLOCK:
             return damaged(f"a frame of {len(data)} bytes, must be {BLOCK}")
         if data[0] != self._number or (self._is_whole and data[1] == 0):
-            self.cut_short = None if self._is_whole else (self._number, self.begun)
-            self._number, self._is_whole, self.begun = data[0], False, time
+            self.cut_short = None if self._is_whole else (self._number, self.started_at)
+            self._number, self._is_whole, self.started_at = data[0], False, time
         before = self._counters.invalid_frames, self._counters.unexpected_frames
         words = self._assembler.add(data, time)
         if words is None and self._counters.invalid_frames > before[0]:

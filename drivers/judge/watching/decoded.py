@@ -44,7 +44,7 @@ _WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
 class Request:
     """A request. address: 0 for broadcast; key: of its reply, None where there is none.
 
-    values: of its record; problem: what is wrong with it, or ""; begun: when the first of its
+    values: of its record; problem: what is wrong with it, or ""; started_at: when the first of its
     frames passed, None where it has one [s].
     """
 
@@ -53,7 +53,7 @@ class Request:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     problem: str = ""
-    begun: float | None = None
+    started_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Notice:
     carried out: the amplifier has carried the request of a key out; read on: the host goes on with
     it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
     has reset it. other host: its request, by name. damaged: a frame that is none, and why.
-    begun: when the first of its frames passed, None where it is one [s].
+    started_at: when the first of its frames passed, None where it is one [s].
     """
 
     what: Literal["carried out", "read on", "event", "boot", "other host", "damaged"]
@@ -85,7 +85,7 @@ class Notice:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     text: str = ""
-    begun: float | None = None
+    started_at: float | None = None
 
 
 class Decoder(ABC):
@@ -104,9 +104,9 @@ DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
 
-def damaged(why: str, begun: float | None = None) -> Notice:
+def damaged(why: str, started_at: float | None = None) -> Notice:
     """Return what is said of bytes that form no message."""
-    return Notice("damaged", text=why, begun=begun)
+    return Notice("damaged", text=why, started_at=started_at)
 
 
 def request_of(
@@ -114,7 +114,7 @@ def request_of(
     words: Sequence[int],
     address: int,
     key: Hashable,
-    begun: float | None = None,
+    started_at: float | None = None,
 ) -> Request:
     """Read a request by the number of its message."""
     name, values = NAMES.get(number, f"type {number}"), Values()
@@ -124,7 +124,7 @@ def request_of(
             _, values = read_request(number, words)
     except Refusal as refusal:
         problem = str(refusal)
-    return Request(name, address, key, values, problem, begun)
+    return Request(name, address, key, values, problem, started_at)
 
 
 def reply_of(record: Record, words: Sequence[int], address: int, key: Hashable) -> Reply:
@@ -158,17 +158,17 @@ def sent_by_amplifier(
 
 @dataclass(eq=False, slots=True)
 class Sent:
-    """A request as it was sent, in this order; begun [s]: when its first byte passed.
+    """A request as it was sent, in this order; started_at [s]: when its first byte passed.
 
-    since: from which on its amplifier has to respond, infinite while it is the host's turn; begin,
-    end: between which it is carried out, None for until its reply [s].
+    since: from which on its amplifier has to respond, infinite while it is the host's turn;
+    earliest, end: between which it is carried out, None for until its reply [s].
     """
 
     number: int
     request: Request
-    begun: float
+    started_at: float
     since: float
-    begin: float
+    earliest: float
     end: float | None = None
     is_overdue: bool = False
 

@@ -125,15 +125,15 @@ class HostRules:
         for each in pending:
             name = each.request.name
             is_reading = name in _READINGS or (name == "GetStatus" and each.request.address in mute)
-            waits = sent.begun - each.begun
+            waits = sent.started_at - each.started_at
             # A last lift preempts too, even if a finger has come since.
-            is_preempted = each.number < preempted_by or each.begun <= self._last_lift
+            is_preempted = each.number < preempted_by or each.started_at <= self._last_lift
             # The host counts from its write: the bytes may have waited in a transport since.
             is_given_up = waits >= self._times.reply - max(self._times.slack, _IN_TRANSPORT)
             if not (is_preempted or is_given_up or is_reading):
                 session.report_always(
                     "credit",
-                    sent.begun,
+                    sent.started_at,
                     f"host sent {sent.request.name} to {session.name} {waits * 1e3:.1f} ms after "
                     f"{name}, whose reply is pending",
                 )
@@ -178,7 +178,7 @@ class HostRules:
         stop that was confirmed, of which there is nothing left to clear. A host that has opened the
         wire since knows a stop by what it shows alone: it may not have heard it.
         """
-        may_be_over = session.is_asked or values.get("latch") == 0
+        may_be_over = session.is_requested or values.get("latch") == 0
         if session.first_stop is None and "state" in values and may_be_over:
             session.is_stopped = session.is_stopped and values["state"] in LATCHED
         if "levels" in values and not any(values["levels"]):
@@ -319,7 +319,7 @@ class HostRules:
         elif name == "Stop":
             is_confirmed = session.is_stopped and session.first_stop is None
             session.is_stopped, session.stop_requested_at, session.session = True, None, None
-            session.is_asked = False
+            session.is_requested = False
             if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
                 session.first_stop = time if session.first_stop is None else session.first_stop
                 self._expect_confirmation(session, time, session.first_stop)

@@ -92,7 +92,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         """Note a request without a reply, or none yet, that may be carried out soon."""
         if sent.request.name in FEEDING:
             self._fed_before = self.fed[1]
-            self.fed = self.fed[0], max(self.fed[1], sent.begun + REACTION)
+            self.fed = self.fed[0], max(self.fed[1], sent.started_at + REACTION)
         if sent.request.name in CHANGING:
             self.unanswered.append(sent)
 
@@ -105,12 +105,12 @@ class WatchedAmplifier(ExpectedAmplifier):
             return
         self._answered = sent.number
         name = sent.request.name
-        self.advance(sent.begin)
+        self.advance(sent.earliest)
         if REPLIES.get(name) is STATUS_RECORD:
             self._resolve(sent.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return
-        self.granted(name, sent.request.values, values, (sent.begin, end))
+        self.granted(name, sent.request.values, values, (sent.earliest, end))
 
     def _take(self, part: Values, reply: Values, when: Interval) -> None:
         """Compare the reply to a part of a set; one that plays finely and is cool plays exactly."""
@@ -136,16 +136,18 @@ class WatchedAmplifier(ExpectedAmplifier):
         earlier = [each for each in self.unanswered if each.number < number]
         self.unanswered = [each for each in self.unanswered if each.number >= number]
         for each in earlier if self.state is not None else ():
-            request, begun, is_broadcast = each.request, each.begun, each.request.key is None
+            request, started_at = each.request, each.started_at
+            is_broadcast = request.key is None
             until, _ = self.sets.staged_until(request.values.get("token"))
             if is_carried_out(request, status):
-                last = min(end, begun + REACTION) if is_broadcast else end
-                self.carry_out(request.name, request.values, status, (begun, max(last, begun)))
+                last = min(end, started_at + REACTION) if is_broadcast else end
+                when = started_at, max(last, started_at)
+                self.carry_out(request.name, request.values, status, when)
             elif request.name == "Arm":
                 self.token = None  # 0, if it was carried out before what disarmed again
             elif is_broadcast and request.name == "Stop":
                 self.report("stop", end, "answer to a broadcast Stop", must="obeyed", seen="none")
-            elif is_broadcast and begun + REACTION <= until:
+            elif is_broadcast and started_at + REACTION <= until:
                 what = f"answer to a broadcast Commit of set {request.values['token']}"
                 self.report("commit", end, what, must="obeyed", seen="none")
 

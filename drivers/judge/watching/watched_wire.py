@@ -60,7 +60,7 @@ class WatchedWire:
         self._kind = kind
         self._decoder = decoder_of(kind)
         self._host, self._times, self._delays, self._report = host, times, delays, report
-        self._begun: dict[Direction, float] = {}  # start of partial frames [s]
+        self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
         self._pending: dict[Hashable, Sent] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
@@ -72,11 +72,11 @@ class WatchedWire:
 
     def opened(self, time: float) -> None:
         """Note that a host has opened it: its amplifiers are not identified yet."""
-        self._decoder, self._begun = decoder_of(self._kind), {}
+        self._decoder, self._started_at = decoder_of(self._kind), {}
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None
-            session.is_asked = True
+            session.is_requested = True
             session.forget_amplifier()
 
     def closed(self, time: float) -> None:
@@ -130,47 +130,47 @@ class WatchedWire:
 
         Bytes that follow a frame cut by a fault are read as its rest, and are a disturbance too.
         """
-        begun = self._begun.pop(direction, time)
-        if begun < time and begun <= self._faults_until < time:
+        started_at = self._started_at.pop(direction, time)
+        if started_at < time and started_at <= self._faults_until < time:
             self.disturb(time)
         found = self._decoder.feed(direction, time, data)
         if self._decoder.rest[direction]:
-            self._begun[direction] = time if found else begun
+            self._started_at[direction] = time if found else started_at
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
-                since = begun if message.begun is None else message.begun
+                since = started_at if message.started_at is None else message.started_at
                 self._damaged(direction, time, message.text, since)
             elif direction == "amplifier" and message is not None:
-                self._sent(time, raw, message, begun)
+                self._sent(time, raw, message, started_at)
             elif message is not None:
                 self._received(time, message)
-            begun = time  # of those behind the first
+            started_at = time  # of those behind the first
         return len(found)
 
     def advance(self, now: float) -> None:
         """Report replies that are overdue."""
         for key, sent in list(self._pending.items()):
-            since = max(sent.since, self._begun.get("host", -math.inf))
+            since = max(sent.since, self._started_at.get("host", -math.inf))
             due = since + self._times.reply + self._times.slack + self._delays.since(since)
             if now > due and not sent.is_overdue:
                 sent.is_overdue = True
                 session = self.sessions[sent.request.address]
                 session.overdue_at = now
                 if not (session.is_mute or self.is_disturbed(due)):
-                    what = f"no reply to {sent.request.name} of {sent.begun:.4f} s"
+                    what = f"no reply to {sent.request.name} of {sent.started_at:.4f} s"
                     session.report_always("answer", now, f"{session.name}: {what}")
-            if now > sent.begun + _PENDING_TIMEOUT:
+            if now > sent.started_at + _PENDING_TIMEOUT:
                 del self._pending[key]
 
-    def _damaged(self, direction: Direction, time: float, why: str, begun: float) -> None:
+    def _damaged(self, direction: Direction, time: float, why: str, started_at: float) -> None:
         if direction == "amplifier":
             self._damaged_at = time
-        if not self.is_disturbed(begun):
+        if not self.is_disturbed(started_at):
             sender = "host" if direction == "amplifier" else "amplifier"
             self._report.add("garbage", self.name, time, f"{sender} sent {why}")
 
-    def _sent(self, time: float, raw: bytes, message: Message, begun: float) -> None:
+    def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
         """Process a frame of the host."""
         is_copy = self.is_disturbed(time) and raw in self._recent
         self._recent.append(raw)
@@ -178,9 +178,10 @@ class WatchedWire:
             self._noticed(time, message)
         if not isinstance(message, Request):
             return
-        begun = begun if message.begun is None else min(begun, message.begun)
+        if message.started_at is not None:
+            started_at = min(started_at, message.started_at)
         self._number += 1
-        sent = Sent(self._number, message, begun, since=time, begin=begun)
+        sent = Sent(self._number, message, started_at, since=time, earliest=started_at)
         addressed = self.sessions.get(message.address)
         sessions = self.sessions.values() if message.address == 0 else (addressed,)
         for session in [each for each in sessions if each is not None]:
@@ -209,7 +210,7 @@ class WatchedWire:
             return
         if self._host.is_preempting(session, time, request):
             self._preempted_by = sent.number
-        elif not self.is_disturbed(sent.begun):
+        elif not self.is_disturbed(sent.started_at):
             is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1
             pending = [
                 one
@@ -228,7 +229,7 @@ class WatchedWire:
         elif notice.what == "read on" and sent is not None:
             sent.since = time
             if sent.request.name in _PRESENT:
-                sent.begin, sent.end = time, None
+                sent.earliest, sent.end = time, None
         elif notice.what == "event" and session is not None:
             session.amplifier.event_reported(notice.values, time)
         elif notice.what == "other host" and session is not None and notice.text in FEEDING:
@@ -283,7 +284,7 @@ class WatchedWire:
         token = amplifier.token
         amplifier.replied(sent, values, time if sent.end is None else sent.end)
         if amplifier.token != token and not self.is_disturbed(time):
-            check_sums(session, sent.begin)
+            check_sums(session, sent.earliest)
         self._move(session, request)
 
     def _move(self, session: AmplifierSession, request: Request) -> None:

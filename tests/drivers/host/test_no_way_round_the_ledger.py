@@ -13,12 +13,12 @@ ON_THE_WAY = sorted(
 )
 
 # Sends sets of its own, and frames damaged on purpose, to amplifiers that it judges.
-CONFORMANCE = ROOT / "drivers" / "conformance"
+CONFORMANCE = ROOT / "drivers" / "judge" / "asking"
 
-# Ports of CAN adapters, which take and give packed frames.
+# Kinds of wire make the bytes of requests; ports of CAN adapters take and give packed frames.
 WIRES = ROOT / "drivers" / "wires"
 
-# One class makes requests of sets, kinds of wire their bytes.
+# One class makes requests of sets.
 HOST = ROOT / "drivers" / "host"
 
 
@@ -45,11 +45,13 @@ def test_only_wires_use_encoders() -> None:
         for name, _ in calls(file, part)
         if name.startswith(part)
     }
-    wires = {file for file in users if file.parent == HOST and file.name.endswith("_wire.py")}
-    assert wires
-    below = {"backends", "codec", "protocol"}
-    above = [file for file in users - wires if not below & set(file.parts)]
-    assert {file.parent for file in above} == {CONFORMANCE, WIRES, HOST}
+    wires = {file for file in users if WIRES in file.parents}
+    assert {file.parent.name for file in wires if file.name == "host.py"} == {
+        "can_bus",
+        "serial_line",
+    }
+    above = [file for file in users - wires if "protocol" not in file.parts]
+    assert {file.parent for file in above} == {CONFORMANCE, HOST}
     assert [file.name for file in above if file.parent == HOST] == ["dialogue.py"]
 
 

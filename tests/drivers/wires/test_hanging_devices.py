@@ -14,7 +14,7 @@ import pytest
 from drivers.ports import serial_port
 from drivers.ports.port import Port
 from drivers.urls import Place
-from drivers.wires import bus_port
+from drivers.wires.can_bus import bus_port
 from registry import threads
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from sim.firmware import bench
+from sim.firmware import processes
 from sim.firmware.processes import ending_with_parent, frequencies_in
 
 RATE = 16_000.0
@@ -37,12 +37,12 @@ def test_missing_firmware_is_told_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a checkout the command that builds it, elsewhere that a checkout is needed."""
-    monkeypatch.setattr(bench, "FOLDER", tmp_path / "out" / "firmware")
+    monkeypatch.setattr(processes, "FOLDER", tmp_path / "out" / "firmware")
     with pytest.raises(InputError, match="checkout"):
-        bench.find_firmware()
+        processes.find_firmware()
     (tmp_path / "firmware").mkdir()
     with pytest.raises(InputError, match="make firmware"):
-        bench.find_firmware()
+        processes.find_firmware()
 
 
 PARENT = """

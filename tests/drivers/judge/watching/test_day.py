@@ -54,7 +54,7 @@ def test_witness_excuses_lost_and_doubled_frames(kind: str, lines: str, seed: in
     live(kind, lines, seed, lossy_steps=25)
 
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
 # the stop that follows a fault is still under way when the operator clears.
 # A finger that comes again before a set was carried out changes nothing.

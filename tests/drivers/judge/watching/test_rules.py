@@ -15,7 +15,7 @@ from hand_written_talk import HALF, Talk
 
 BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
 FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
-PAGE = Path(__file__).parents[3] / "docs" / "reference" / "witness.md"
+PAGE = Path(__file__).parents[4] / "docs" / "reference" / "witness.md"
 
 
 @pytest.mark.parametrize("name", BROKEN)

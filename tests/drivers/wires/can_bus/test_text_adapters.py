@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import LinkError
 from drivers.opening import Lines
 from drivers.ports.port import PORT_OPENER
-from drivers.wires import can_bus
+from drivers.wires.can_bus import address
 from drivers.wires.can_bus.address import SlcanAddress, TextPort
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames, unpack_frames
@@ -93,7 +93,7 @@ async def test_server_that_does_not_open_the_bus_is_told(
     replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error, a closed connection, or no reply at all: with the remedy."""
-    monkeypatch.setattr(can_bus, "_GREETING_TIMEOUT", 0.2)
+    monkeypatch.setattr(address, "_GREETING_TIMEOUT", 0.2)
     async with server(*replies) as url:
         with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
             await open_port(url, lambda data: None)

@@ -24,6 +24,7 @@ from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import STATES
+from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
@@ -98,7 +99,7 @@ def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None
 )
 def test_parse_endpoint_refuses_an_invalid_url(url: str) -> None:
     """Scheme, location, address and baud rate are checked; the error names the URL."""
-    with pytest.raises(CommandError, match=re.escape(url)):
+    with pytest.raises(InputError, match=re.escape(url)):
         parse_endpoint(url)
 
 
@@ -141,7 +142,7 @@ def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
     capture.write_text(text, encoding="utf-8")
     arguments = ["witness", URL, "--replay", str(capture), "--json", *options]
     result = CliRunner().invoke(app, arguments)
-    if isinstance(result.exception, CommandError):
+    if isinstance(result.exception, InputError | CommandError):
         return 2, str(result.exception)
     return result.exit_code, result.stdout
 
@@ -177,7 +178,7 @@ def test_witness_replay_refuses_an_invalid_capture(
     capture = tmp_path / "capture.txt"
     capture.write_bytes(text.encode("utf-8", errors="surrogateescape"))
     result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
-    assert isinstance(result.exception, CommandError)
+    assert isinstance(result.exception, InputError | CommandError)
     place = str(capture) if line is None else f"{capture}:{line}:"
     assert str(result.exception).startswith(place)
 
@@ -205,7 +206,7 @@ def test_witness_refuses_invalid_arguments(
     """The option, file or URL is named before anything is opened."""
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["witness", URL, *arguments])
-    assert isinstance(result.exception, CommandError)
+    assert isinstance(result.exception, InputError | CommandError)
     assert named in str(result.exception)
 
 
@@ -276,6 +277,6 @@ def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("sim.witness_relay.relays", ended_at_once)
     result = CliRunner().invoke(app, ["witness", URL])
-    assert isinstance(result.exception, CommandError)
+    assert isinstance(result.exception, InputError | CommandError)
     assert "nothing was checked" in str(result.exception)
     assert "Ctrl-C ends" in result.stderr

@@ -15,7 +15,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from controller.touch.frames import open_source
 from controller.touch.tuio import TuioSource
 from drivers.errors import CommandError

@@ -19,7 +19,7 @@ from typing import Any
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
-from controller.play.reports import Observer
+from controller.play.observer import Observer
 from controller.touch.frames import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line

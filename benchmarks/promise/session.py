@@ -23,7 +23,7 @@ from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
-from controller.play.reports import Applied
+from controller.play.observer import Applied
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.table.timing import Timing
 from registry import clock

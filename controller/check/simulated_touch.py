@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.choice import Chooser
 from controller.play.intent import Target
-from controller.play.limits import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.table_query import TableAnswer, query_table
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError

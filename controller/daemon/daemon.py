@@ -21,7 +21,7 @@ from controller.operation.dumps import FaultDumps
 from controller.operation.links import Supervisor
 from controller.operation.states import ENERGISED, DaemonState, Operation
 from controller.play.loop import Controller
-from controller.play.reports import Observer
+from controller.play.observer import Observer
 from controller.process.log import LogThread
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock

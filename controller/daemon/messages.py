@@ -29,9 +29,9 @@ from controller.effects.layout import SurfaceLayout
 from controller.operation.states import Loss
 from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
-from controller.play.reports import Applied, Silenced
+from controller.play.observer import Applied, Silenced
 from controller.play.routing import Drive
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from drivers.counters import LinkStatistics
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost

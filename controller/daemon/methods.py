@@ -48,7 +48,7 @@ from controller.operation.states import (
 )
 from controller.play.loop import Controller
 from controller.play.table_query import MAX_DB_SL
-from controller.touch.fingers import Contact
+from controller.touch.contacts import Contact
 from controller.touch.frames import Touch, TouchFrame
 from drivers.host.stop import Stopped
 from model.compiled.kernels import why_slow

@@ -34,8 +34,8 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
-from controller.play.reports import Applied, Observer, Silenced
-from controller.touch.fingers import Change, Contact, ContactKey
+from controller.play.observer import Applied, Observer, Silenced
+from controller.touch.contacts import Change, Contact, ContactKey
 from registry import clock
 
 _MAX_MESSAGE = 1000  # characters

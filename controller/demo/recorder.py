@@ -18,9 +18,9 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.play.content import HELD_BACK, Prediction
+from controller.play.observer import Applied, Observer, Silenced
 from controller.play.playing import PlayedContent
-from controller.play.reports import Applied, Observer, Silenced
-from controller.touch.fingers import Change, Contact, ContactKey
+from controller.touch.contacts import Change, Contact, ContactKey
 from model.transients.measures import ONSET_WINDOW
 from registry import clock
 

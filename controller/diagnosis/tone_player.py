@@ -7,7 +7,7 @@ confirm.
 import math
 from collections.abc import Callable, Mapping
 
-from controller.play.limits import PlaybackCapabilities, playback_capabilities
+from controller.play.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.play.routing import Drive, route, tones_by_era
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier

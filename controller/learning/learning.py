@@ -24,8 +24,8 @@ from controller.learning.estimator_process import (
 from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.play.loop import Controller
-from controller.play.reports import Applied, Observer
-from controller.touch.fingers import Change, Contact
+from controller.play.observer import Applied, Observer
+from controller.touch.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig

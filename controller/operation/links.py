@@ -19,7 +19,7 @@ from controller.operation.states import (
     DaemonState,
     Trigger,
 )
-from controller.play.reports import Observer
+from controller.play.observer import Observer
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import GroupState

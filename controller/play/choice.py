@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from controller.play.capabilities import PlaybackCapabilities, amplitudes_of
 from controller.play.content import Content, Prediction, Selection, Targets, not_served
 from controller.play.intent import Target
 from controller.play.joint_answer import (
@@ -19,9 +20,8 @@ from controller.play.joint_answer import (
     query_jointly,
     unshaped,
 )
-from controller.play.limits import PlaybackCapabilities, amplitudes_of
 from controller.play.table_query import TableAnswer, query_table
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.choice import NEARLY
 from model.errors import InputError
 from model.finger.perception import decibels

@@ -9,14 +9,14 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+from controller.play.capabilities import PlaybackCapabilities
 from controller.play.choice import Chooser
 from controller.play.content import Selection, no_layer_free
 from controller.play.intent import FADED_AFTER, IntentSource, Pulse
-from controller.play.limits import PlaybackCapabilities
 from controller.play.playing import PlayedContent, Playing, all_left
 from controller.play.routing import FADE_RAMP, PlateSet, SetBuilder
 from controller.play.selection import Selector
-from controller.touch.fingers import Change, Contact, ContactKey, ContactTracker
+from controller.touch.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.rig.rig import Rig

@@ -7,12 +7,12 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+from controller.play.capabilities import playback_capabilities
 from controller.play.decision import RELEASE_RAMP, Decider, Decision
 from controller.play.intent import IntentSource
-from controller.play.limits import playback_capabilities
-from controller.play.reports import Observer, applied_by, silenced_by
+from controller.play.observer import Observer, applied_by, silenced_by
 from controller.play.routing import PlateSet
-from controller.touch.fingers import Change, ContactTracker
+from controller.touch.contacts import Change, ContactTracker
 from controller.touch.frames import TouchFrame
 from controller.touch.reject_counter import RejectCounter
 from drivers.errors import (

@@ -14,7 +14,7 @@ from itertools import islice
 
 import numpy as np
 
-from controller.play.limits import EnvelopeSupport
+from controller.play.capabilities import EnvelopeSupport
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
+from controller.play.capabilities import PlaybackCapabilities
 from controller.play.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
 from controller.play.content import (
     BEING_CHOSEN,
@@ -20,8 +21,7 @@ from controller.play.content import (
     not_served,
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
-from controller.play.limits import PlaybackCapabilities
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
 from model.table.answer import MAX_SEPARATE
 

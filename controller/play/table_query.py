@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from controller.play.capabilities import PlaybackCapabilities
 from controller.play.intent import Target, band_of_table
-from controller.play.limits import PlaybackCapabilities
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from controller.touch.fingers import LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.touch.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from controller.touch.frames import Touch
 from model.errors import InputError
 

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
+from controller.touch.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.touch.datagrams import Datagram, Peer, listen
-from controller.touch.fingers import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.touch.frames import Touch, TouchFrame, TouchSource, number_option
 from controller.touch.osc import Argument, OscError, osc_messages, read_message
 from controller.touch.reject_counter import RejectCounter

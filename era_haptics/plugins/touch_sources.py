@@ -3,8 +3,8 @@
 `open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
 """
 
+from controller.touch.contacts import Change, Contact, ContactKey, ContactTracker
 from controller.touch.datagrams import Datagram, Datagrams, listen
-from controller.touch.fingers import Change, Contact, ContactKey, ContactTracker
 from controller.touch.frames import Touch, TouchFrame, TouchSource, open_source
 from controller.touch.reject_counter import RejectCounter
 from model.errors import InputError

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self, cast
 
 from controller.play.loop import Controller
-from controller.play.reports import Applied, Observer, Silenced
+from controller.play.observer import Applied, Observer, Silenced
 from controller.touch.frames import Touch, TouchFrame
 from drivers.judge.watching.witness import OperatorCommand
 from drivers.opening import Lines

@@ -16,7 +16,7 @@ from chain import Chain
 from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.play.reports import Applied
+from controller.play.observer import Applied
 from drivers.judge.watching.capture import Violation
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig

@@ -15,7 +15,7 @@ from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Trigger
-from controller.play.reports import Applied, Observer
+from controller.play.observer import Applied, Observer
 from controller.touch.frames import Touch, TouchFrame
 from drivers.errors import DriverError
 from model.rig.rig import Rig

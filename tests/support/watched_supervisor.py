@@ -9,7 +9,7 @@ from typing import Any
 
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Lease, Trigger
-from controller.play.reports import Observer
+from controller.play.observer import Observer
 from courses import Acted, Planted, Step
 from drivers.errors import LinkError
 from registry import clock

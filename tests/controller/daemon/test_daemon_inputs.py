@@ -18,7 +18,7 @@ from controller.cli.shown import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.inputs import TouchInputs
 from controller.gateway.metrics import exposition
-from controller.touch.fingers import Change
+from controller.touch.contacts import Change
 from controller.touch.frames import Touch, TouchCalibration, TouchFrame, TouchSource, turned
 from controller.touch.reject_counter import RejectCounter
 from daemon_bench import ready_daemon, until

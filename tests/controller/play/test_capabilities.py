@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from controller.play.limits import (
+from controller.play.capabilities import (
     EnvelopeSupport,
     envelope_support,
     playback_capabilities,

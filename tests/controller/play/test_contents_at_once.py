@@ -16,10 +16,10 @@ from controller.effects.player import EffectPlayer
 from controller.play.decision import ENDED, Decider
 from controller.play.intent import Target
 from controller.play.joint_answer import query_jointly, unshaped
+from controller.play.observer import Applied
 from controller.play.playing import PlayedContent
-from controller.play.reports import Applied
 from controller.play.routing import PlateSet
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from drivers.playing.contents import Layer

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.play.reports import Observer
+from controller.play.observer import Observer
 from controller.touch.frames import Touch, TouchFrame
 from courses import Acted, courses, follow
 from drivers.protocol.records import Values

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller.play.capabilities import PlaybackCapabilities
 from controller.play.choice import Chooser
 from controller.play.content import Selection
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.joint_answer import query_jointly, unshaped
-from controller.play.limits import PlaybackCapabilities
 from controller.play.selection import Selector
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.table.effect_level import EffectLevels
 from several_fingers import LEFT, RIGHT, playable, table
 

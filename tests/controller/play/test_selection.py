@@ -8,12 +8,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.choice import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.limits import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Selector
 from controller.play.table_query import strongest
-from controller.touch.fingers import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.errors import InputError
 from model.finger.perception import DEFAULT_THRESHOLD
 from model.structure.plate import Material, Plate

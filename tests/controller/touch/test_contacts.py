@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.touch.fingers import CONTACT_TIMEOUT, ContactKey, ContactTracker
+from controller.touch.contacts import CONTACT_TIMEOUT, ContactKey, ContactTracker
 from controller.touch.frames import Touch, TouchFrame, turned
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Material, Plate

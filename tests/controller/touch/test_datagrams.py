@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from controller.touch.contacts import Change, ContactTracker
 from controller.touch.datagrams import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
-from controller.touch.fingers import Change, ContactTracker
 from controller.touch.frames import Touch, TouchFrame
 from controller.touch.reject_counter import RejectCounter
 from controller.touch.tuio import TuioReader, without_superseded

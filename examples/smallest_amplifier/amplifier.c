@@ -240,7 +240,7 @@ static void tick(double now) {
     for (int layer = 0; layer < LAYERS; layer++) {
         Layer *one = &layers[layer];
         if (now >= one->waits_until) {
-            Words words = {one->waiting, one->waiting_words, 0, 0, NO_CHANNEL};
+            Words words = {.word = one->waiting, .count = one->waiting_words};
             read_layer(&words, 1, one->waiting_token, one->waits_until, 1);
         }
         if (now >= one->ends) fade_layer(layer, one->ends, one->ramp / 1000.0, 1);
@@ -272,7 +272,7 @@ static void status(double now) {
 }
 
 static void play(const uint16_t *word, int count, uint16_t token, double now) {
-    Words words = {word, count, 0, 0, NO_CHANNEL};
+    Words words = {.word = word, .count = count};
     while (words.at < count) read_layer(&words, 1, token, now, 0);
     committed = token;
     staged.is_whole = staged.parts = 0;
@@ -308,7 +308,7 @@ static int take_part(const uint16_t *in, int count, double now, int *channel) {
         memcpy(staged.word + staged.words, staged.part[i], length * sizeof *in);
         staged.words += length;
     }
-    Words words = {staged.word, staged.words, 0, 0, NO_CHANNEL};
+    Words words = {.word = staged.word, .count = staged.words, .channel = NO_CHANNEL};
     int seen = 0;
     while (words.at < words.count && !words.code) {
         int layer = staged.word[words.at] >> 7 & 15;
@@ -487,7 +487,7 @@ int main(int argc, char **argv) {
     tcsetattr(line, TCSANOW, &raw);
     for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
     uint8_t data[256];
-    struct pollfd ready = {line, POLLIN, 0};
+    struct pollfd ready = {.fd = line, .events = POLLIN};
     for (;;) {
         poll(&ready, 1, 1);
         struct timespec clock;

@@ -22,6 +22,12 @@ enum object {
     STATUS = 0x2002        // those of GetStatus
 };
 
+uint8_t can_error_register(enum fault fault)
+{
+    static const uint8_t REGISTERS[] = {0x00, 0x11, 0x09, 0x05, 0x03, 0x81, 0x81, 0x01, 0x03};
+    return REGISTERS[fault];
+}
+
 static void put_number(struct can_sdo *into, uint32_t value, uint16_t size)
 {
     for (into->length = 0; into->length < size; into->length++)
@@ -51,7 +57,7 @@ static void put_device(struct can_sdo *into, const struct amplifier *amplifier)
 // Read an object with subindices: its highest one; 0: the object has none.
 static uint16_t read_part(const struct can_node *node, struct can_sdo *into)
 {
-    struct words words = {0};
+    struct words words = {.count = 0};
     bool is_here = into->subindex > 0;
     switch (into->index) {
     case DEVICE:

@@ -23,8 +23,7 @@ enum { HELLO = 1, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP, GET_STATUS,
        PING, GET_ACHIEVED, EVENT = 30, NAK };
 enum { UNKNOWN_TYPE = 1, BAD_LENGTH, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN,
        UNSUPPORTED_VERSION = 8, WRONG_SESSION = 10, WRONG_LATCH, INCOMPLETE };
-enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT };
-enum { WATCHDOG_FAULT = 1 };
+enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT, WATCHDOG_FAULT = 1 };
 enum { FREQUENCY_MIN = 200, FREQUENCY_MAX = 20000, FULL = 10000, RAMP_MAX = 1000 };
 
 typedef struct {
@@ -350,7 +349,8 @@ static int achieved(int layer) {
 }
 
 static int handle(int type, const uint16_t *in, int count, double now, int *channel) {
-    static const int lengths[] = {0, 0, 0, 2, 1, 3, 2, 2, 1, 0, 0, 1, 1, 1}; /* by type */
+    static const int lengths[] = {[ARM] = 2, [DISARM] = 1, [SET] = 3, [COMMIT] = 2, [SILENCE] = 2,
+                                  [STOP] = 1, [CLEAR] = 1, [PING] = 1, [GET_ACHIEVED] = 1};
     if (type < GET_CAPS || type > GET_ACHIEVED) return UNKNOWN_TYPE;
     if (count < lengths[type] || (type != SET && count > lengths[type])) return BAD_LENGTH;
     int feeds = type == ARM || type == SET || type == COMMIT || type == SILENCE || type == PING;

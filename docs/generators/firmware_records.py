@@ -25,7 +25,7 @@ _HEAD = """\
 #include "words.h"
 
 """
-SENT: Mapping[str, Record] = {
+_SENT: Mapping[str, Record] = {
     "capabilities": MESSAGES["GetCaps"].reply,
     "status": MESSAGES["GetStatus"].reply,
     "taken": MESSAGES["Set"].reply,
@@ -37,7 +37,7 @@ SENT: Mapping[str, Record] = {
 _TYPES = {"u16": "uint16_t", "i16": "int16_t", "u32": "uint32_t"}
 
 
-def records_header(sent: Mapping[str, Record] = SENT) -> str:
+def records_header(sent: Mapping[str, Record] = _SENT) -> str:
     """Return the text of the header of records by name."""
     made = [text for name, record in sent.items() for text in _record(name, record)]
     return f"{_HEAD}{''.join(made)}#endif\n"

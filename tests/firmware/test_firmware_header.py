@@ -6,27 +6,34 @@ from pathlib import Path
 
 import pytest
 
-from drivers.protocol.records import Number, Record, WireQuantity
-from firmware_records import SENT, records_header
+from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, WireQuantity
+from firmware_records import records_header
 from installed_program import installed_program
 
 ROOT = Path(__file__).parents[2]
-GROWN = """
+WORD = WireQuantity("word", "u16", 1, "", 0, 0xFFFF)
+SIGNED = WireQuantity("signed", "i16", 1, "", -100, 100)
+LONG = WireQuantity("long", "u32", 1, "", 0, 0xFFFFFFFF)
+MADE_UP = Record(
+    *(Number("first", SIGNED), Bits((("count", 8), ("is_so", 1), ("many", 2)))),
+    *(Numbers("levels", "count", WORD), Rows("pairs", "many", Record(Number("a", LONG)))),
+    Number("behind", LONG),
+)
+PROGRAM = """
 #include "records.h"
 #include <stdio.h>
 int main(void)
 {
-    uint16_t levels[] = {11, 12}, tokens[] = {13};
-    struct wire_status status = {
-        .uptime = 70000, .state = 1, .fault = 2, .flags = 3, .latch = 4, .watchdog_left = 5,
-        .temperature = -100, .voltage = 7, .token = 8, .channels = 2, .layers = 1,
-        .levels = levels, .tokens = tokens,
+    uint16_t levels[] = {11, 12};
+    struct wire_pair pairs[] = {{.a = 13}, {.a = 0x20003}, {.a = 4}};
+    struct wire_made_up made_up = {
+        .behind = 70000, .pairs = pairs, .levels = levels, .many = 3, .count = 2, .first = -100,
     };
     struct words words = {.count = 0};
-    put_status(&words, &status);
+    put_made_up(&words, &made_up);
     for (unsigned i = 0; i < words.count; i++)
         printf("%u ", words.words[i]);
-    printf("%d", STATUS_WORDS(2, 1));
+    printf("%d", MADE_UP_WORDS(2, 3));
 }
 """
 
@@ -42,16 +49,15 @@ def test_header_is_that_of_the_table(program: str, header: str) -> None:
     assert (ROOT / "firmware" / "core" / header).read_text("utf-8") == done.stdout
 
 
-def test_status_that_has_grown_is_sent_by_the_names_of_its_fields(tmp_path: Path) -> None:
-    """A number behind levels and tokens goes there, high word first, and is counted."""
+def test_record_is_sent_by_the_names_of_its_fields(tmp_path: Path) -> None:
+    """In the order of the record, also behind what varies; of two words the high one goes first."""
     compiler = installed_program("cc", package="gcc")
-    uptime = Number("uptime", WireQuantity("uptime", "u32", 1, "s", 0, 0xFFFFFFFF))
-    grown = Record(*SENT["status"].fields, uptime)
-    (tmp_path / "records.h").write_text(records_header({"status": grown}))
-    (tmp_path / "grown.c").write_text(GROWN)
-    program = tmp_path / "grown"
+    (tmp_path / "records.h").write_text(records_header({"made_up": MADE_UP}))
+    (tmp_path / "sent.c").write_text(PROGRAM)
+    program = tmp_path / "sent"
     includes = [f"-I{tmp_path}", f"-I{ROOT / 'firmware' / 'core'}"]
-    command = [compiler, "-std=c99", "-Wall", *includes, "-o", program, tmp_path / "grown.c"]
+    command = [compiler, "-std=c99", "-Wall", *includes, "-o", program, tmp_path / "sent.c"]
     subprocess.run(command, check=True)
-    words = [int(word) for word in subprocess.check_output([program], text=True).split()]
-    assert words == [1, 2, 3, 4, 5, 65436, 7, 8, 513, 11, 12, 13, 1, 4464, 14]
+    *words, count = map(int, subprocess.check_output([program], text=True).split())
+    assert words == [65436, 2 << 3 | 3, 11, 12, 0, 13, 2, 3, 0, 4, 1, 4464]
+    assert count == len(words)

@@ -25,7 +25,7 @@ PROGRAMS: Mapping[tuple[str, ...], Sequence[str]] = {
 """Folders whose files are compiled together, with the options of the compiler."""
 BY_NAME = (
     *("-Dstruct=struct __attribute__((designated_init))", "-Wno-attributes"),
-    "-Werror=designated-init",
+    *("-Werror=designated-init", "-Werror=missing-braces"),  # the first field without its braces
 )
 
 Needs = dict[str, set[str]]
@@ -33,6 +33,10 @@ Needs = dict[str, set[str]]
 
 def problems(root: Path) -> Iterator[str]:
     """Yield what is wrong with the sources of a checkout, with its place."""
+    checked = {root / folder for folders in PROGRAMS for folder in folders}
+    for path in sorted(root.glob("[a-z]*/**/*.[ch]")):
+        if path.parent not in checked and not path.is_relative_to(root / "out"):
+            yield f"{path.relative_to(root)}: its folder must be one of PROGRAMS"
     for folders, options in PROGRAMS.items():
         paths = [path for each in folders for path in sorted((root / each).glob("*.[ch]"))]
         command = ["gcc", "-O0", *options, *BY_NAME, *(f"-I{root / each}" for each in folders)]

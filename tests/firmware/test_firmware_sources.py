@@ -34,8 +34,9 @@ def test_sources_pass() -> None:
         ({"a.c": f"{PAIR}all[] = {{{{.a = 1}}, {{3}}}};"}, "firmware/core/a.c:2:"),
         ({"a.h": '#include "b.h"', "b.h": "int b;", "b.c": '#include "a.h"'}, "a < b < a"),
         ({"a.c": "int b(void); int a(void) { return b(); }"}, "a < b < a"),
+        ({"../a.c": ""}, "firmware/a.c: its folder"),
     ],
-    ids=["by position", "within", "circle of headers", "circle of uses"],
+    ids=["by position", "within", "circle of headers", "circle of uses", "elsewhere"],
 )
 def test_what_is_wrong_is_found(sources: Mapping[str, str], place: str, tmp_path: Path) -> None:
     """An initialiser by position, and a circle of what files include or use of each other."""

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 
+from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Record
 from drivers.protocol.table import (
     COMMAND,
@@ -71,6 +72,7 @@ def header() -> str:
         _enum("", "FEATURE_", {name: 1 << bit for name, bit in FEATURES.items()}),
         _block("enum", *_places(), *_rows()),
         _requests(),
+        _emergencies(),
         "#endif\n",
     ]
     return "\n".join(part for part in parts if part)
@@ -185,6 +187,17 @@ def _words(record: Record) -> Iterator[str]:
             yield f"WITHIN({field.quantity.minimum},~{field.quantity.maximum},~{code})"
         elif isinstance(field, Bits):
             yield f"WITHIN(0,~{_most(field)},~BAD_VALUE)"
+
+
+def _emergencies() -> str:
+    """Return the rows of a table: what a CANopen node says of each fault."""
+    rows = [
+        f"    [FAULT_{name}] = {{.code = 0x{each['code']:04X}, "
+        f".error_register = 0x{each['error_register']:02X}}},"
+        for name, each in CANOPEN["emergencies"].items()
+    ]
+    head = "// Of each fault: code of the emergency, and the error register meanwhile (CiA 301).\n"
+    return f"{head}#define EMERGENCY_TABLE {''.join(f' {_BREAK}{row}' for row in rows).lstrip()}\n"
 
 
 if __name__ == "__main__":

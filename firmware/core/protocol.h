@@ -125,4 +125,16 @@ enum {
         WITHIN(1, 10000, BAD_VALUE), WITHIN(1, 16, BAD_VALUE)}}, \
     [MESSAGE_GET_READING] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}},
 
+// Of each fault: code of the emergency, and the error register meanwhile (CiA 301).
+#define EMERGENCY_TABLE \
+    [FAULT_NONE] = {.code = 0x0000, .error_register = 0x00}, \
+    [FAULT_WATCHDOG] = {.code = 0x8130, .error_register = 0x11}, \
+    [FAULT_OVER_TEMPERATURE] = {.code = 0x4310, .error_register = 0x09}, \
+    [FAULT_OVER_VOLTAGE] = {.code = 0x3310, .error_register = 0x05}, \
+    [FAULT_ARC] = {.code = 0x2340, .error_register = 0x03}, \
+    [FAULT_CHANNEL] = {.code = 0xFF01, .error_register = 0x81}, \
+    [FAULT_INTERNAL] = {.code = 0x6100, .error_register = 0x81}, \
+    [FAULT_INTERLOCK] = {.code = 0x9000, .error_register = 0x01}, \
+    [FAULT_OVER_CURRENT] = {.code = 0x2310, .error_register = 0x03},
+
 #endif

@@ -25,6 +25,12 @@ struct can_frame {
     uint8_t data[8];
 };
 
+// What is said of a fault.
+struct can_emergency {
+    uint16_t code;
+    uint8_t error_register;
+};
+
 #define SEGMENT_FIRST 2 // words of frame 0, behind type and count
 #define SEGMENT_EACH 3  // of the others
 #define SEGMENTS_MAX (1 + (WORDS_MAX - SEGMENT_FIRST + SEGMENT_EACH - 1) / SEGMENT_EACH)
@@ -88,7 +94,7 @@ static inline void can_send(struct can_node *node, uint16_t function, const uint
 
 void can_send_message(struct can_node *node, uint8_t number, uint8_t type,
                       const struct words *words);
-uint8_t can_error_register(enum fault fault);
+struct can_emergency can_emergency(enum fault fault);
 void can_sdo_receive(struct can_node *node, const uint8_t request[8]);
 // Abort codes, or 0.
 uint32_t can_read_object(const struct can_node *node, struct can_sdo *into);

@@ -45,13 +45,6 @@ void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number
     boot(node);
 }
 
-static uint16_t error_code(enum fault fault)
-{
-    static const uint16_t CODES[] = {0x0000, 0x8130, 0x4310, 0x3310, 0x2340,
-                                     0xFF01, 0x6100, 0x9000, 0x2310};
-    return CODES[fault];
-}
-
 void can_event(struct can_node *node, const struct wire_event *event)
 {
     struct words words = {.count = 0};
@@ -61,8 +54,9 @@ void can_event(struct can_node *node, const struct wire_event *event)
     if (node->nmt == NMT_OPERATIONAL)
         can_send_message(node, 0, MESSAGE_EVENT, &words);
     if ((is_faulty || node->was_faulty) && node->nmt != NMT_STOPPED) {
-        uint16_t code = error_code(fault);
-        uint8_t data[8] = {(uint8_t)code, (uint8_t)(code >> 8), can_error_register(fault),
+        struct can_emergency emergency = can_emergency(fault);
+        uint8_t data[8] = {(uint8_t)emergency.code, (uint8_t)(emergency.code >> 8),
+                           emergency.error_register,
                            (uint8_t)(event->state | event->fault << 4), (uint8_t)event->channel};
         can_send(node, EMERGENCY, data, 8);
     }

@@ -22,10 +22,10 @@ enum object {
     STATUS = 0x2002        // those of GetStatus
 };
 
-uint8_t can_error_register(enum fault fault)
+struct can_emergency can_emergency(enum fault fault)
 {
-    static const uint8_t REGISTERS[] = {0x00, 0x11, 0x09, 0x05, 0x03, 0x81, 0x81, 0x01, 0x03};
-    return REGISTERS[fault];
+    static const struct can_emergency EMERGENCIES[] = {EMERGENCY_TABLE};
+    return EMERGENCIES[fault];
 }
 
 static void put_number(struct can_sdo *into, uint32_t value, uint16_t size)
@@ -89,7 +89,7 @@ static uint32_t read_whole(const struct can_node *node, struct can_sdo *into)
         put_number(into, 0, 4);
         break;
     case ERROR_REGISTER:
-        put_number(into, can_error_register(node->amplifier->fault), 1);
+        put_number(into, can_emergency(node->amplifier->fault).error_register, 1);
         break;
     case EMERGENCY_ID:
         put_number(into, 0x80u + node->number, 4);

@@ -54,10 +54,8 @@ def test_record_is_sent_by_the_names_of_its_fields(tmp_path: Path) -> None:
     compiler = installed_program("cc", package="gcc")
     (tmp_path / "records.h").write_text(records_header({"made_up": MADE_UP}))
     (tmp_path / "sent.c").write_text(PROGRAM)
-    program = tmp_path / "sent"
-    includes = [f"-I{tmp_path}", f"-I{ROOT / 'firmware' / 'core'}"]
-    command = [compiler, "-std=c99", "-Wall", *includes, "-o", program, tmp_path / "sent.c"]
-    subprocess.run(command, check=True)
-    *words, count = map(int, subprocess.check_output([program], text=True).split())
+    options = ("-std=c99", "-Wall", f"-I{tmp_path}", f"-I{ROOT / 'firmware' / 'core'}")
+    subprocess.run([compiler, *options, "sent.c"], cwd=tmp_path, check=True)
+    *words, count = map(int, subprocess.check_output([tmp_path / "a.out"], text=True).split())
     assert words == [65436, 2 << 3 | 3, 11, 12, 0, 13, 2, 3, 0, 4, 1, 4464]
     assert count == len(words)

@@ -16,8 +16,8 @@ PAIR = "struct pair { int a, b; };\nstruct pair "
 def problems(root: Path) -> list[str]:
     """What the check of sources finds in a checkout."""
     installed_program("gcc", package="gcc")
-    program = ROOT / "firmware" / "test" / "sources.py"
-    done = subprocess.run([sys.executable, program, root], capture_output=True, text=True)
+    command = [sys.executable, ROOT / "firmware" / "test" / "sources.py", root]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == bool(done.stdout.strip()), done.stderr
     return done.stdout.splitlines()
 
@@ -45,6 +45,4 @@ def test_what_is_wrong_is_found(sources: Mapping[str, str], place: str, tmp_path
     (folder / "b.c").write_text("int a(void); int b(void) { return a(); }")
     for name, text in sources.items():
         (folder / name).write_text(text)
-    found = problems(tmp_path)
-    assert found
-    assert place in found[0]
+    assert place in problems(tmp_path)[0]

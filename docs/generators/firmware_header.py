@@ -9,7 +9,6 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Record
 from drivers.protocol.table import (
     COMMAND,
@@ -31,6 +30,7 @@ from drivers.protocol.table import (
     VERSION,
     Message,
 )
+from drivers.wires.can_bus.canopen import CANOPEN
 
 _HEAD = """\
 // SPDX-License-Identifier: MIT

@@ -1,7 +1,7 @@
 """Print the C header of protocol 3: `firmware_header.py > firmware/core/protocol.h`.
 
 Numbers of states, faults, refusals and messages, ranges of quantities, the place of each field in
-the words of a record, and what the words of each request may be.
+the words of a request, and what those words may be. Replies: `firmware_records.py`.
 """
 
 import re
@@ -9,21 +9,17 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from drivers.protocol.records import Bits, Number, Real, Record
+from drivers.protocol.records import Bits, Number, Record
 from drivers.protocol.table import (
     COMMAND,
-    ENVELOPE,
     EVENT,
-    EVENT_RECORD,
     FAULTS,
     FEATURES,
     HELLO,
-    KNOT,
     LAYER,
     MAX_WORDS,
     MESSAGES,
     NAK,
-    NAK_RECORD,
     NO_CHANNEL,
     QUANTITIES,
     REFUSALS,
@@ -32,16 +28,17 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
     VERSION,
+    Message,
 )
+from drivers.wires.can_bus.canopen import CANOPEN
 
 _HEAD = """\
 // SPDX-License-Identifier: MIT
 //
 // Protocol 3 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
-// row of 16-bit words (docs/decisions/0061-protocol-3.md). RECORD_FIELD is the place of a field in
-// the words of a record, RECORD_WORDS their number without what varies; small fields share the word
-// RECORD_BITS, out of which FIELD_OF takes one. Ranges of quantities are those of the wire, 0 to
-// 65535 where nothing is said.
+// row of 16-bit words (docs/decisions/0061-protocol-3.md). REQUEST_FIELD is the place of a field in
+// the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
+// quantities are those of the wire, 0 to 65535 where nothing is said. Replies are in records.h.
 
 #ifndef PROTOCOL_H
 #define PROTOCOL_H
@@ -51,17 +48,15 @@ _HEAD = """\
 
 #define FIELD_OF(bits, field) ((bits) >> field##_SHIFT & field##_MASK)
 """
-_RECORDS: Mapping[str, Record] = {
-    **{message.name: message.request for message in MESSAGES.values()},
-    "Capabilities": MESSAGES["GetCaps"].reply,
-    "Status": MESSAGES["GetStatus"].reply,
-    "Taken": MESSAGES["Set"].reply,
-    "Faults": MESSAGES["GetFaults"].reply,
-    "Achieved": MESSAGES["GetAchieved"].reply,
-    **{"Event": EVENT_RECORD, "Nak": NAK_RECORD},
-    **{"Layer": LAYER, "Command": COMMAND, "EnvelopeHead": ENVELOPE, "Knot": KNOT},
-}
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}  # of words out of range, by quantity
+_BREAK = "\\\n"
+_TABLE = """\
+// Each request: whether it may be a broadcast, feeds the watchdog and so names its session where,
+// has words behind its fields; how many fields; lowest and highest value of each, and how others
+// are refused.
+#define REQUEST_FIELDS_MAX {most}
+#define WITHIN(lowest, highest, code) {{.low = lowest, .high = highest, .nak = NAK_##code}}
+#define REQUEST_TABLE"""
 
 
 def header() -> str:
@@ -75,8 +70,9 @@ def header() -> str:
         _enum("message", "MESSAGE_", _messages()),
         _enum("", "FLAG_", {name: 1 << bit for name, bit in STATUS_FLAGS.items()}),
         _enum("", "FEATURE_", {name: 1 << bit for name, bit in FEATURES.items()}),
-        _block("enum", *(_layout(name, record) for name, record in _RECORDS.items())),
+        _block("enum", *_places(), *_rows()),
         _requests(),
+        _emergencies(),
         "#endif\n",
     ]
     return "\n".join(part for part in parts if part)
@@ -123,59 +119,85 @@ def _numbers(prefix: str, values: Mapping[str, int]) -> str:
     return f"{lines},\n".replace("_=_", " = ")
 
 
-def _layout(name: str, record: Record) -> str:
-    """Return the places of the fields of a record up to the first of variable length."""
-    places, bits, at = dict[str, int](), dict[str, int](), 0
+def _places() -> Iterator[str]:
+    """Return the places of the fields of each request up to the first of variable length."""
+    for message in MESSAGES.values():
+        places, at = dict[str, int](), 0
+        for field in message.request.fields:
+            places["BITS" if isinstance(field, Bits) else field.name] = at
+            if not isinstance(field, Number | Bits):
+                break
+            at += 2 if isinstance(field, Number) and field.quantity.wire == "u32" else 1
+        if places:
+            yield _numbers(f"{_upper(message.name)}_", {**places, **_shared(message.request)})
+
+
+def _rows() -> Iterator[str]:
+    """Return what the words of a set are made of that several fields share."""
+    yield _numbers("LAYER_", _shared(LAYER))
+    yield _numbers("COMMAND_", _shared(COMMAND))
+
+
+def _shared(record: Record) -> dict[str, int]:
+    """Return shift and mask of each field that shares a word, and the largest such word."""
+    numbers = dict[str, int]()
     for field in record.fields:
-        places["BITS" if isinstance(field, Bits) else field.name] = at
         if isinstance(field, Bits):
-            bits = _bits(field)
-            at += 1
-        elif isinstance(field, Number):
-            at += 2 if field.quantity.wire == "u32" else 1
-        elif isinstance(field, Real):
-            at += 2
-        else:
-            break
-    return _numbers(f"{_upper(name)}_", {**places, "WORDS": at, **bits}) if places else ""
+            for (name, width), shift in zip(field.parts, field.shifts, strict=True):
+                numbers[f"{name}_SHIFT"], numbers[f"{name}_MASK"] = shift, (1 << width) - 1
+            numbers["BITS_MAX"] = _most(field)
+    return numbers
 
 
-def _bits(field: Bits) -> dict[str, int]:
-    places, shift = dict[str, int](), sum(width for _, width in field.parts)
-    for name, width in field.parts:
-        shift -= width
-        places[f"{name}_SHIFT"], places[f"{name}_MASK"] = shift, (1 << width) - 1
-    return places
+def _most(field: Bits) -> int:
+    return (1 << sum(width for _, width in field.parts)) - 1
 
 
 def _requests() -> str:
     """Return the rows of a table: what the words of each request may be."""
-    rows = []
-    for message in MESSAGES.values():
-        fields = [*_fields(message.request)]
-        has_tail = len(fields) < len(message.request.fields)
-        flags = (message.is_broadcast, message.feeds, has_tail)
-        shown = [str(flag).lower() for flag in flags]
-        rows.append(
-            f"    [{message.number}] = {{{', '.join(shown)}, {len(fields)}, "
-            f"{{{', '.join(fields) or '{0, 0, 0}'}}}}},"
-        )
-    return (
-        "// Each request: whether it may be a broadcast, feeds the watchdog, has words behind its\n"
-        "// fields; how many fields; lowest and highest value of each, and the number with which\n"
-        "// others are refused.\n"
-        "#define REQUEST_TABLE \\\n" + " \\\n".join(rows) + "\n"
-    )
+    lines = [line for message in MESSAGES.values() for line in _request(message)]
+    most = max(len([*_words(message.request)]) for message in MESSAGES.values())
+    return f"{_TABLE.format(most=most)}{''.join(f' {_BREAK}{line}' for line in lines)}\n"
 
 
-def _fields(record: Record) -> Iterator[str]:
+def _request(message: Message) -> Iterator[str]:
+    """Return the lines of a request: what is not 0 of it."""
+    name, words = _upper(message.name), [*_words(message.request)]
+    stated = {
+        "is_broadcast": message.is_broadcast,
+        "feeds": message.feeds,
+        "has_tail": len(words) < len(message.request.fields),
+    }
+    named = [f".{key} = true" for key, is_so in stated.items() if is_so]
+    if message.feeds:
+        named.append(f".session = {name}_SESSION")
+    named.append(f".fields = {len(words)}")
+    if words:
+        named.append(f".field = {{{', '.join(words)}}}")
+    text = f"[MESSAGE_{name}] = {{{', '.join(named)}}},".replace(" = ", "~=~")
+    for line in textwrap.wrap(text, 97, initial_indent=" " * 4, subsequent_indent=" " * 8):
+        yield line.replace("~", " ")
+
+
+def _words(record: Record) -> Iterator[str]:
+    """Return the range of each word of a request, and how others are refused; ~: no line ends."""
     for field in record.fields:
         if isinstance(field, Number):
-            code = REFUSALS[_CODES.get(field.quantity.name, "BAD_VALUE")]
-            yield f"{{{field.quantity.minimum}, {field.quantity.maximum}, {code}}}"
+            code = _CODES.get(field.quantity.name, "BAD_VALUE")
+            yield f"WITHIN({field.quantity.minimum},~{field.quantity.maximum},~{code})"
         elif isinstance(field, Bits):
-            width = sum(width for _, width in field.parts)
-            yield f"{{0, {(1 << width) - 1}, {REFUSALS['BAD_VALUE']}}}"
+            yield f"WITHIN(0,~{_most(field)},~BAD_VALUE)"
+
+
+def _emergencies() -> str:
+    """Return the rows of a table: what a CANopen node says of each fault."""
+    rows = [
+        f"    [FAULT_{name}] = {{.code = 0x{each['code']:04X}, "
+        f".error_register = 0x{each['error_register']:02X}}},"
+        for name, each in CANOPEN["emergencies"].items()
+    ]
+    head = "// Of each fault: code of the emergency, and the error register meanwhile (CiA 301).\n"
+    return f"{head}#define EMERGENCY_TABLE {''.join(f' {_BREAK}{row}' for row in rows).lstrip()}\n"
 
 
 if __name__ == "__main__":

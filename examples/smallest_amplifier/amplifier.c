@@ -23,8 +23,7 @@ enum { HELLO = 1, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP, GET_STATUS,
        PING, GET_ACHIEVED, EVENT = 30, NAK };
 enum { UNKNOWN_TYPE = 1, BAD_LENGTH, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN,
        UNSUPPORTED_VERSION = 8, WRONG_SESSION = 10, WRONG_LATCH, INCOMPLETE };
-enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT };
-enum { WATCHDOG_FAULT = 1 };
+enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT, WATCHDOG_FAULT = 1 };
 enum { FREQUENCY_MIN = 200, FREQUENCY_MAX = 20000, FULL = 10000, RAMP_MAX = 1000 };
 
 typedef struct {
@@ -240,7 +239,7 @@ static void tick(double now) {
     for (int layer = 0; layer < LAYERS; layer++) {
         Layer *one = &layers[layer];
         if (now >= one->waits_until) {
-            Words words = {one->waiting, one->waiting_words, 0, 0, NO_CHANNEL};
+            Words words = {.word = one->waiting, .count = one->waiting_words};
             read_layer(&words, 1, one->waiting_token, one->waits_until, 1);
         }
         if (now >= one->ends) fade_layer(layer, one->ends, one->ramp / 1000.0, 1);
@@ -272,7 +271,7 @@ static void status(double now) {
 }
 
 static void play(const uint16_t *word, int count, uint16_t token, double now) {
-    Words words = {word, count, 0, 0, NO_CHANNEL};
+    Words words = {.word = word, .count = count};
     while (words.at < count) read_layer(&words, 1, token, now, 0);
     committed = token;
     staged.is_whole = staged.parts = 0;
@@ -308,7 +307,7 @@ static int take_part(const uint16_t *in, int count, double now, int *channel) {
         memcpy(staged.word + staged.words, staged.part[i], length * sizeof *in);
         staged.words += length;
     }
-    Words words = {staged.word, staged.words, 0, 0, NO_CHANNEL};
+    Words words = {.word = staged.word, .count = staged.words, .channel = NO_CHANNEL};
     int seen = 0;
     while (words.at < words.count && !words.code) {
         int layer = staged.word[words.at] >> 7 & 15;
@@ -350,7 +349,8 @@ static int achieved(int layer) {
 }
 
 static int handle(int type, const uint16_t *in, int count, double now, int *channel) {
-    static const int lengths[] = {0, 0, 0, 2, 1, 3, 2, 2, 1, 0, 0, 1, 1, 1}; /* by type */
+    static const int lengths[] = {[ARM] = 2, [DISARM] = 1, [SET] = 3, [COMMIT] = 2, [SILENCE] = 2,
+                                  [STOP] = 1, [CLEAR] = 1, [PING] = 1, [GET_ACHIEVED] = 1};
     if (type < GET_CAPS || type > GET_ACHIEVED) return UNKNOWN_TYPE;
     if (count < lengths[type] || (type != SET && count > lengths[type])) return BAD_LENGTH;
     int feeds = type == ARM || type == SET || type == COMMIT || type == SILENCE || type == PING;
@@ -487,7 +487,7 @@ int main(int argc, char **argv) {
     tcsetattr(line, TCSANOW, &raw);
     for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
     uint8_t data[256];
-    struct pollfd ready = {line, POLLIN, 0};
+    struct pollfd ready = {.fd = line, .events = POLLIN};
     for (;;) {
         poll(&ready, 1, 1);
         struct timespec clock;

@@ -11,6 +11,7 @@
 #define AMPLIFIER_H
 
 #include "channel.h"
+#include "records.h"
 
 struct layer {
     uint16_t token, ramp, valid_for; // of the set that plays
@@ -41,8 +42,8 @@ struct measured {
 };
 
 struct amplifier;
-// Called with the words of an Event, at every change of state.
-typedef void amplifier_notify(const struct amplifier *amplifier, const struct words *event);
+// Called at every change of state.
+typedef void amplifier_notify(const struct amplifier *amplifier, const struct wire_event *event);
 
 struct amplifier {
     const char *serial_number; // at most 32 bytes
@@ -102,7 +103,11 @@ void amplifier_feed(struct amplifier *amplifier);
 void amplifier_play(struct amplifier *amplifier);
 
 // Time of the next sample [us].
-uint64_t amplifier_now(const struct amplifier *amplifier);
+static inline uint64_t amplifier_now(const struct amplifier *amplifier)
+{
+    return amplifier->now + (amplifier->sample - amplifier->now_at) * 1000000 / SAMPLE_RATE;
+}
+
 // Token of a layer that plays, 0 of a silent one.
 uint16_t amplifier_token(const struct amplifier *amplifier, uint8_t layer);
 // Milliseconds that the watchdog has left, rounded.

@@ -73,7 +73,7 @@ static void wait(struct layer *layer, struct layer_head head, const uint16_t *wo
 void amplifier_play(struct amplifier *amplifier)
 {
     struct intake *intake = &amplifier->intake;
-    struct reader reader = {intake->words, intake->count, NAK_NONE, NO_CHANNEL};
+    struct reader reader = reader_of(intake->words, intake->count);
     while (reader.left > 0 && reader.nak == NAK_NONE) {
         const uint16_t *words = reader.at;
         struct layer_head head = read_layer(&reader);
@@ -105,7 +105,7 @@ void layers_sample(struct amplifier *amplifier)
         struct layer *layer = &amplifier->layers[i];
         bool has_ended = timer_sample(&layer->ends);
         if (layer->waits > 0 && --layer->waits == 0) {
-            struct reader reader = {layer->waiting, layer->waiting_count, NAK_NONE, NO_CHANNEL};
+            struct reader reader = reader_of(layer->waiting, layer->waiting_count);
             struct layer_head head = read_layer(&reader);
             start(amplifier, head, &reader, layer->waiting_token);
         } else if (has_ended) {

@@ -29,7 +29,7 @@ static void send_can(const struct can_frame *frame)
         board_write(LINE_CAN, (const uint8_t *)line, length);
 }
 
-static void notify(const struct amplifier *changed, const struct words *event)
+static void notify(const struct amplifier *changed, const struct wire_event *event)
 {
     uint8_t line[SERIAL_STUFFED_MAX + 2];
     (void)changed;
@@ -55,8 +55,11 @@ void loop_init(void)
 
 static void measure(void)
 {
-    struct measured measured = {board_temperature(), board_voltage(), board_interlock_open(),
-                                FAULT_NONE, NO_CHANNEL};
+    struct measured measured = {
+        .temperature = board_temperature(),
+        .voltage = board_voltage(),
+        .is_interlock_open = board_interlock_open(),
+    };
     measured.cause = board_fault(&measured.channel);
     amplifier_measured(&amplifier, measured);
 }

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: MIT
 //
 // Protocol 3 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
-// row of 16-bit words (docs/decisions/0061-protocol-3.md). RECORD_FIELD is the place of a field in
-// the words of a record, RECORD_WORDS their number without what varies; small fields share the word
-// RECORD_BITS, out of which FIELD_OF takes one. Ranges of quantities are those of the wire, 0 to
-// 65535 where nothing is said.
+// row of 16-bit words (docs/decisions/0061-protocol-3.md). REQUEST_FIELD is the place of a field in
+// the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
+// quantities are those of the wire, 0 to 65535 where nothing is said. Replies are in records.h.
 
 #ifndef PROTOCOL_H
 #define PROTOCOL_H
@@ -70,76 +69,72 @@ enum {
 };
 
 enum {
-    ARM_SESSION = 0, ARM_WATCHDOG = 1, ARM_WORDS = 2,
-    DISARM_RAMP = 0, DISARM_WORDS = 1,
-    SET_SESSION = 0, SET_TOKEN = 1, SET_BITS = 2, SET_STREAM = 3, SET_WORDS = 3,
-    SET_INDEX_SHIFT = 8, SET_INDEX_MASK = 255, SET_PARTS_SHIFT = 1, SET_PARTS_MASK = 127,
-    SET_NOW_SHIFT = 0, SET_NOW_MASK = 1,
-    COMMIT_SESSION = 0, COMMIT_TOKEN = 1, COMMIT_WORDS = 2,
-    SILENCE_SESSION = 0, SILENCE_RAMP = 1, SILENCE_WORDS = 2,
-    STOP_RAMP = 0, STOP_WORDS = 1,
-    CLEAR_LATCH = 0, CLEAR_WORDS = 1,
-    PING_SESSION = 0, PING_WORDS = 1,
-    GET_ACHIEVED_LAYER = 0, GET_ACHIEVED_WORDS = 1,
-    SET_ADDRESS_ADDRESS = 0, SET_ADDRESS_SERIAL_NUMBER = 1, SET_ADDRESS_WORDS = 1,
-    GET_SENSORS_FIRST = 0, GET_SENSORS_WORDS = 1,
+    ARM_SESSION = 0, ARM_WATCHDOG = 1,
+    DISARM_RAMP = 0,
+    SET_SESSION = 0, SET_TOKEN = 1, SET_BITS = 2, SET_STREAM = 3, SET_INDEX_SHIFT = 8,
+    SET_INDEX_MASK = 255, SET_PARTS_SHIFT = 1, SET_PARTS_MASK = 127, SET_NOW_SHIFT = 0,
+    SET_NOW_MASK = 1, SET_BITS_MAX = 65535,
+    COMMIT_SESSION = 0, COMMIT_TOKEN = 1,
+    SILENCE_SESSION = 0, SILENCE_RAMP = 1,
+    STOP_RAMP = 0,
+    CLEAR_LATCH = 0,
+    PING_SESSION = 0,
+    GET_ACHIEVED_LAYER = 0,
+    SET_ADDRESS_ADDRESS = 0, SET_ADDRESS_SERIAL_NUMBER = 1,
+    GET_SENSORS_FIRST = 0,
     MEASURE_READING = 0, MEASURE_WINDOW = 1, MEASURE_TONES = 2, MEASURE_FREQUENCIES = 3,
-    MEASURE_WORDS = 3,
-    GET_READING_FIRST = 0, GET_READING_WORDS = 1,
-    CAPABILITIES_CHANNELS = 0, CAPABILITIES_LAYERS = 1, CAPABILITIES_VOICES = 2,
-    CAPABILITIES_SET_WORDS = 3, CAPABILITIES_KNOTS = 4, CAPABILITIES_FEATURES = 5,
-    CAPABILITIES_FREQUENCY_MIN = 6, CAPABILITIES_FREQUENCY_MAX = 7,
-    CAPABILITIES_FREQUENCY_STEP = 8, CAPABILITIES_LEVEL_MAX = 9, CAPABILITIES_LEVEL_STEP = 10,
-    CAPABILITIES_PHASE_STEP = 11, CAPABILITIES_RAMP_MAX = 12, CAPABILITIES_SLEW = 13,
-    CAPABILITIES_WATCHDOG_MIN = 14, CAPABILITIES_WATCHDOG_MAX = 15,
-    CAPABILITIES_ENVELOPE_STEP_MIN = 16, CAPABILITIES_ENVELOPE_STEP_MAX = 17,
-    CAPABILITIES_LIMITS = 18, CAPABILITIES_WORDS = 18,
-    STATUS_STATE = 0, STATUS_FAULT = 1, STATUS_FLAGS = 2, STATUS_LATCH = 3,
-    STATUS_WATCHDOG_LEFT = 4, STATUS_TEMPERATURE = 5, STATUS_VOLTAGE = 6, STATUS_TOKEN = 7,
-    STATUS_BITS = 8, STATUS_LEVELS = 9, STATUS_WORDS = 9, STATUS_CHANNELS_SHIFT = 8,
-    STATUS_CHANNELS_MASK = 255, STATUS_LAYERS_SHIFT = 0, STATUS_LAYERS_MASK = 255,
-    TAKEN_TOKEN = 0, TAKEN_BITS = 1, TAKEN_MISSING = 2, TAKEN_WORDS = 3, TAKEN_EXACT_SHIFT = 2,
-    TAKEN_EXACT_MASK = 1, TAKEN_STAGED_SHIFT = 1, TAKEN_STAGED_MASK = 1, TAKEN_PLAYED_SHIFT = 0,
-    TAKEN_PLAYED_MASK = 1,
-    FAULTS_COUNT = 0, FAULTS_FAULTS = 1, FAULTS_WORDS = 1,
-    ACHIEVED_TOKEN = 0, ACHIEVED_BITS = 1, ACHIEVED_RAMP = 2, ACHIEVED_VALID_FOR = 3,
-    ACHIEVED_COMMANDS = 4, ACHIEVED_WORDS = 4, ACHIEVED_LAYER_SHIFT = 7, ACHIEVED_LAYER_MASK = 15,
-    ACHIEVED_AFTER_SHIFT = 6, ACHIEVED_AFTER_MASK = 1, ACHIEVED_RENEW_SHIFT = 5,
-    ACHIEVED_RENEW_MASK = 1, ACHIEVED_COUNT_SHIFT = 0, ACHIEVED_COUNT_MASK = 31,
-    EVENT_STATE = 0, EVENT_FAULT = 1, EVENT_CHANNEL = 2, EVENT_LATCH = 3, EVENT_WORDS = 4,
-    NAK_REQUEST = 0, NAK_CODE = 1, NAK_CHANNEL = 2, NAK_WORDS = 3,
-    LAYER_BITS = 0, LAYER_RAMP = 1, LAYER_VALID_FOR = 2, LAYER_WORDS = 3, LAYER_LAYER_SHIFT = 7,
-    LAYER_LAYER_MASK = 15, LAYER_AFTER_SHIFT = 6, LAYER_AFTER_MASK = 1, LAYER_RENEW_SHIFT = 5,
-    LAYER_RENEW_MASK = 1, LAYER_COUNT_SHIFT = 0, LAYER_COUNT_MASK = 31,
-    COMMAND_BITS = 0, COMMAND_FREQUENCY = 1, COMMAND_LEVEL = 2, COMMAND_PHASE = 3,
-    COMMAND_WORDS = 4, COMMAND_CHANNEL_SHIFT = 4, COMMAND_CHANNEL_MASK = 15,
-    COMMAND_KEEP_PHASE_SHIFT = 3, COMMAND_KEEP_PHASE_MASK = 1, COMMAND_SKIP_ENDING_SHIFT = 2,
-    COMMAND_SKIP_ENDING_MASK = 1, COMMAND_ONSET_SHIFT = 1, COMMAND_ONSET_MASK = 1,
-    COMMAND_ENDING_SHIFT = 0, COMMAND_ENDING_MASK = 1,
-    ENVELOPE_HEAD_KNOTS = 0, ENVELOPE_HEAD_STEP = 1, ENVELOPE_HEAD_WORDS = 2,
-    KNOT_LEVEL = 0, KNOT_PHASE = 1, KNOT_WORDS = 2,
+    GET_READING_FIRST = 0,
+    LAYER_LAYER_SHIFT = 7, LAYER_LAYER_MASK = 15, LAYER_AFTER_SHIFT = 6, LAYER_AFTER_MASK = 1,
+    LAYER_RENEW_SHIFT = 5, LAYER_RENEW_MASK = 1, LAYER_COUNT_SHIFT = 0, LAYER_COUNT_MASK = 31,
+    LAYER_BITS_MAX = 2047,
+    COMMAND_CHANNEL_SHIFT = 4, COMMAND_CHANNEL_MASK = 15, COMMAND_KEEP_PHASE_SHIFT = 3,
+    COMMAND_KEEP_PHASE_MASK = 1, COMMAND_SKIP_ENDING_SHIFT = 2, COMMAND_SKIP_ENDING_MASK = 1,
+    COMMAND_ONSET_SHIFT = 1, COMMAND_ONSET_MASK = 1, COMMAND_ENDING_SHIFT = 0,
+    COMMAND_ENDING_MASK = 1, COMMAND_BITS_MAX = 255,
 };
 
-// Each request: whether it may be a broadcast, feeds the watchdog, has words behind its
-// fields; how many fields; lowest and highest value of each, and the number with which
-// others are refused.
+// Each request: whether it may be a broadcast, feeds the watchdog and so names its session where,
+// has words behind its fields; how many fields; lowest and highest value of each, and how others
+// are refused.
+#define REQUEST_FIELDS_MAX 3
+#define WITHIN(lowest, highest, code) {.low = lowest, .high = highest, .nak = NAK_##code}
 #define REQUEST_TABLE \
-    [2] = {false, false, false, 0, {{0, 0, 0}}}, \
-    [3] = {false, true, false, 2, {{1, 65535, 3}, {100, 2000, 3}}}, \
-    [4] = {false, false, false, 1, {{0, 65535, 3}}}, \
-    [5] = {false, true, true, 3, {{1, 65535, 3}, {1, 65535, 6}, {0, 65535, 3}}}, \
-    [6] = {true, true, false, 2, {{1, 65535, 3}, {1, 65535, 6}}}, \
-    [7] = {false, true, false, 2, {{1, 65535, 3}, {0, 1000, 3}}}, \
-    [8] = {true, false, false, 1, {{0, 65535, 3}}}, \
-    [9] = {false, false, false, 0, {{0, 0, 0}}}, \
-    [10] = {false, false, false, 0, {{0, 0, 0}}}, \
-    [11] = {false, false, false, 1, {{0, 65535, 3}}}, \
-    [12] = {false, true, false, 1, {{1, 65535, 3}}}, \
-    [13] = {false, false, false, 1, {{0, 15, 3}}}, \
-    [14] = {false, false, false, 0, {{0, 0, 0}}}, \
-    [15] = {true, false, true, 1, {{1, 247, 3}}}, \
-    [16] = {false, false, false, 1, {{0, 31, 3}}}, \
-    [17] = {false, false, true, 3, {{1, 65535, 3}, {1, 10000, 3}, {1, 16, 3}}}, \
-    [18] = {false, false, false, 1, {{0, 31, 3}}},
+    [MESSAGE_GET_CAPS] = {.fields = 0}, \
+    [MESSAGE_ARM] = {.feeds = true, .session = ARM_SESSION, .fields = 2, \
+        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(100, 2000, BAD_VALUE)}}, \
+    [MESSAGE_DISARM] = {.fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
+    [MESSAGE_SET] = {.feeds = true, .has_tail = true, .session = SET_SESSION, .fields = 3, \
+        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(1, 65535, BAD_TOKEN), \
+        WITHIN(0, 65535, BAD_VALUE)}}, \
+    [MESSAGE_COMMIT] = {.is_broadcast = true, .feeds = true, .session = COMMIT_SESSION, \
+        .fields = 2, .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(1, 65535, BAD_TOKEN)}}, \
+    [MESSAGE_SILENCE] = {.feeds = true, .session = SILENCE_SESSION, .fields = 2, \
+        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(0, 1000, BAD_VALUE)}}, \
+    [MESSAGE_STOP] = {.is_broadcast = true, .fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
+    [MESSAGE_GET_STATUS] = {.fields = 0}, \
+    [MESSAGE_GET_FAULTS] = {.fields = 0}, \
+    [MESSAGE_CLEAR] = {.fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
+    [MESSAGE_PING] = {.feeds = true, .session = PING_SESSION, .fields = 1, \
+        .field = {WITHIN(1, 65535, BAD_VALUE)}}, \
+    [MESSAGE_GET_ACHIEVED] = {.fields = 1, .field = {WITHIN(0, 15, BAD_VALUE)}}, \
+    [MESSAGE_GET_MEASURED] = {.fields = 0}, \
+    [MESSAGE_SET_ADDRESS] = {.is_broadcast = true, .has_tail = true, .fields = 1, \
+        .field = {WITHIN(1, 247, BAD_VALUE)}}, \
+    [MESSAGE_GET_SENSORS] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}}, \
+    [MESSAGE_MEASURE] = {.has_tail = true, .fields = 3, .field = {WITHIN(1, 65535, BAD_VALUE), \
+        WITHIN(1, 10000, BAD_VALUE), WITHIN(1, 16, BAD_VALUE)}}, \
+    [MESSAGE_GET_READING] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}},
+
+// Of each fault: code of the emergency, and the error register meanwhile (CiA 301).
+#define EMERGENCY_TABLE \
+    [FAULT_NONE] = {.code = 0x0000, .error_register = 0x00}, \
+    [FAULT_WATCHDOG] = {.code = 0x8130, .error_register = 0x11}, \
+    [FAULT_OVER_TEMPERATURE] = {.code = 0x4310, .error_register = 0x09}, \
+    [FAULT_OVER_VOLTAGE] = {.code = 0x3310, .error_register = 0x05}, \
+    [FAULT_ARC] = {.code = 0x2340, .error_register = 0x03}, \
+    [FAULT_CHANNEL] = {.code = 0xFF01, .error_register = 0x81}, \
+    [FAULT_INTERNAL] = {.code = 0x6100, .error_register = 0x81}, \
+    [FAULT_INTERLOCK] = {.code = 0x9000, .error_register = 0x01}, \
+    [FAULT_OVER_CURRENT] = {.code = 0x2310, .error_register = 0x03},
 
 #endif

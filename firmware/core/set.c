@@ -20,7 +20,7 @@ static void read_envelope(struct reader *reader, struct envelope *envelope)
     envelope->step = (uint16_t)read_word(reader, WIRE_ENVELOPE_STEP_MIN, WIRE_ENVELOPE_STEP_MAX,
                                          NAK_BAD_VALUE);
     for (uint8_t i = 0; i < envelope->knots; i++) {
-        struct knot knot = {read_range(reader, WIRE_LEVEL_MAX), 0};
+        struct knot knot = {.level = read_range(reader, WIRE_LEVEL_MAX)};
         knot.phase = read_phase(reader);
         if (i < ENVELOPE_KNOTS)
             envelope->knot[i] = knot;
@@ -29,12 +29,13 @@ static void read_envelope(struct reader *reader, struct envelope *envelope)
 
 struct layer_head read_layer(struct reader *reader)
 {
-    uint16_t bits = read_range(reader, (1 << (LAYER_LAYER_SHIFT + 4)) - 1);
-    struct layer_head head = {0};
-    head.layer = (uint8_t)FIELD_OF(bits, LAYER_LAYER);
-    head.after = FIELD_OF(bits, LAYER_AFTER);
-    head.renew = FIELD_OF(bits, LAYER_RENEW);
-    head.count = FIELD_OF(bits, LAYER_COUNT);
+    uint16_t bits = read_range(reader, LAYER_BITS_MAX);
+    struct layer_head head = {
+        .layer = (uint8_t)FIELD_OF(bits, LAYER_LAYER),
+        .after = FIELD_OF(bits, LAYER_AFTER),
+        .renew = FIELD_OF(bits, LAYER_RENEW),
+        .count = FIELD_OF(bits, LAYER_COUNT),
+    };
     head.ramp = read_range(reader, WIRE_RAMP_MAX);
     head.valid_for = read_range(reader, WIRE_VALID_FOR_MAX);
     return head;
@@ -42,13 +43,14 @@ struct layer_head read_layer(struct reader *reader)
 
 struct command read_command(struct reader *reader)
 {
-    uint16_t bits = read_range(reader, (1 << (COMMAND_CHANNEL_SHIFT + 4)) - 1);
-    struct command command = {0};
-    command.channel = (uint8_t)FIELD_OF(bits, COMMAND_CHANNEL);
-    command.keep_phase = FIELD_OF(bits, COMMAND_KEEP_PHASE);
-    command.skip_ending = FIELD_OF(bits, COMMAND_SKIP_ENDING);
-    command.has_onset = FIELD_OF(bits, COMMAND_ONSET);
-    command.has_ending = FIELD_OF(bits, COMMAND_ENDING);
+    uint16_t bits = read_range(reader, COMMAND_BITS_MAX);
+    struct command command = {
+        .channel = (uint8_t)FIELD_OF(bits, COMMAND_CHANNEL),
+        .keep_phase = FIELD_OF(bits, COMMAND_KEEP_PHASE),
+        .skip_ending = FIELD_OF(bits, COMMAND_SKIP_ENDING),
+        .has_onset = FIELD_OF(bits, COMMAND_ONSET),
+        .has_ending = FIELD_OF(bits, COMMAND_ENDING),
+    };
     command.frequency = read_range(reader, UINT16_MAX);
     command.level = read_range(reader, WIRE_LEVEL_MAX);
     command.phase = read_phase(reader);
@@ -187,7 +189,7 @@ enum nak intake_take(struct intake *intake, uint16_t token, uint16_t bits, struc
     }
     if (!is_whole(intake))
         return NAK_NONE;
-    struct reader whole = {intake->words, intake->count, NAK_NONE, NO_CHANNEL};
+    struct reader whole = reader_of(intake->words, intake->count);
     check_set(&whole);
     part->channel = whole.channel;
     if (whole.nak != NAK_NONE)

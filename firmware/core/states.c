@@ -20,8 +20,12 @@ static void enter(struct amplifier *amplifier, enum state state, uint8_t channel
     if (state == OPERATION_ENABLED)
         amplifier->high_voltage = true;
     if (amplifier->notify != NULL) {
-        struct words event = {EVENT_WORDS, {(uint16_t)state, (uint16_t)amplifier->fault, channel,
-                                            amplifier->latch}};
+        struct wire_event event = {
+            .state = (uint16_t)state,
+            .fault = (uint16_t)amplifier->fault,
+            .channel = channel,
+            .latch = amplifier->latch,
+        };
         amplifier->notify(amplifier, &event);
     }
 }
@@ -88,7 +92,8 @@ static void leave(struct amplifier *amplifier, enum state next, uint16_t ramp, u
 
 void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
 {
-    struct fault_record record = {(uint8_t)fault, channel, amplifier_now(amplifier)};
+    struct fault_record record = {
+        .fault = (uint8_t)fault, .channel = channel, .at = amplifier_now(amplifier)};
     amplifier->fault = fault;
     next_latch(amplifier);
     memmove(&amplifier->faults[1], &amplifier->faults[0],
@@ -212,11 +217,6 @@ void amplifier_time(struct amplifier *amplifier, uint64_t now)
     if (timer_is_late(&amplifier->intake.life, amplifier->now, amplifier->slack))
         intake_drop(&amplifier->intake);
     layers_time(amplifier);
-}
-
-uint64_t amplifier_now(const struct amplifier *amplifier)
-{
-    return amplifier->now + (amplifier->sample - amplifier->now_at) * 1000000 / SAMPLE_RATE;
 }
 
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)

@@ -11,7 +11,7 @@ static struct complex amplitude_of(uint16_t level, int16_t phase)
     uint32_t turn = (uint32_t)(phase < 0 ? phase + PHASE_TURN : phase);
     uint32_t angle = (uint32_t)(((uint64_t)turn << 32) / PHASE_TURN);
     int32_t size = (int32_t)(((int64_t)level * ONE) / LEVEL_PER_UNIT);
-    struct complex amplitude = {times(size, cosine(angle)), times(size, sine(angle))};
+    struct complex amplitude = {.re = times(size, cosine(angle)), .im = times(size, sine(angle))};
     return amplitude;
 }
 
@@ -34,8 +34,8 @@ static struct complex present(const struct voice *voice)
     if (voice->stride == 0)
         return voice->to;
     int32_t way = voice->path.knots > 0 ? (int32_t)(voice->along >> 2) : raised_cosine(voice->along);
-    struct complex amplitude = {between(voice->from.re, voice->to.re, way),
-                                between(voice->from.im, voice->to.im, way)};
+    struct complex amplitude = {.re = between(voice->from.re, voice->to.re, way),
+                                .im = between(voice->from.im, voice->to.im, way)};
     return amplitude;
 }
 
@@ -72,7 +72,7 @@ static void send(struct voice *voice, const struct envelope *shape, uint16_t ram
 
 void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number)
 {
-    static const struct complex silence = {0, 0};
+    static const struct complex silence = {.re = 0, .im = 0};
     const uint64_t rate = (uint64_t)SAMPLE_RATE * FREQUENCY_PER_UNIT;
     voice->is_playing = true;
     voice->layer = layer;
@@ -155,7 +155,7 @@ struct complex voice_pointer(const struct voice *voice)
 {
     struct complex amplitude = present(voice);
     int32_t re = cosine(voice->angle), im = sine(voice->angle);
-    struct complex turned = {times(amplitude.re, re) - times(amplitude.im, im),
-                             times(amplitude.re, im) + times(amplitude.im, re)};
+    struct complex turned = {.re = times(amplitude.re, re) - times(amplitude.im, im),
+                             .im = times(amplitude.re, im) + times(amplitude.im, re)};
     return turned;
 }

@@ -24,6 +24,13 @@ struct words {
     uint16_t words[WORDS_MAX];
 };
 
+// A reader of so many words.
+static inline struct reader reader_of(const uint16_t *words, size_t count)
+{
+    struct reader reader = {.at = words, .left = (uint16_t)count, .channel = NO_CHANNEL};
+    return reader;
+}
+
 static inline void reader_refuse(struct reader *reader, enum nak nak, uint8_t channel)
 {
     if (reader->nak == NAK_NONE) {
@@ -55,6 +62,16 @@ static inline void put(struct words *words, uint16_t word)
     if (words->count < WORDS_MAX)
         words->words[words->count++] = word;
 }
+
+static inline void put_all(struct words *words, const uint16_t *from, size_t count)
+{
+    for (size_t i = 0; i < count; i++)
+        put(words, from[i]);
+}
+
+// Put words one after another.
+#define PUT(words, ...) \
+    put_all(words, (const uint16_t[]){__VA_ARGS__}, sizeof((uint16_t[]){__VA_ARGS__}) / 2)
 
 // A text: its length in bytes, then two a word, the first one high.
 static inline void put_text(struct words *words, const char *text)

@@ -1,9 +1,10 @@
 """Prove the firmware: `python firmware/test/run.py [--long] [--no-tests]`, by `make firmware-test`.
 
-Runs its tests, then that of damaged frames under the sanitizers of addresses and of undefined
-behaviour (20 000 for each line; 200 000 with --long). Prints the sizes of core and wires for a
-Cortex-M3, as configured and with the least of all, and says so where its compiler is not
-installed, which is a failure in CI. --no-tests: after `make test`, which has run them.
+Runs its tests, among them the check of its sources (`sources.py`), then that of damaged frames
+under the sanitizers of addresses and of undefined behaviour (20 000 for each line; 200 000 with
+--long). Prints the sizes of core and wires for a Cortex-M3, as configured and with the least of
+all, and says so where its compiler is not installed, which is a failure in CI. --no-tests: after
+`make test`, which has run them.
 """
 
 import os

@@ -13,6 +13,8 @@
 
 #include "amplifier.h"
 
+#include <string.h>
+
 enum nmt { NMT_BOOT_UP = 0, NMT_STOPPED = 4, NMT_OPERATIONAL = 5, NMT_PRE_OPERATIONAL = 127 };
 
 #define NODE_MAX 127
@@ -21,6 +23,12 @@ struct can_frame {
     uint16_t id;
     uint8_t length;
     uint8_t data[8];
+};
+
+// What is said of a fault.
+struct can_emergency {
+    uint16_t code;
+    uint8_t error_register;
 };
 
 #define SEGMENT_FIRST 2 // words of frame 0, behind type and count
@@ -68,16 +76,25 @@ void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number
 void can_receive(struct can_node *node, const struct can_frame *frame);
 
 // Report a change of state.
-void can_event(struct can_node *node, const struct words *event);
+void can_event(struct can_node *node, const struct wire_event *event);
 
 // Send a heartbeat that is due. Call it every millisecond.
 void can_time(struct can_node *node);
 
 // Between the files of the node.
-void can_send(struct can_node *node, uint16_t function, const uint8_t *data, uint8_t length);
+
+// Send a frame; function: its identifier without the number of the node.
+static inline void can_send(struct can_node *node, uint16_t function, const uint8_t *data,
+                            uint8_t length)
+{
+    struct can_frame frame = {.id = (uint16_t)(function + node->number), .length = length};
+    memcpy(frame.data, data, length);
+    node->send(&frame);
+}
+
 void can_send_message(struct can_node *node, uint8_t number, uint8_t type,
                       const struct words *words);
-uint8_t can_error_register(enum fault fault);
+struct can_emergency can_emergency(enum fault fault);
 void can_sdo_receive(struct can_node *node, const uint8_t request[8]);
 // Abort codes, or 0.
 uint32_t can_read_object(const struct can_node *node, struct can_sdo *into);

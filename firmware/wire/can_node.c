@@ -17,13 +17,6 @@ enum nmt_command { START = 1, LEAVE = 2, ENTER_PRE_OPERATIONAL = 128, RESET_NODE
 #define HEARTBEAT_INTERVAL 50 // ms, until object 1017 is written
 #define LEAVING_RAMP 5        // ms
 
-void can_send(struct can_node *node, uint16_t function, const uint8_t *data, uint8_t length)
-{
-    struct can_frame frame = {(uint16_t)(function + node->number), length, {0}};
-    memcpy(frame.data, data, length);
-    node->send(&frame);
-}
-
 static void send_heartbeat(struct can_node *node, enum nmt nmt)
 {
     uint8_t state = (uint8_t)nmt;
@@ -52,30 +45,19 @@ void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number
     boot(node);
 }
 
-uint8_t can_error_register(enum fault fault)
+void can_event(struct can_node *node, const struct wire_event *event)
 {
-    static const uint8_t REGISTERS[] = {0x00, 0x11, 0x09, 0x05, 0x03, 0x81, 0x81, 0x01, 0x03};
-    return REGISTERS[fault];
-}
-
-static uint16_t error_code(enum fault fault)
-{
-    static const uint16_t CODES[] = {0x0000, 0x8130, 0x4310, 0x3310, 0x2340,
-                                     0xFF01, 0x6100, 0x9000, 0x2310};
-    return CODES[fault];
-}
-
-void can_event(struct can_node *node, const struct words *event)
-{
-    uint16_t state = event->words[EVENT_STATE], fault = event->words[EVENT_FAULT];
+    struct words words = {.count = 0};
+    enum fault fault = (enum fault)event->fault;
     bool is_faulty = fault != FAULT_NONE;
+    put_event(&words, event);
     if (node->nmt == NMT_OPERATIONAL)
-        can_send_message(node, 0, MESSAGE_EVENT, event);
+        can_send_message(node, 0, MESSAGE_EVENT, &words);
     if ((is_faulty || node->was_faulty) && node->nmt != NMT_STOPPED) {
-        uint16_t code = error_code((enum fault)fault);
-        uint8_t data[8] = {(uint8_t)code, (uint8_t)(code >> 8),
-                           can_error_register((enum fault)fault), (uint8_t)(state | fault << 4),
-                           (uint8_t)event->words[EVENT_CHANNEL]};
+        struct can_emergency emergency = can_emergency(fault);
+        uint8_t data[8] = {(uint8_t)emergency.code, (uint8_t)(emergency.code >> 8),
+                           emergency.error_register,
+                           (uint8_t)(event->state | event->fault << 4), (uint8_t)event->channel};
         can_send(node, EMERGENCY, data, 8);
     }
     node->was_faulty = is_faulty;
@@ -117,8 +99,8 @@ static void manage(struct can_node *node, uint8_t command)
 // Carry a message out; its reply goes to a numbered one.
 static void handle(struct can_node *node, const struct can_assembly *message)
 {
-    struct words reply = {0};
-    struct verdict verdict = {NAK_NONE, NO_CHANNEL};
+    struct words reply = {.count = 0};
+    struct verdict verdict = {.channel = NO_CHANNEL};
     uint8_t type = message->type;
     uint16_t address = message->words[SET_ADDRESS_ADDRESS];
     bool is_moving = type == MESSAGE_SET_ADDRESS && message->count > 0;

@@ -22,6 +22,12 @@ enum object {
     STATUS = 0x2002        // those of GetStatus
 };
 
+struct can_emergency can_emergency(enum fault fault)
+{
+    static const struct can_emergency EMERGENCIES[] = {EMERGENCY_TABLE};
+    return EMERGENCIES[fault];
+}
+
 static void put_number(struct can_sdo *into, uint32_t value, uint16_t size)
 {
     for (into->length = 0; into->length < size; into->length++)
@@ -51,7 +57,7 @@ static void put_device(struct can_sdo *into, const struct amplifier *amplifier)
 // Read an object with subindices: its highest one; 0: the object has none.
 static uint16_t read_part(const struct can_node *node, struct can_sdo *into)
 {
-    struct words words = {0};
+    struct words words = {.count = 0};
     bool is_here = into->subindex > 0;
     switch (into->index) {
     case DEVICE:
@@ -83,7 +89,7 @@ static uint32_t read_whole(const struct can_node *node, struct can_sdo *into)
         put_number(into, 0, 4);
         break;
     case ERROR_REGISTER:
-        put_number(into, can_error_register(node->amplifier->fault), 1);
+        put_number(into, can_emergency(node->amplifier->fault).error_register, 1);
         break;
     case EMERGENCY_ID:
         put_number(into, 0x80u + node->number, 4);

@@ -4,15 +4,17 @@
 
 #include <string.h>
 
-#define FIELDS_MAX 3
+// One message carries the longest replies of any configuration.
+typedef char longest_replies_fit[CAPABILITIES_WORDS(CHANNELS_MAX) <= WORDS_MAX &&
+                                 FAULTS_WORDS(FAULTS_KEPT) <= WORDS_MAX ? 1 : -1];
 
 static const struct request {
     bool is_broadcast, feeds, has_tail;
-    uint8_t fields;
+    uint8_t session, fields; // place of the session; how many fields
     struct {
         int32_t low, high;
         enum nak nak;
-    } field[FIELDS_MAX];
+    } field[REQUEST_FIELDS_MAX];
 } REQUESTS[] = {REQUEST_TABLE};
 
 static const struct request *request_of(uint8_t type)
@@ -45,7 +47,7 @@ static bool is_there(uint8_t type)
 static enum nak check_words(const struct request *request, uint8_t type, const uint16_t *words,
                             uint16_t count)
 {
-    struct reader reader = {words, count, NAK_NONE, NO_CHANNEL};
+    struct reader reader = reader_of(words, count);
     for (uint8_t i = 0; i < request->fields; i++)
         read_word(&reader, request->field[i].low, request->field[i].high, request->field[i].nak);
     bool is_text = reader.left > 0 && *reader.at <= SERIAL_NUMBER_MAX &&
@@ -80,93 +82,98 @@ static bool is_foreign(const struct amplifier *amplifier, uint8_t type, uint16_t
     return type == MESSAGE_ARM && session == amplifier->session;
 }
 
-static void put_status(struct words *reply, struct amplifier *amplifier)
+static void reply_status(struct words *reply, struct amplifier *amplifier)
 {
-    uint16_t *words = reply->words;
+    uint16_t levels[CHANNELS_MAX], tokens[LAYERS];
     int flags = (amplifier->high_voltage ? FLAG_HIGH_VOLTAGE : 0) |
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
     amplifier->is_limited = false;
-    words[STATUS_STATE] = (uint16_t)amplifier->state;
-    words[STATUS_FAULT] = (uint16_t)amplifier->fault;
-    words[STATUS_FLAGS] = (uint16_t)flags;
-    words[STATUS_LATCH] = amplifier->latch;
-    words[STATUS_WATCHDOG_LEFT] = amplifier_watchdog_left(amplifier);
-    words[STATUS_TEMPERATURE] = (uint16_t)amplifier->measured.temperature;
-    words[STATUS_VOLTAGE] = amplifier->measured.voltage;
-    words[STATUS_TOKEN] = amplifier->committed;
-    words[STATUS_BITS] = (uint16_t)(CHANNELS << STATUS_CHANNELS_SHIFT | LAYERS);
-    reply->count = STATUS_WORDS;
     for (unsigned i = 0; i < CHANNELS; i++)
-        put(reply, channel_level(&amplifier->channels[i]));
+        levels[i] = channel_level(&amplifier->channels[i]);
     for (uint8_t i = 0; i < LAYERS; i++)
-        put(reply, amplifier_token(amplifier, i));
+        tokens[i] = amplifier_token(amplifier, i);
+    struct wire_status status = {
+        .state = (uint16_t)amplifier->state,
+        .fault = (uint16_t)amplifier->fault,
+        .flags = (uint16_t)flags,
+        .latch = amplifier->latch,
+        .watchdog_left = amplifier_watchdog_left(amplifier),
+        .temperature = amplifier->measured.temperature,
+        .voltage = amplifier->measured.voltage,
+        .token = amplifier->committed,
+        .channels = CHANNELS,
+        .layers = LAYERS,
+        .levels = levels,
+        .tokens = tokens,
+    };
+    put_status(reply, &status);
 }
 
-static void put_capabilities(struct words *reply)
+static void reply_capabilities(struct words *reply)
 {
-    uint16_t *words = reply->words;
-    words[CAPABILITIES_CHANNELS] = CHANNELS;
-    words[CAPABILITIES_LAYERS] = LAYERS;
-    words[CAPABILITIES_VOICES] = VOICES;
-    words[CAPABILITIES_SET_WORDS] = STREAM_WORDS;
-    words[CAPABILITIES_KNOTS] = ENVELOPE_KNOTS;
-    words[CAPABILITIES_FEATURES] = FEATURES;
-    words[CAPABILITIES_FREQUENCY_MIN] = FREQUENCY_MIN;
-    words[CAPABILITIES_FREQUENCY_MAX] = FREQUENCY_MAX;
-    words[CAPABILITIES_FREQUENCY_STEP] = 1;
-    words[CAPABILITIES_LEVEL_MAX] = LEVEL_MAX;
-    words[CAPABILITIES_LEVEL_STEP] = 1;
-    words[CAPABILITIES_PHASE_STEP] = 1;
-    words[CAPABILITIES_RAMP_MAX] = RAMP_MAX;
-    words[CAPABILITIES_SLEW] = UINT16_MAX;
-    words[CAPABILITIES_WATCHDOG_MIN] = WATCHDOG_MIN;
-    words[CAPABILITIES_WATCHDOG_MAX] = WATCHDOG_MAX;
-    words[CAPABILITIES_ENVELOPE_STEP_MIN] = ENVELOPE_STEP_MIN;
-    words[CAPABILITIES_ENVELOPE_STEP_MAX] = ENVELOPE_STEP_MAX;
-    reply->count = CAPABILITIES_WORDS;
+    struct wire_limit limits[CHANNELS_MAX];
     for (unsigned i = 0; i < CHANNELS; i++) {
-        put(reply, FREQUENCY_MIN);
-        put(reply, FREQUENCY_MAX);
-        put(reply, LEVEL_MAX);
+        limits[i].frequency_min = FREQUENCY_MIN;
+        limits[i].frequency_max = FREQUENCY_MAX;
+        limits[i].level_max = LEVEL_MAX;
     }
+    struct wire_capabilities capabilities = {
+        .channels = CHANNELS,
+        .layers = LAYERS,
+        .voices = VOICES,
+        .set_words = STREAM_WORDS,
+        .knots = ENVELOPE_KNOTS,
+        .features = FEATURES,
+        .frequency_min = FREQUENCY_MIN, .frequency_max = FREQUENCY_MAX, .frequency_step = 1,
+        .level_max = LEVEL_MAX, .level_step = 1,
+        .phase_step = 1,
+        .ramp_max = RAMP_MAX,
+        .slew = UINT16_MAX,
+        .watchdog_min = WATCHDOG_MIN, .watchdog_max = WATCHDOG_MAX,
+        .envelope_step_min = ENVELOPE_STEP_MIN, .envelope_step_max = ENVELOPE_STEP_MAX,
+        .limits = limits,
+    };
+    put_capabilities(reply, &capabilities);
 }
 
-static void put_faults(struct words *reply, const struct amplifier *amplifier)
+static void reply_faults(struct words *reply, const struct amplifier *amplifier)
 {
-    put(reply, amplifier->fault_count);
+    struct wire_fault shown[FAULTS_KEPT];
+    struct wire_faults faults = {.count = amplifier->fault_count, .faults = shown};
     for (uint8_t i = 0; i < amplifier->fault_count; i++) {
         uint64_t at = amplifier->faults[i].at; // samples may be made ahead of time
         uint64_t age = amplifier->now > at ? (amplifier->now - at) / 1000 : 0;
-        uint32_t shown = age > UINT32_MAX ? UINT32_MAX : (uint32_t)age;
-        put(reply, amplifier->faults[i].fault);
-        put(reply, amplifier->faults[i].channel);
-        put(reply, (uint16_t)(shown >> 16));
-        put(reply, (uint16_t)shown);
+        shown[i].fault = amplifier->faults[i].fault;
+        shown[i].channel = amplifier->faults[i].channel;
+        shown[i].age = age > UINT32_MAX ? UINT32_MAX : (uint32_t)age;
     }
+    put_faults(reply, &faults);
 }
 
-static enum nak put_achieved(struct words *reply, const struct amplifier *amplifier, uint16_t number)
+static enum nak reply_achieved(struct words *reply, const struct amplifier *amplifier,
+                               uint16_t number)
 {
     if (number >= LAYERS)
         return NAK_BAD_VALUE;
-    const struct layer *layer = &amplifier->layers[number];
-    uint16_t token = amplifier_token(amplifier, (uint8_t)number), count = 0;
-    reply->words[ACHIEVED_TOKEN] = token;
-    reply->words[ACHIEVED_RAMP] = token > 0 ? layer->ramp : 0;
-    reply->words[ACHIEVED_VALID_FOR] = token > 0 ? layer->valid_for : 0;
-    reply->count = ACHIEVED_WORDS;
-    for (unsigned i = 0; i < CHANNELS; i++) {
+    struct wire_command commands[CHANNELS_MAX];
+    struct wire_achieved achieved = {
+        .token = amplifier_token(amplifier, (uint8_t)number),
+        .layer = (uint8_t)number,
+        .commands = commands,
+    };
+    if (achieved.token > 0) {
+        achieved.ramp = amplifier->layers[number].ramp;
+        achieved.valid_for = amplifier->layers[number].valid_for;
+    }
+    for (uint8_t i = 0; i < CHANNELS; i++) {
         const struct voice *voice = channel_voice(&amplifier->channels[i], (uint8_t)number);
         if (voice == NULL)
             continue;
-        put(reply, (uint16_t)(i << COMMAND_CHANNEL_SHIFT));
-        put(reply, voice->frequency);
-        put(reply, voice->level);
-        put(reply, (uint16_t)voice->phase);
-        count++;
+        commands[achieved.count++] = (struct wire_command){
+            .channel = i, .frequency = voice->frequency, .level = voice->level, .phase = voice->phase};
     }
-    reply->words[ACHIEVED_BITS] = (uint16_t)(number << ACHIEVED_LAYER_SHIFT | count);
+    put_achieved(reply, &achieved);
     return NAK_NONE;
 }
 
@@ -175,8 +182,8 @@ static struct verdict take(struct amplifier *amplifier, const uint16_t *words, u
                            struct words *reply)
 {
     struct intake *intake = &amplifier->intake;
-    struct reader part = {words + SET_STREAM, (uint16_t)(count - SET_STREAM), NAK_NONE, NO_CHANNEL};
-    struct verdict verdict = {NAK_NONE, NO_CHANNEL};
+    struct reader part = reader_of(words + SET_STREAM, count - SET_STREAM);
+    struct verdict verdict = {.channel = NO_CHANNEL};
     uint16_t token = words[SET_TOKEN], bits = words[SET_BITS];
     bool is_played = token == amplifier->committed, is_staged = false;
     if (!is_played) {
@@ -193,10 +200,14 @@ static struct verdict take(struct amplifier *amplifier, const uint16_t *words, u
         is_played = true;
         is_staged = false;
     }
-    put(reply, token);
-    put(reply, (uint16_t)(1 << TAKEN_EXACT_SHIFT | is_staged << TAKEN_STAGED_SHIFT |
-                          is_played << TAKEN_PLAYED_SHIFT));
-    put(reply, is_staged || is_played ? 0 : intake_missing(intake));
+    struct wire_taken taken = {
+        .token = token,
+        .exact = true,
+        .staged = is_staged,
+        .played = is_played,
+        .missing = is_staged || is_played ? 0 : intake_missing(intake),
+    };
+    put_taken(reply, &taken);
     return verdict;
 }
 
@@ -216,7 +227,7 @@ static enum nak commit(struct amplifier *amplifier, uint16_t token)
 // Whether a text is this amplifier's serial number.
 static enum nak check_name(const struct amplifier *amplifier, const uint16_t *words)
 {
-    struct words name = {0};
+    struct words name = {.count = 0};
     put_text(&name, amplifier->serial_number);
     uint16_t whole = (uint16_t)(1 + words[0] / 2); // what is behind an odd text has no meaning
     bool is_same = words[0] == name.words[0] && memcmp(words, name.words, whole * sizeof *words) == 0;
@@ -228,10 +239,10 @@ static enum nak check_name(const struct amplifier *amplifier, const uint16_t *wo
 static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const uint16_t *words,
                                 uint16_t count, struct words *reply)
 {
-    struct verdict verdict = {NAK_NONE, NO_CHANNEL};
+    struct verdict verdict = {.channel = NO_CHANNEL};
     switch (type) {
     case MESSAGE_GET_CAPS:
-        put_capabilities(reply);
+        reply_capabilities(reply);
         break;
     case MESSAGE_ARM:
         if (words[ARM_WATCHDOG] < WATCHDOG_MIN || words[ARM_WATCHDOG] > WATCHDOG_MAX)
@@ -257,13 +268,13 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
         amplifier_stop(amplifier, words[STOP_RAMP]);
         break;
     case MESSAGE_GET_FAULTS:
-        put_faults(reply, amplifier);
+        reply_faults(reply, amplifier);
         break;
     case MESSAGE_CLEAR:
         verdict.nak = amplifier_clear(amplifier, words[CLEAR_LATCH]);
         break;
     case MESSAGE_GET_ACHIEVED:
-        verdict.nak = put_achieved(reply, amplifier, words[GET_ACHIEVED_LAYER]);
+        verdict.nak = reply_achieved(reply, amplifier, words[GET_ACHIEVED_LAYER]);
         break;
     case MESSAGE_SET_ADDRESS:
         verdict.nak = check_name(amplifier, words + SET_ADDRESS_SERIAL_NUMBER);
@@ -278,14 +289,15 @@ struct verdict message_handle(struct amplifier *amplifier, uint8_t type, const u
                               uint16_t count, struct words *reply)
 {
     const struct request *request = request_of(type);
-    struct verdict verdict = {NAK_UNKNOWN_TYPE, NO_CHANNEL};
+    struct verdict verdict = {.nak = NAK_UNKNOWN_TYPE, .channel = NO_CHANNEL};
     reply->count = 0;
     if (request == NULL || !is_there(type))
         return verdict;
     verdict.nak = check_words(request, type, words, count);
     if (verdict.nak == NAK_NONE && !is_allowed(amplifier, type))
         verdict.nak = NAK_WRONG_STATE;
-    if (verdict.nak == NAK_NONE && request->feeds && is_foreign(amplifier, type, words[0]))
+    if (verdict.nak == NAK_NONE && request->feeds &&
+        is_foreign(amplifier, type, words[request->session]))
         verdict.nak = NAK_WRONG_SESSION;
     if (verdict.nak == NAK_NONE)
         verdict = carry_out(amplifier, type, words, count, reply);
@@ -294,16 +306,16 @@ struct verdict message_handle(struct amplifier *amplifier, uint8_t type, const u
     if (request->feeds)
         amplifier_feed(amplifier);
     if (reply->count == 0) // after feeding, so that the status shows the watchdog full
-        put_status(reply, amplifier);
+        reply_status(reply, amplifier);
     return verdict;
 }
 
 void message_nak(struct words *reply, uint8_t type, struct verdict verdict)
 {
-    reply->count = NAK_WORDS;
-    reply->words[NAK_REQUEST] = type;
-    reply->words[NAK_CODE] = (uint16_t)verdict.nak;
-    reply->words[NAK_CHANNEL] = verdict.channel;
+    struct wire_nak nak = {
+        .request = type, .code = (uint16_t)verdict.nak, .channel = verdict.channel};
+    reply->count = 0;
+    put_nak(reply, &nak);
 }
 
 const char *message_text(const struct amplifier *amplifier, unsigned number)

@@ -92,7 +92,7 @@ static int write_box(struct modbus *modbus, const uint8_t *pdu, uint16_t length)
 // The registers of a reply, with zeros behind it.
 static void read_reply(struct modbus *modbus, uint8_t type, uint16_t area[AREA_MAX])
 {
-    struct words reply = {0};
+    struct words reply = {.count = 0};
     area[0] = modbus->replies[type].tag;
     area[1] = modbus->replies[type].result;
     if (!is_present(type)) {

@@ -10,8 +10,9 @@
 
 #define MODBUS_PDU_MAX 253
 
-// Words of the longer of the replies that are kept: Status and Achieved.
-#define MODBUS_KEPT (STATUS_WORDS + COMMAND_WORDS * CHANNELS_MAX + LAYERS)
+// Words of the longer of the replies that are kept.
+#define LONGER(a, b) ((a) > (b) ? (a) : (b))
+#define MODBUS_KEPT LONGER(STATUS_WORDS(CHANNELS_MAX, LAYERS), ACHIEVED_WORDS(CHANNELS_MAX))
 #define MODBUS_BOXES (MESSAGE_GET_READING + 1)
 
 struct modbus {

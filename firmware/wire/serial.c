@@ -102,7 +102,7 @@ static bool has_good_crc(const uint8_t *frame, uint16_t length)
 static struct verdict handle(struct serial *serial, const uint8_t *request, uint16_t length,
                              struct words *reply)
 {
-    struct verdict verdict = {NAK_UNSUPPORTED_VERSION, NO_CHANNEL};
+    struct verdict verdict = {.nak = NAK_UNSUPPORTED_VERSION, .channel = NO_CHANNEL};
     uint16_t words[WORDS_MAX], count = (uint16_t)((length - HEADER) / 2);
     if (request[VERSION] != PROTOCOL_VERSION)
         return verdict;
@@ -122,7 +122,7 @@ static uint16_t frame_received(struct serial *serial)
     uint8_t *request = serial->received, frame[SERIAL_FRAME_MAX];
     uint16_t length = unstuff(request, serial->received_length);
     bool is_for_us = request[ADDRESS] == serial->address || request[ADDRESS] == BROADCAST;
-    struct words reply = {0};
+    struct words reply = {.count = 0};
     if (length < HEADER + 4 || length > SERIAL_FRAME_MAX || !has_good_crc(request, length) ||
         (request[TYPE] & REPLY) != 0 || request[TYPE] == MESSAGE_EVENT || !is_for_us) {
         serial->discarded++;
@@ -169,14 +169,17 @@ uint16_t serial_byte(struct serial *serial, uint8_t byte)
     return reply;
 }
 
-uint16_t serial_event(struct serial *serial, const struct words *event,
+uint16_t serial_event(struct serial *serial, const struct wire_event *event,
                       uint8_t line[SERIAL_STUFFED_MAX + 2])
 {
-    uint8_t frame[SERIAL_FRAME_MAX] = {MESSAGE_EVENT, PROTOCOL_VERSION, serial->address};
+    uint8_t frame[SERIAL_FRAME_MAX] = {
+        [TYPE] = MESSAGE_EVENT, [VERSION] = PROTOCOL_VERSION, [ADDRESS] = serial->address};
+    struct words words = {.count = 0};
     if (SERIAL_IS_SHARED)
         return 0;
     serial->events++;
     frame[SEQUENCE] = (uint8_t)serial->events;
     frame[SEQUENCE + 1] = (uint8_t)(serial->events >> 8);
-    return finish(frame, put_words(frame, event), line);
+    put_event(&words, event);
+    return finish(frame, put_words(frame, &words), line);
 }

@@ -30,7 +30,7 @@ void serial_init(struct serial *serial, struct amplifier *amplifier, uint8_t add
 uint16_t serial_byte(struct serial *serial, uint8_t byte);
 
 // Write an Event as a frame, where no other amplifier is on the line; return its length.
-uint16_t serial_event(struct serial *serial, const struct words *event,
+uint16_t serial_event(struct serial *serial, const struct wire_event *event,
                       uint8_t line[SERIAL_STUFFED_MAX + 2]);
 
 #endif

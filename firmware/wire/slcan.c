@@ -41,7 +41,7 @@ static int number(const char *text, unsigned digits)
 // A data frame with an 11-bit identifier: tIIILDD...
 static bool transmit(struct slcan *slcan)
 {
-    struct can_frame frame = {0};
+    struct can_frame frame = {.length = 0};
     int id = slcan->length >= 5 ? number(slcan->line + 1, 3) : -1;
     int length = slcan->length >= 5 ? number(slcan->line + 4, 1) : -1;
     if (!slcan->is_open || id < 0 || id > 0x7FF || length < 0 || length > 8 ||

@@ -28,7 +28,7 @@ static __attribute__((unused)) void *take(arena *from, size_t bytes) {
         size_t size = ALIGNMENT + bytes > 2 * before ? ALIGNMENT + bytes : 2 * before;
         void *more;
         if (posix_memalign(&more, ALIGNMENT, size)) longjmp(*from->failed, 1);
-        *(chunk *)more = (chunk){from->last, (char *)more + size};
+        *(chunk *)more = (chunk){.before = from->last, .end = (char *)more + size};
         from->last = more, from->at = (char *)more + ALIGNMENT;
     }
     void *found = from->at;

@@ -17,7 +17,8 @@ typedef struct {
 } rows_found;
 
 SHARED rows_found new_rows(size_t count, size_t n, arena *memory) {
-    return (rows_found){floats(memory, count), floats(memory, count), floats(memory, count), floats(memory, 2 * count * n)};
+    return (rows_found){.score = floats(memory, count), .missed = floats(memory, count), .bound = floats(memory, count),
+                        .weights = floats(memory, 2 * count * n)};
 }
 
 INLINE void rows_at(int *rows, const int *all, int first, int count) {
@@ -48,10 +49,11 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
         if ((int)i / p == own) mean[i % p] = share;
         weights[i] = is_other[i / p] ? share / (float)others : 0;
     }
-    const grouped all = {1, k * p, 0, by->others, by->gain_variance, by->ridge, is_coarse ? on->centres : of->few_points,
-                         NULL, weights, by->error};
+    const grouped all = {.groups = 1, .p = k * p, .others = by->others, .gain_variance = by->gain_variance,
+                         .ridge = by->ridge, .points = is_coarse ? on->centres : of->few_points, .weights = weights,
+                         .error = by->error};
     formed found = new_forms(on, &all, memory);
-    best reached = {values(memory, n), ZERO.re, ZERO.re, ZERO.re};
+    best reached = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};
     value *target = values(memory, n);
     const value *const forms[1] = {found.power};
     rows_found at = new_rows(count, n, memory);
@@ -67,7 +69,8 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
             }
         lanes wanted;
         load_real(&wanted, by->threshold, 1, rows);
-        const searched here = {n, 1, 1, 0, 0, 0, by->phases, 0, of->level[0] * wanted, target, NULL, forms, NULL, NULL, NULL};
+        const searched here = {.n = n, .targets = 1, .quiet = 1, .phases = by->phases, .wanted = of->level[0] * wanted,
+                               .target = target, .forms = forms};
         search(&reached, &here, &by->one_finger, memory);
         store_real(at.score + first, &reached.score, 1, some);
         store_real(at.bound + first, &reached.bound, 1, some);
@@ -136,8 +139,10 @@ SHARED searched forms_of(const formed *found, const plates *on, const rules *by,
     }
     lanes wanted;
     load_real(&wanted, by->threshold, 1, rows);
-    return (searched){n, count, q, points, few, fine, by->phases, margin, level * wanted, target, expected_power, forms, at,
-                      at_few, at_fine};
+    return (searched){.n = n, .targets = count, .quiet = q, .points = points, .few = few, .fine = fine,
+                      .phases = by->phases, .margin = margin, .wanted = level * wanted, .target = target,
+                      .target_power = expected_power, .forms = forms, .at_points = at, .few_fields = at_few,
+                      .fine_fields = at_fine};
 }
 
 INLINE float highest_score(const float *scores, int first, int end) {
@@ -151,7 +156,7 @@ INLINE float highest_score(const float *scores, int first, int end) {
 SHARED int search_rows(rows_found *to, searched *blocks, const rules *by, int first, int end, arena *memory) {
     const size_t n = blocks[first / LANES].n;
     const arena mark = *memory;
-    best found = {values(memory, n), ZERO.re, ZERO.re, ZERO.re};
+    best found = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};
     float score[LANES], missed[LANES], bound[LANES], *weights = floats(memory, 2 * LANES * n);
     int limited = 0;
     for (int pass = 0; pass < 4; pass++) {
@@ -193,7 +198,8 @@ SHARED int search_rows(rows_found *to, searched *blocks, const rules *by, int fi
 /* The highest amplitude to threshold at the weakest target, of rows from a first to an end. */
 SHARED float highest_level(searched *blocks, const rules *by, const int *all, int count, int first, int end, arena *memory) {
     const arena mark = *memory;
-    best found = {values(memory, blocks[first / LANES].n), ZERO.re, ZERO.re, ZERO.re};
+    best found = {.weights = values(memory, blocks[first / LANES].n), .score = ZERO.re, .missed = ZERO.re,
+                  .bound = ZERO.re};
     float highest = 0;
     for (int block = first / LANES; block * LANES < end; block++) {
         int rows[LANES];
@@ -239,8 +245,9 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
     char *is_other = take(memory, k);
     for (int content = 0; content < of->contents; content++)
         has_fine |= (int)find_others(is_other, of, content, k) <= by->max_by_point;
-    const grouped each = {k, of->few, has_fine ? k * of->fine : 0, by->others, by->gain_variance, by->ridge, of->few_points,
-                          of->fine_points, of->few_weights, by->error};
+    const grouped each = {.groups = k, .p = of->few, .fine = has_fine ? k * of->fine : 0, .others = by->others,
+                          .gain_variance = by->gain_variance, .ridge = by->ridge, .points = of->few_points,
+                          .fine_points = of->fine_points, .weights = of->few_weights, .error = by->error};
     formed *found = take(memory, blocks * sizeof(formed));
     searched *forms = take(memory, blocks * sizeof(searched));
     rows_found at = new_rows(blocks * LANES, n, memory);

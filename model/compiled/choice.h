@@ -26,7 +26,7 @@ static int by_run(const void *one, const void *other) {
 SHARED void best_first(int *order, const float *scores, int count, arena *memory) {
     const arena mark = *memory;
     ranked *each = take(memory, count * sizeof(ranked));
-    for (int i = 0; i < count; i++) each[i] = (ranked){scores[i], i, 0};
+    for (int i = 0; i < count; i++) each[i] = (ranked){.score = scores[i], .at = i};
     qsort(each, count, sizeof(ranked), by_score);
     for (int i = 1; i < count; i++) {
         float above = each[i - 1].score, below = each[i].score;

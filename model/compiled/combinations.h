@@ -42,13 +42,15 @@ static matrix strongest(const double *amplitudes, size_t n, size_t count, const 
                 const float zeta = (beta - alpha) / (2 * along);
                 const float tangent = copysignf(1, zeta) / (fabsf(zeta) + sqrtf(1 + zeta * zeta));
                 const float cosine = 1 / sqrtf(1 + tangent * tangent), sine = cosine * tangent;
-                const value back = {filled(re / along), filled(-im / along)};
+                const value back = {.re = filled(re / along), .im = filled(-im / along)};
                 for (int which = 0; which < 2; which++)
                     for (size_t j = 0; j < width; j += LANES) {
                         const matrix *columns = which ? &own : &form;
                         const value a = at(columns, p * width + j), b = times(back, at(columns, q * width + j));
-                        put(columns, p * width + j, (value){cosine * a.re - sine * b.re, cosine * a.im - sine * b.im});
-                        put(columns, q * width + j, (value){sine * a.re + cosine * b.re, sine * a.im + cosine * b.im});
+                        put(columns, p * width + j, (value){.re = cosine * a.re - sine * b.re,
+                                                            .im = cosine * a.im - sine * b.im});
+                        put(columns, q * width + j, (value){.re = sine * a.re + cosine * b.re,
+                                                            .im = sine * a.im + cosine * b.im});
                     }
             }
     }
@@ -69,7 +71,7 @@ static matrix strongest(const double *amplitudes, size_t n, size_t count, const 
                 value along = ZERO;
                 for (size_t j = 0; j < width; j += LANES)
                     along = add_conjugate_product(along, at(&made, before * width + j), at(&made, i * width + j));
-                const value by = {filled(sum(along.re)), filled(sum(along.im))};
+                const value by = {.re = filled(sum(along.re)), .im = filled(sum(along.im))};
                 for (size_t j = 0; j < width; j += LANES)
                     put(&made, i * width + j, subtract_product(at(&made, i * width + j), at(&made, before * width + j), by));
             }

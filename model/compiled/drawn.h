@@ -197,7 +197,7 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
         for (size_t e = 0; e < n; e++) moved[j] = add_product(moved[j], without[j * n + e], w[e]);
     }
     for (size_t e = 0; e < n; e++) {
-        value stretched = subtract_product(times(strokes[e], w[e]), (value){filled(1), ZERO.im}, moved[e]);
+        value stretched = subtract_product(times(strokes[e], w[e]), (value){.re = filled(1), .im = ZERO.im}, moved[e]);
         damping[e] = times(by_damping[e], stretched), own[e] = times(by_stiffness[e], stretched);
     }
     for (size_t j = 0; j < a; j++) {
@@ -257,8 +257,10 @@ SHARED void find_by_force(tones *to, const float *columns, const float *weights,
 SHARED tones respond(const plates *on, const draws *by, const sensors *at, const float *columns, size_t m,
                      const int *rows, const float *weights, arena *memory) {
     const size_t n = on->n, a = on->b + on->k, padded = padded_to(at->points), cases = m * by->bases;
-    tones found = {on, by, at, m, padded, rows, floats(memory, m), floats(memory, 2 * m * (1 + by->nodes) * at->points),
-                   floats(memory, 2 * cases * (a + 1) * padded), floats(memory, 2 * 4 * cases * a)};
+    tones found = {.on = on, .by = by, .at = at, .m = m, .padded = padded, .rows = rows, .error = floats(memory, m),
+                   .at_nodes = floats(memory, 2 * m * (1 + by->nodes) * at->points),
+                   .by_force = floats(memory, 2 * cases * (a + 1) * padded),
+                   .forces = floats(memory, 2 * 4 * cases * a)};
     for (size_t tone = 0; tone < m; tone++) {
         float sum = 0;
         for (size_t e = 0; e < n; e++) {
@@ -280,7 +282,7 @@ INLINE lanes some(const float *from) {
 
 /* sum + (re + i im) f. */
 INLINE value add_scaled(value sum, value f, float re, float im) {
-    return (value){sum.re + re * f.re - im * f.im, sum.im + re * f.im + im * f.re};
+    return (value){.re = sum.re + re * f.re - im * f.im, .im = sum.im + re * f.im + im * f.re};
 }
 
 /* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
@@ -310,7 +312,7 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
         force[j].im = loss[2 * j + 1] * by_loss + damping[2 * j + 1] * by_damping + own[2 * j + 1] * by_own +
                       gain[2 * j] * im + gain[2 * j + 1] * re;
     }
-    force[a] = (value){by_loss, ZERO.im};
+    force[a] = (value){.re = by_loss, .im = ZERO.im};
     for (size_t i = 0; i < points; i += 4) {
         const size_t last = points - 1 - i; /* padded points are read, and not kept */
         value s0 = found[i], s1 = found[i + (last > 0)], s2 = found[i + (last > 1 ? 2 : 0)], s3 = found[i + (last > 2 ? 3 : 0)];
@@ -331,7 +333,7 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
         lanes re = of->error[tone] * some(by->errors + finger * width + from);
         lanes im = of->error[tone] * some(by->errors + (k + finger) * width + from);
         for (size_t i = finger * each; i < (finger + 1) * each; i++)
-            sensed[i] = above * power((value){found[i].re + re, found[i].im + im});
+            sensed[i] = above * power((value){.re = found[i].re + re, .im = found[i].im + im});
     }
 }
 

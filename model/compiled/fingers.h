@@ -39,7 +39,7 @@ INLINE void invert(value *restrict P, const value *D, size_t k) {
     }
     for (size_t s = 0; s < k; s++) {
         value *own = P + s * k, factor = reciprocal(own[s]);
-        own[s] = (value){filled(1), ZERO.im};
+        own[s] = (value){.re = filled(1), .im = ZERO.im};
         for (size_t j = 0; j < k; j++) own[j] = times(own[j], factor);
         for (size_t i = 0; i < k; i++) {
             if (i == s) continue;
@@ -51,7 +51,7 @@ INLINE void invert(value *restrict P, const value *D, size_t k) {
 }
 
 INLINE void add(value *to, const value *more, size_t count) {
-    for (size_t i = 0; i < count; i++) to[i] = (value){to[i].re + more[i].re, to[i].im + more[i].im};
+    for (size_t i = 0; i < count; i++) to[i] = (value){.re = to[i].re + more[i].re, .im = to[i].im + more[i].im};
 }
 
 /* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),

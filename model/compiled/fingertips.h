@@ -80,8 +80,9 @@ INLINE void lagrange(float *to, double x, int count) {
 SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *memory) {
     const size_t r = on->r, few = on->few, fine = on->fine, count = few + fine, patch = on->side_x * on->side_y;
     const size_t half = patch / 2, padded = (r + LANES - 1) / LANES * LANES;
-    tips to = {floats(memory, k * few * r), floats(memory, k * fine * r), floats(memory, k * few),
-               floats(memory, k * fine), floats(memory, k * r)};
+    tips to = {.few = floats(memory, k * few * r), .fine = floats(memory, k * fine * r),
+               .few_weights = floats(memory, k * few), .fine_weights = floats(memory, k * fine),
+               .centres = floats(memory, k * r)};
     const arena mark = *memory;
     float *near = floats(memory, patch * padded), *share = floats(memory, patch), *found = floats(memory, padded);
     float *along_x = floats(memory, on->side_x), *along_y = floats(memory, on->side_y);

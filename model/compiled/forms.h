@@ -20,8 +20,8 @@ typedef struct {
 
 SHARED formed new_forms(const plates *on, const grouped *of, arena *memory) {
     const size_t n = on->n, groups = of->groups;
-    return (formed){values(memory, groups * of->p * n), values(memory, of->fine * n), values(memory, groups * n * n),
-                    values(memory, groups * n * n)};
+    return (formed){.fields = values(memory, groups * of->p * n), .fine = values(memory, of->fine * n),
+                    .power = values(memory, groups * n * n), .uncertain = values(memory, groups * n * n)};
 }
 
 /* Times the force of each ERA, of accelerations (p, n) by forces. */
@@ -69,7 +69,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     for (size_t i = 0; i < n; i++) {
         for (size_t e = 0; e < n; e++) {
             value own = scaled(moved[i * n + e], filled(-1));
-            if (i == e) own = (value){own.re + strokes[e].re, own.im + strokes[e].im};
+            if (i == e) own = (value){.re = own.re + strokes[e].re, .im = own.im + strokes[e].im};
             damped[i * n + e] = times(by_damping[i], own);
             changes[i * n + e] = times(by_stiffness[i], own);
         }
@@ -88,7 +88,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
         to_points(other, n, of->points, at, &now, on, room);
         drive(other, drives, at, n);
         for (size_t i = 0; i < at * n; i++)
-            other[i] = scaled((value){other[i].re - h[i].re, other[i].im - h[i].im}, filled(sqrtf(0.5f)));
+            other[i] = scaled((value){.re = other[i].re - h[i].re, .im = other[i].im - h[i].im}, filled(sqrtf(0.5f)));
     }
 
     /* Forms of the mean over each group, of the rows at its points and of what is uncertain. */
@@ -122,16 +122,16 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
             trace += form[e * n + e].re;
         }
         for (size_t e = 0; e < n; e++) {
-            form[e * n + e] = (value){form[e * n + e].re + trace * (of->ridge / (float)n), ZERO.im};
+            form[e * n + e] = (value){.re = form[e * n + e].re + trace * (of->ridge / (float)n), .im = ZERO.im};
             for (size_t v = 0; v < e; v++)
-                form[e * n + v] = (value){form[v * n + e].re, -form[v * n + e].im};
+                form[e * n + v] = (value){.re = form[v * n + e].re, .im = -form[v * n + e].im};
         }
         value *rest = U + group * n * n;
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
                 value own = form[u * n + v], without = modelled[u * n + v];
-                rest[u * n + v] = (value){own.re - without.re, own.im - without.im};
-                rest[v * n + u] = (value){own.re - without.re, without.im - own.im};
+                rest[u * n + v] = (value){.re = own.re - without.re, .im = own.im - without.im};
+                rest[v * n + u] = (value){.re = own.re - without.re, .im = without.im - own.im};
             }
         for (size_t u = 0; u < n; u++) rest[u * n + u].im = ZERO.im;
     }

@@ -65,7 +65,7 @@ static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots
                 const size_t to = (a * span + k) * form.width + b * span, from = to + form.width + 1;
                 for (size_t l = 0; l < span; l += LANES) {
                     const value x = at(&form, to + l), y = at(&form, from + l);
-                    put(&form, to + l, (value){x.re + y.re, x.im + y.im});
+                    put(&form, to + l, (value){.re = x.re + y.re, .im = x.im + y.im});
                 }
                 for (size_t l = knots; l < span; l++) form.re[to + l] = form.im[to + l] = 0;
             }
@@ -83,7 +83,7 @@ static void add_held(const matrix *to, const matrix *form, const matrix *held, f
     for (size_t a = 0; a < count; a++)
         for (size_t b = a; b < count; b++) {
             const float re = sign * held->re[b], im = sign * held->im[b];
-            const value by = {filled(sign * held->re[a]), filled(sign * held->im[a])};
+            const value by = {.re = filled(sign * held->re[a]), .im = filled(sign * held->im[a])};
             for (size_t k = 0; k < knots; k++) {
                 const size_t from = (a * span + k) * form->width + b * span;
                 float found_re = 0, found_im = 0;
@@ -145,7 +145,7 @@ static void bounded_minimum(double *found, const matrix *form, const matrix *rig
         for (int step = 0; step < by->iterations; step++) {
             for (size_t i = 0; i < eras * each; i += LANES) {
                 const value a = at(&feasible, i), b = at(&dual, i);
-                put(&moved, i, (value){penalty * (a.re - b.re), penalty * (a.im - b.im)});
+                put(&moved, i, (value){.re = penalty * (a.re - b.re), .im = penalty * (a.im - b.im)});
             }
             combine(&x, knots, combinations, width, 1, -1, &moved, each, count, eras, knots);
             for (size_t a = 0; a < count; a++)
@@ -155,9 +155,10 @@ static void bounded_minimum(double *found, const matrix *form, const matrix *rig
             combine(&moved, each, combinations, 1, width, 1, &x, knots, eras, count, knots);
             for (size_t i = 0; i < eras * each; i += LANES) {
                 const value a = at(&moved, i), b = at(&feasible, i), c = at(&dual, i);
-                const value relaxed = {by->relaxation * a.re + old * b.re + c.re, by->relaxation * a.im + old * b.im + c.im};
+                const value relaxed = {.re = by->relaxation * a.re + old * b.re + c.re,
+                                       .im = by->relaxation * a.im + old * b.im + c.im};
                 const value kept = within(relaxed);
-                put(&feasible, i, kept), put(&dual, i, (value){relaxed.re - kept.re, relaxed.im - kept.im});
+                put(&feasible, i, kept), put(&dual, i, (value){.re = relaxed.re - kept.re, .im = relaxed.im - kept.im});
             }
         }
     }
@@ -182,8 +183,8 @@ static void shape_onset(double *found, const shaped_tone *of, const shaping *by,
         combinations = strongest(of->amplitudes, n, count, &all, by->samples * rows, span, memory);
         hats = zeros(by->samples * rows, apart(count * span), memory);
         for (size_t row = 0; row < by->samples * rows; row++) {
-            const matrix from = {all.re + row * all.width, all.im + row * all.width, span};
-            const matrix to = {hats.re + row * hats.width, hats.im + row * hats.width, span};
+            const matrix from = {.re = all.re + row * all.width, .im = all.im + row * all.width, .width = span};
+            const matrix to = {.re = hats.re + row * hats.width, .im = hats.im + row * hats.width, .width = span};
             combine(&to, span, &combinations, width, 1, 1, &from, span, count, n, span);
         }
     } else
@@ -209,7 +210,7 @@ static void shape_onset(double *found, const shaped_tone *of, const shaping *by,
                 for (size_t k = 0; k < free; k += LANES) {
                     const value from = at(&line, k + steps - 1 - step), old = at(&right, a * span + k);
                     const float rise = by->rise[step * by->samples + sample];
-                    put(&right, a * span + k, (value){old.re + rise * from.re, old.im + rise * from.im});
+                    put(&right, a * span + k, (value){.re = old.re + rise * from.re, .im = old.im + rise * from.im});
                 }
         }
     for (size_t a = 0; a < count; a++)
@@ -288,8 +289,8 @@ static int guarded(void (*shape)(double *, const shaped_tone *, const shaping *,
 
 /* Knots but the last, (knots - 1, eras) complex, of an onset, or of an ending: 0, or NO_MEMORY. */
 int shaped_knots(double *found, const shaped_tone *of, const shaping *by, int is_ending) {
-    arena memory = {NULL, NULL, NULL};
+    arena memory = {.last = NULL};
     const int status = guarded(is_ending ? shape_ending : shape_onset, found, of, by, &memory);
-    release(&memory, (arena){NULL, NULL, NULL});
+    release(&memory, (arena){.last = NULL});
     return status;
 }

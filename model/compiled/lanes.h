@@ -26,22 +26,22 @@ typedef struct {
 } value;
 
 INLINE value times(value a, value b) {
-    return (value){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
+    return (value){.re = a.re * b.re - a.im * b.im, .im = a.re * b.im + a.im * b.re};
 }
 
 INLINE value add_product(value c, value a, value b) { /* c + a b */
-    return (value){c.re + a.re * b.re - a.im * b.im, c.im + a.re * b.im + a.im * b.re};
+    return (value){.re = c.re + a.re * b.re - a.im * b.im, .im = c.im + a.re * b.im + a.im * b.re};
 }
 
 INLINE value subtract_product(value c, value a, value b) { /* c - a b */
-    return (value){c.re - a.re * b.re + a.im * b.im, c.im - a.re * b.im - a.im * b.re};
+    return (value){.re = c.re - a.re * b.re + a.im * b.im, .im = c.im - a.re * b.im - a.im * b.re};
 }
 
 INLINE value add_conjugate_product(value c, value a, value b) { /* c + conj(a) b */
-    return (value){c.re + a.re * b.re + a.im * b.im, c.im + a.re * b.im - a.im * b.re};
+    return (value){.re = c.re + a.re * b.re + a.im * b.im, .im = c.im + a.re * b.im - a.im * b.re};
 }
 
-INLINE value scaled(value a, lanes by) { return (value){a.re * by, a.im * by}; }
+INLINE value scaled(value a, lanes by) { return (value){.re = a.re * by, .im = a.im * by}; }
 
 INLINE lanes power(value a) { return a.re * a.re + a.im * a.im; }
 
@@ -49,7 +49,7 @@ INLINE lanes inverse(lanes a) { return 1 / a; }
 
 INLINE value reciprocal(value a) {
     lanes size = inverse(power(a));
-    return (value){a.re * size, -a.im * size};
+    return (value){.re = a.re * size, .im = -a.im * size};
 }
 
 INLINE lanes filled(float a) { return a - (lanes){0}; }
@@ -232,7 +232,7 @@ SHARED void factorise(value *restrict R, size_t n) {
         const value *from = R + s * n;
         const lanes pivot = inverse(from[s].re);
         for (size_t u = s + 1; u < n; u++) {
-            value by = {from[u].re * pivot, -from[u].im * pivot};
+            value by = {.re = from[u].re * pivot, .im = -from[u].im * pivot};
             for (size_t v = u; v < n; v++) R[u * n + v] = subtract_product(R[u * n + v], by, from[v]);
         }
         R[s * n + s].im = pivot;
@@ -245,7 +245,7 @@ SHARED void solve_factorised(value *restrict x, const value *restrict R, size_t 
         for (size_t u = s + 1; u < n; u++) {
             const value from = R[s * n + u];
             const lanes pivot = R[s * n + s].im;
-            x[u] = subtract_product(x[u], (value){from.re * pivot, -from.im * pivot}, x[s]);
+            x[u] = subtract_product(x[u], (value){.re = from.re * pivot, .im = -from.im * pivot}, x[s]);
         }
     for (size_t s = n; s-- > 0;) {
         value own = x[s];

@@ -134,14 +134,16 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
     const size_t contents = of->contents, k = on->k, points = k * of->fine, groups = group_count(of->promise);
     const arena mark = *memory;
     const size_t plates = 1 + of->promise->count;
-    const sensors at = {points, of->fine_points, of->fine_weights, by->error, by->threshold};
+    const sensors at = {.points = points, .rows = of->fine_points, .weights = of->fine_weights, .error = by->error,
+                        .threshold = by->threshold};
     const tones drawn = respond(on, of->promise, &at, columns, contents, to->rows, to->weights, memory);
     lanes *powers = take(memory, contents * groups * points * sizeof(lanes));
     value *found = values(memory, points), *force = values(memory, on->b + k + 1);
     for (size_t content = 0; content < contents; content++)
         for (size_t group = 0; group < groups; group++)
             sense(powers + (content * groups + group) * points, &drawn, content, group, found, force);
-    felt now = {on, by, of, to->rows, powers, to->gains, groups, plates};
+    felt now = {.on = on, .by = by, .of = of, .rows = to->rows, .powers = powers, .gains = to->gains, .groups = groups,
+                .plates = plates};
 
     float *own = floats(memory, contents * plates), *some = floats(memory, plates), *worst = floats(memory, plates);
     float *loudest = floats(memory, plates);

@@ -21,16 +21,18 @@ static matrix zeros(size_t rows, size_t width, arena *memory) {
     const size_t size = rows * width + 4 * LANES; /* some are read and written beyond the last */
     float *at = floats(memory, 2 * size);
     memset(at, 0, 2 * size * sizeof(float));
-    return (matrix){at, at + size, width};
+    return (matrix){.re = at, .im = at + size, .width = width};
 }
 
-INLINE value at(const matrix *of, size_t i) { return (value){*(const loose *)(of->re + i), *(const loose *)(of->im + i)}; }
+INLINE value at(const matrix *of, size_t i) {
+    return (value){.re = *(const loose *)(of->re + i), .im = *(const loose *)(of->im + i)};
+}
 
 INLINE void put(const matrix *to, size_t i, value a) { *(loose *)(to->re + i) = a.re, *(loose *)(to->im + i) = a.im; }
 
-INLINE value one(const matrix *of, size_t i) { return (value){filled(of->re[i]), filled(of->im[i])}; }
+INLINE value one(const matrix *of, size_t i) { return (value){.re = filled(of->re[i]), .im = filled(of->im[i])}; }
 
-INLINE value conjugate(value a) { return (value){a.re, -a.im}; }
+INLINE value conjugate(value a) { return (value){.re = a.re, .im = -a.im}; }
 
 INLINE float sum(lanes a) {
     float parts[LANES];
@@ -55,7 +57,7 @@ INLINE void add_gram(const matrix *C, const matrix *X, size_t rows, size_t i, si
     for (size_t q = 0; q < 4; q++) {
         const size_t to = (i + q) * C->width + j;
         const value old = at(C, to);
-        put(C, to, (value){old.re + sign * found[q].re, old.im + sign * found[q].im});
+        put(C, to, (value){.re = old.re + sign * found[q].re, .im = old.im + sign * found[q].im});
     }
 }
 
@@ -87,10 +89,11 @@ static void solve(const matrix *x, const matrix *R, const float *inverted) {
     const size_t n = R->width;
     for (size_t row = 0; row < n; row++) {
         const float re = x->re[row] * inverted[row], im = x->im[row] * inverted[row];
-        const value by = {filled(re), filled(im)};
+        const value by = {.re = filled(re), .im = filled(im)};
         for (size_t j = row / LANES * LANES; j < n; j += LANES) {
             const value from = at(R, row * n + j), old = at(x, j);
-            put(x, j, (value){old.re - from.re * by.re - from.im * by.im, old.im - from.re * by.im + from.im * by.re});
+            put(x, j, (value){.re = old.re - from.re * by.re - from.im * by.im,
+                              .im = old.im - from.re * by.im + from.im * by.re});
         }
         x->re[row] = re, x->im[row] = im;
     }
@@ -111,7 +114,8 @@ static void combine(const matrix *to, size_t to_each, const matrix *a, size_t st
             value found = ZERO;
             for (size_t e = 0; e < inner; e++) {
                 const size_t by = i * step + e * next;
-                found = add_product(found, (value){filled(a->re[by]), filled(sign * a->im[by])}, at(from, e * each + j));
+                found = add_product(found, (value){.re = filled(a->re[by]), .im = filled(sign * a->im[by])},
+                                    at(from, e * each + j));
             }
             put(to, i * to_each + j, found);
         }

@@ -179,10 +179,10 @@ SHARED lanes least_power(value *restrict w, value *restrict R, value *restrict b
         for (size_t u = 0; u <= t; u++) {
             const value found = field(on->target + u * n, column, n);
             gram[u * targets + t] = found;
-            gram[t * targets + u] = (value){found.re, u < t ? -found.im : ZERO.im};
+            gram[t * targets + u] = (value){.re = found.re, .im = u < t ? -found.im : ZERO.im};
         }
     }
-    if (targets == 1) best[0] = (value){filled(1), ZERO.im}, highest = root(gram[0].re);
+    if (targets == 1) best[0] = (value){.re = filled(1), .im = ZERO.im}, highest = root(gram[0].re);
     for (size_t start = 0; start < starts && targets > 1; start++) {
         for (size_t t = 0; t < targets; t++) {
             const value own = is_first ? gram[t * targets + start * targets / starts] : best[t];
@@ -211,7 +211,7 @@ SHARED void search(best *to, const searched *on, const method *by, arena *memory
     for (int step = 0; step < by->steps; step++) {
         weighted(R, on, share);
         for (size_t u = 0; u < n; u++)
-            R[u * n + u] = (value){R[u * n + u].re * (1 + by->variance) + multiplier[u], ZERO.im};
+            R[u * n + u] = (value){.re = R[u * n + u].re * (1 + by->variance) + multiplier[u], .im = ZERO.im};
         to->bound = smaller(to->bound, least_power(w, R, factors, step == 0, by->gain, on, memory));
         lanes least;
         if (by->limited) {

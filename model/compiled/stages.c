@@ -79,25 +79,26 @@ static int guarded(void (*run)(const job *, arena *), const job *each, arena *me
 }
 
 static int done(void (*run)(const job *, arena *), job each) {
-    arena memory = {NULL, NULL, NULL};
+    arena memory = {.last = NULL};
     const int status = guarded(run, &each, &memory);
-    release(&memory, (arena){NULL, NULL, NULL});
+    release(&memory, (arena){.last = NULL});
     return status;
 }
 
 /* `tips` but for the centres, under fingertips at places (count, 2) [m]. */
 int fingertips_stage(const raster *on, const double *places, int count, void *few, void *fine, void *few_weights,
                      void *fine_weights) {
-    return done(run_fingertips, (job){on, places, NULL, NULL, count, {few, fine, few_weights, fine_weights}});
+    return done(run_fingertips, (job){.on = on, .by = places, .count = count,
+                                      .to = {few, fine, few_weights, fine_weights}});
 }
 
 /* Forms at rows (count). */
 int forms_stage(const plates *on, const grouped *of, const int *rows, int count, found_forms *to) {
-    return done(run_forms, (job){on, of, NULL, rows, count, {to}});
+    return done(run_forms, (job){.on = on, .by = of, .rows = rows, .count = count, .to = {to}});
 }
 
 /* Tones at rows (count) of weights (count, n). */
 int tones_stage(const plates *on, const draws *by, const sensors *at, const int *rows, int count, float *weights,
                 found_tones *to) {
-    return done(run_tones, (job){on, by, at, rows, count, {to, weights}});
+    return done(run_tones, (job){.on = on, .by = by, .of = at, .rows = rows, .count = count, .to = {to, weights}});
 }

@@ -14,17 +14,17 @@ from pathlib import Path
 import pytest
 from cobs import cobs
 
-from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
+import hand_written as hand
+from drivers.protocol.table import STATES, STATUS_FLAGS
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import REQUEST, segments
 from drivers.wires.can_bus.text import SLCAN
 from drivers.wires.modbus.frames import framed
 from firmware_requests import RandomHost
-from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, request
+from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, values_of
 from mutation import damage
 
 COUNT = int(os.environ.get("FRAMES", "1000"))
-GET_CAPS, GET_STATUS = 2, 9
 LINES = {"serial": SERIAL, "rtu": MODBUS, "tcp": TCP, "can": CAN}
 OPERATIONAL = b"O\rt0002" + b"0100\r"
 
@@ -78,15 +78,6 @@ WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
 """The bodies of a request on each wire, and the frame of a body, with a good checksum."""
 
 
-def words_of(firmware: MovedFirmware, number: int) -> tuple[int, ...]:
-    """The reply on its serial line, behind a zero that ends what was begun there."""
-    firmware.sent(SERIAL)
-    firmware.receive(SERIAL, b"\0" + request(number))
-    frame = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
-    assert frame[0] == 0x80 | number
-    return struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4])
-
-
 @pytest.mark.parametrize("wire", LINES)
 def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., Path]) -> None:
     """Half of the requests are whole, so that it plays; damaged ones have a good checksum mostly.
@@ -94,8 +85,7 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
     Its states, levels, watchdog and high voltage keep what the protocol says of them.
     """
     draw, firmware = random.Random(wire), MovedFirmware(moved())
-    capabilities = MESSAGES["GetCaps"].reply.unpack(words_of(firmware, GET_CAPS), is_strict=True)
-    host = RandomHost(draw, capabilities)
+    host = RandomHost(draw, values_of(firmware, hand.GET_CAPS))
     bodies, frame_of = WIRES[wire]
     time, latch, sequence, damaged, tokens = 0.0, 0, 0, 0, set[int]()
     while damaged < COUNT:
@@ -118,7 +108,7 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
                     firmware.move(time)
         time += 0.3 if draw.random() < 0.02 else draw.choice([0.0, 0.001, 0.002, 0.01])
         firmware.move(time)
-        status = MESSAGES["GetStatus"].reply.unpack(words_of(firmware, GET_STATUS), is_strict=True)
+        status = values_of(firmware, hand.GET_STATUS)
         is_on = bool(status["flags"] & 1 << STATUS_FLAGS["high_voltage"])
         is_armed = status["state"] == STATES["OPERATION_ENABLED"]
         assert status["state"] in STATES.values()

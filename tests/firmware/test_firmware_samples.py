@@ -10,7 +10,18 @@ from cobs import cobs
 import hand_written as hand
 from hand_written import tone as command
 from model.arrays import FloatArray
-from moved_firmware import PER_MS, RATE, SERIAL, MovedFirmware, Script, apply, arm, replay, request
+from moved_firmware import (
+    PER_MS,
+    RATE,
+    SERIAL,
+    MovedFirmware,
+    Script,
+    apply,
+    arm,
+    replay,
+    request,
+    values_of,
+)
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
 
@@ -123,9 +134,8 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     t = seconds(len(samples))
     gain = falling(t - first, 0.005)
     assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < TOLERANCE
-    firmware.receive(SERIAL, request(hand.GET_STATUS))
-    status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
-    assert (status[5], status[7]) == (7, 1)  # FAULT, of the watchdog
+    status = values_of(firmware, hand.GET_STATUS)
+    assert (status["state"], status["fault"]) == (hand.FAULT, hand.WATCHDOG)
 
 
 def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
@@ -135,7 +145,6 @@ def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
     firmware.move(0.1)
     firmware.stall(0.2, is_converter_still=True)
     firmware.move(0.21)
-    firmware.receive(SERIAL, request(hand.GET_STATUS))
-    status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
-    assert status[5] == 4  # OPERATION_ENABLED
-    assert int.from_bytes(status[13:15], "little") == pytest.approx(40, abs=1)
+    status = values_of(firmware, hand.GET_STATUS)
+    assert status["state"] == hand.ENABLED
+    assert status["watchdog_left"] == pytest.approx(40, abs=1)

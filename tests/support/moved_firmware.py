@@ -190,6 +190,16 @@ def apply(token: int, *commands: Sequence[int], ramp_ms: int = 0) -> bytes:
     return request(hand.SET, *hand.part(token, layer, session=SESSION, now=True))
 
 
+def values_of(firmware: MovedFirmware, number: int) -> Values:
+    """The values of its reply on the serial line, behind a zero that ends what was begun there."""
+    firmware.sent(SERIAL)
+    firmware.receive(SERIAL, b"\0" + request(number))
+    frame = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
+    assert frame[0] == hand.REPLY | number
+    words = struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4])
+    return BY_NUMBER[number].reply.unpack(words, is_strict=True)
+
+
 def replay(
     folder: Path, script: Script, until_ms: float
 ) -> tuple[FloatArray, list[tuple[int, tuple[int, ...]]]]:

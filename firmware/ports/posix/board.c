@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// The amplifier as a program: lines are pseudo-terminals, samples go to a file or pipe. Options;
-// without any it is --serial:
+// The board of the program: lines are pseudo-terminals, samples go to a file or pipe. Options; without
+// any it is --serial:
 //
 //     --serial              serve the serial protocol on a pseudo-terminal; prints its URL
 //     --modbus-rtu          serve Modbus RTU on a pseudo-terminal; prints its URL
@@ -17,8 +17,8 @@
 #define _XOPEN_SOURCE 700
 
 #include "board.h"
-#include "loop.h"
 #include "modbus_tcp.h"
+#include "posix.h"
 
 #include <fcntl.h>
 #include <poll.h>
@@ -208,7 +208,7 @@ static void open_line(enum line line, const char *scheme, const char *separator)
     printf("\n");
 }
 
-static void board_open(int count, char **arguments)
+void board_open(int count, char **arguments)
 {
     for (int i = 1; i < count; i++) {
         const char *option = arguments[i], *value = i + 1 < count ? arguments[i + 1] : NULL;
@@ -243,15 +243,4 @@ static void board_open(int count, char **arguments)
     struct sigaction moves = {.sa_handler = move_interlock, .sa_flags = SA_RESTART};
     sigaction(SIGUSR1, &moves, NULL);
     started_at = microseconds();
-}
-
-int main(int count, char **arguments)
-{
-    board_open(count, arguments);
-    loop_init();
-    for (;;) {
-        loop_once();
-        tcp_serve(loop_modbus());
-        board_wait();
-    }
 }

@@ -3,7 +3,6 @@
 #define _XOPEN_SOURCE 700
 
 #include "modbus_tcp.h"
-#include "loop.h"
 #include "mbap.h"
 
 #include <arpa/inet.h>
@@ -52,7 +51,7 @@ static void send_frame(int connection, const uint8_t *frame, uint16_t length)
         return; // a host that does not read loses replies; one that is gone is noticed below
 }
 
-static void take(struct modbus *modbus, struct host *host)
+static void take(struct modbus *modbus, struct host *host, void (*arrived)(void))
 {
     for (;;) {
         uint8_t bytes[MBAP_FRAME_MAX];
@@ -64,7 +63,7 @@ static void take(struct modbus *modbus, struct host *host)
             host->connection = 0;
             return;
         }
-        loop_samples();
+        arrived();
         mbap_take(&host->mbap, bytes, (uint16_t)size, modbus, 1, send_frame, host->connection);
     }
 }
@@ -86,11 +85,11 @@ static void accept_host(void)
         close(connection);
 }
 
-void tcp_serve(struct modbus *modbus)
+void tcp_serve(struct modbus *modbus, void (*arrived)(void))
 {
     if (listening >= 0)
         accept_host();
     for (int i = 0; i < TCP_HOSTS; i++)
         if (hosts[i].connection > 0)
-            take(modbus, &hosts[i]);
+            take(modbus, &hosts[i], arrived);
 }

@@ -18,7 +18,7 @@ int tcp_open(uint16_t port);
 // Fill in what to wait for.
 void tcp_watch(struct pollfd watched[TCP_WATCHED]);
 
-// Take what has arrived, and answer it.
-void tcp_serve(struct modbus *modbus);
+// Take what has arrived, call `arrived`, and answer it.
+void tcp_serve(struct modbus *modbus, void (*arrived)(void));
 
 #endif

@@ -17,8 +17,6 @@
 #define REQUESTS_MAX 16  // pieces carried out before a block, so that its work is bounded
 #define ENDING_RAMP 5    // ms
 
-struct sound_format sound_format;
-
 static struct engine *notifying; // the engine of this process
 
 uint64_t engine_microseconds(void)
@@ -28,7 +26,7 @@ uint64_t engine_microseconds(void)
     return (uint64_t)now.tv_sec * 1000000 + (uint64_t)now.tv_nsec / 1000;
 }
 
-static void notify(const struct amplifier *amplifier, const struct words *event);
+static void notify(const struct amplifier *amplifier, const struct wire_event *event);
 
 int engine_init(struct engine *engine, const struct sound_settings *settings,
                 struct counters *counters)
@@ -84,7 +82,7 @@ static void wake(struct engine *engine)
 }
 
 // Send an Event to the host of the serial line.
-static void notify(const struct amplifier *amplifier, const struct words *event)
+static void notify(const struct amplifier *amplifier, const struct wire_event *event)
 {
     uint8_t line[SERIAL_STUFFED_MAX + 2];
     (void)amplifier;
@@ -181,8 +179,8 @@ static void measure(struct engine *engine)
     bool is_faulty = GET(engine->counters->is_lost) || !engine->has_stream ||
                      has_too_many_gaps(engine);
     for (unsigned i = 0; i < engine->amplifiers; i++) {
-        struct measured measured = {0, 0, false, is_faulty ? FAULT_INTERNAL : FAULT_NONE,
-                                    NO_CHANNEL};
+        struct measured measured = {
+            .cause = is_faulty ? FAULT_INTERNAL : FAULT_NONE, .channel = NO_CHANNEL};
         amplifier_measured(&engine->amplifier[i], measured);
         if (GET(engine->is_ending) && engine->amplifier[i].state == OPERATION_ENABLED)
             amplifier_stop(&engine->amplifier[i], ENDING_RAMP);

@@ -129,10 +129,12 @@ static void watch(struct pollfd watched[WATCHED])
 {
     bool has_room = engine->requests.written - GET(engine->requests.taken) <= RING_SIZE / 2;
     for (unsigned i = 0; i < CONNECTIONS; i++)
-        watched[i] = (struct pollfd){has_room ? lines[i].connection : -1, POLLIN, 0};
-    watched[CONNECTIONS] = (struct pollfd){has_room ? settings.listening : -1, POLLIN, 0};
-    watched[CONNECTIONS + 1] = (struct pollfd){engine->wake[0], POLLIN, 0};
-    watched[CONNECTIONS + 2] = (struct pollfd){settings.parent, POLLIN, 0};
+        watched[i].fd = has_room ? lines[i].connection : -1;
+    watched[CONNECTIONS].fd = has_room ? settings.listening : -1;
+    watched[CONNECTIONS + 1].fd = engine->wake[0];
+    watched[CONNECTIONS + 2].fd = settings.parent;
+    for (unsigned i = 0; i < WATCHED; i++)
+        watched[i].events = POLLIN;
     bool is_soon = !has_room || !engine->has_stream;
     if (poll(watched, WATCHED, is_soon ? SILENT_RATE : WAIT) < 0)
         for (unsigned i = 0; i < WATCHED; i++)

@@ -47,7 +47,8 @@ static double drawn(void) { return 2.0 * rand() / RAND_MAX - 1; }
 int main(void) {
     float rise[150];
     for (int i = 0; i < 150; i++) rise[i] = i < 40 ? i / 40.0f : 1;
-    const shaping by = {5, 30, 21, 8, 30, 1e-6f, 0.03f, 1.6f, rise};
+    const shaping by = {.samples = 5, .steps = 30, .knots = 21, .ending_knots = 8, .iterations = 30, .ridge = 1e-6f,
+                        .penalty = 0.03f, .relaxation = 1.6f, .rise = rise};
     const double sizes[] = {0.3, 0.01, 1, 1e4, 0, NAN, INFINITY};
     double largest = 0;
     for (int number = 0; number < 28; number++) {
@@ -62,7 +63,9 @@ int main(void) {
         for (int i = 0; i < 2 * rows * eras; i++) steady[i] = drawn();
         for (int i = 0; i < 2 * eras; i++) amplitudes[i] = drawn() / 2;
         for (int i = 0; i < eras; i++) active[i] = i + total - eras;
-        const shaped_tone of = {eras, targets, rows, 8, 0.01f, rows > targets, hat, steady, amplitudes, total, active, residual};
+        const shaped_tone of = {.eras = eras, .targets = targets, .rows = rows, .combinations = 8,
+                                .gain_variance = 0.01f, .weight = rows > targets, .hats = hat, .steady = steady,
+                                .amplitudes = amplitudes, .total = total, .active = active, .residual = residual};
         left = number == 9 ? 3 : -1;
         for (int is_ending = 0; is_ending < 2; is_ending++) {
             const int count = is_ending ? 7 : 20, status = shaped_knots(knots, &of, &by, is_ending);

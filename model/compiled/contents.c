@@ -12,7 +12,8 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
     for (size_t first = 0; first < (size_t)from->count; first += BATCH) {
         const arena mark = *memory;
         const size_t some = from->count - first < BATCH ? from->count - first : BATCH;
-        const sensors at = {points, of->fine_points, of->fine_weights, by->error, by->threshold};
+        const sensors at = {.points = points, .rows = of->fine_points, .weights = of->fine_weights, .error = by->error,
+                            .threshold = by->threshold};
         const tones drawn = respond(on, draws, &at, columns, some, from->rows + first, from->weights + 2 * n * first, memory);
         lanes *sensed = take(memory, points * sizeof(lanes));
         value *found = values(memory, points), *force = values(memory, on->b + k + 1);
@@ -87,7 +88,7 @@ SHARED judged some_of(const judged *every, size_t count, size_t fingers, size_t 
         for (size_t i = 0; i < count; i++) own[i * draws + d] = every->own[i * every->draws + d * step];
         for (size_t i = 0; i < count * fingers; i++) loudest[i * draws + d] = every->loudest[i * every->draws + d * step];
     }
-    return (judged){draws, own, loudest};
+    return (judged){.draws = draws, .own = own, .loudest = loudest};
 }
 
 /* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents. */
@@ -201,8 +202,9 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
         if (kept && kept < count) rows = some, count = kept;
     }
     const size_t most = contents * of->bands * 2 * of->candidates;
-    candidates from = {0, integers(memory, most), integers(memory, most), integers(memory, most), floats(memory, most),
-                       floats(memory, 2 * most * n)};
+    candidates from = {.content = integers(memory, most), .band = integers(memory, most),
+                       .rows = integers(memory, most), .scores = floats(memory, most),
+                       .weights = floats(memory, 2 * most * n)};
     int is_limited = find_candidates(&from, on, by, of, rows, count, memory);
     if (count < of->rows && (!from.count || is_limited) && of->is_ranked) {
         from.count = 0; /* among all frequencies */
@@ -218,7 +220,8 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, memory);
     if (contents > 1) {
         bring_to_level(own, loudest, &from, k, by, of, memory);
-        to->is_apart = best_combination(best_tones, &from, &(judged){draws, own, loudest}, on, by, of, memory);
+        const judged by_draws = {.draws = draws, .own = own, .loudest = loudest};
+        to->is_apart = best_combination(best_tones, &from, &by_draws, on, by, of, memory);
         if (to->is_apart < 0) return NOT_REACHED;
     }
     for (size_t j = 0; j < contents; j++) {
@@ -256,8 +259,8 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     plates on = *table;
     on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness;
     question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
-                   .candidates = given->candidates, .combinations = given->combinations,
-                   .apart = given->apart, .level = given->level, .background = given->background, .judging = given->judging,
+                   .candidates = given->candidates, .combinations = given->combinations, .apart = given->apart,
+                   .level = given->level, .background = given->background, .judging = given->judging,
                    .promise = given->promise, .few = read->few, .fine = read->fine, .few_points = at.few,
                    .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};
     of.starts = given->numbers, of.targets = of.starts + contents + 1, of.quiet = of.targets + of.starts[contents];
@@ -274,8 +277,8 @@ static int guarded(results *found, const plates *table, const raster *read, cons
 
 /* FOUND, NOT_REACHED where nothing is felt at all, or NO_MEMORY. */
 int answer(results *to, const plates *on, const raster *read, const rules *by, const asked *of) {
-    arena memory = {NULL, NULL, NULL};
+    arena memory = {.last = NULL};
     const int status = guarded(to, on, read, by, of, &memory);
-    release(&memory, (arena){NULL, NULL, NULL});
+    release(&memory, (arena){.last = NULL});
     return status;
 }

@@ -1,0 +1,19 @@
+// SPDX-License-Identifier: MIT
+//
+// The amplifier as a program for this machine (board.c lists its options).
+
+#include "board.h"
+#include "loop.h"
+#include "modbus_tcp.h"
+#include "posix.h"
+
+int main(int count, char **arguments)
+{
+    board_open(count, arguments);
+    loop_init();
+    for (;;) {
+        loop_once();
+        tcp_serve(loop_modbus(), loop_samples);
+        board_wait();
+    }
+}

@@ -1,0 +1,5 @@
+// SPDX-License-Identifier: MIT
+
+#include "config.h"
+
+struct sound_format sound_format;

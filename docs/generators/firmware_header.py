@@ -1,11 +1,10 @@
-"""Print the C header of protocol 3: `firmware_header.py > firmware/core/protocol.h`.
+"""The C header of protocol 3, firmware/core/protocol.h.
 
 Numbers of states, faults, refusals and messages, ranges of quantities, the place of each field in
 the words of a record, and what the words of each request may be.
 """
 
 import re
-import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 
@@ -176,7 +175,3 @@ def _fields(record: Record) -> Iterator[str]:
         elif isinstance(field, Bits):
             width = sum(width for _, width in field.parts)
             yield f"{{0, {(1 << width) - 1}, {REFUSALS['BAD_VALUE']}}}"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(header())

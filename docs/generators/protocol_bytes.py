@@ -42,8 +42,9 @@ def _wire_set(layers: Sequence[Layer]) -> list[LayerSet]:
     """Return layers in units of the wire."""
 
     def command(tone: Tone) -> Command:
-        numbers = (_integer(name, getattr(tone, name)) for name in ("frequency", "level", "phase"))
-        return Command(tone.channel, *numbers, keep_phase=tone.keep_phase)
+        level, phase = _integer("level", tone.level), _integer("phase", tone.phase)
+        frequency = _integer("frequency", tone.frequency)
+        return Command(tone.channel, frequency, level, phase, keep_phase=tone.keep_phase)
 
     return [
         LayerSet(
@@ -224,8 +225,8 @@ def _more(page: str) -> str:
         exchange.request(before, {})
     return _block(
         {
-            title + seen: exchange.request(*request)
-            for (title, *request), seen in zip(requests, _MORE[page], strict=False)
+            title + seen: exchange.request(name, values, address)
+            for (title, name, values, address), seen in zip(requests, _MORE[page], strict=False)
         }
     )
 

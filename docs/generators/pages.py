@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+import changed_tests
 import error_cases
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
@@ -70,6 +71,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
+    "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
 """The writers of each file, by its path from the root."""
 

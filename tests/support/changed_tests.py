@@ -3,7 +3,7 @@
     python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
 A test is near what has changed by its folder, then by the number of imports between both. A file
-that is no module has the tests of its folder and those that name it. What is not reached and what
+that is no module has the tests that name it and those of its folder. What is not reached and what
 the minute has no time for is printed. pytest loads this file as a plug-in, too.
 """
 
@@ -58,7 +58,7 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
 """What else to run after a change of files that begin so."""
 
 _MAX_FILES = 60  # collecting more leaves no time to run them
-_SECONDS = 50.0  # for tests, of a minute
+_SECONDS = 45.0  # for tests, of a minute
 _UNTIL = "ERA_TESTS_UNTIL"
 _NO_TIME = "without time"
 
@@ -103,13 +103,15 @@ def _git(*arguments: str) -> str:
 def nearest(changed: Sequence[str]) -> dict[str, int]:
     """The files of tests that changed files reach, by path: 0 in their folder, then by imports.
 
-    Of as many imports those of a near folder come first, and those that take long last.
+    Of a file that is no module those are 0 that name it, then come those of its folder. Of as many
+    imports those of a near folder come first, and those that take long last.
     """
     start: dict[str, int] = {}
     for path in changed:
+        is_module = path.endswith((".py", ".pyi"))
         start[_node(path)] = 0
-        start |= dict.fromkeys(_tests_beside(path), 0)
-        if not path.endswith((".py", ".pyi")):
+        start |= dict.fromkeys(_tests_beside(path), 0 if is_module else 1)
+        if not is_module:
             start |= dict.fromkeys(_tests_that_name(Path(path).name), 0)
             package = str(Path(path).parent).replace("/", ".")
             start |= {each: 0 for each in _importers() if each.rpartition(".")[0] == package}

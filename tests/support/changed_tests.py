@@ -109,12 +109,14 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
     start: dict[str, int] = {}
     for path in changed:
         is_module = path.endswith((".py", ".pyi"))
-        start[_node(path)] = 0
-        start |= dict.fromkeys(_tests_beside(path), 0 if is_module else 1)
-        if not is_module:
-            start |= dict.fromkeys(_tests_that_name(Path(path).name), 0)
+        first, second = [_node(path)], [*_tests_beside(path)]
+        if is_module:
+            first, second = [*first, *second], []
+        else:
             package = str(Path(path).parent).replace("/", ".")
-            start |= {each: 0 for each in _importers() if each.rpartition(".")[0] == package}
+            first += [each for each in _importers() if each.rpartition(".")[0] == package]
+            first += _tests_that_name(Path(path).name)
+        start = dict.fromkeys(second, 1) | start | dict.fromkeys(first, 0)
     distances = _distances(start)
     if "conftest" in start:
         distances = dict.fromkeys(_tests(), 1) | distances

@@ -19,6 +19,7 @@ from api_page import api_reference
 from client_stub import stub
 from command_page import command_reference
 from firmware_header import header
+from metrics_page import metrics
 from protocol_bytes import BYTES
 from protocol_tables import TABLES
 from python_page import with_entries
@@ -69,6 +70,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     },
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
+    "docs/reference/metrics.md": [part("docs/generators/metrics_page.py", metrics)],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],

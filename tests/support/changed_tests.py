@@ -45,7 +45,13 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (("sim/soft_amp/", "sim/measuring/"), ("make desk-test",)),
     (("firmware/",), ("make firmware-test",)),
     (("examples/application/",), ("make qt-test",)),
-    (("controller/gateway/",), ("pytest tests/integration/test_dashboard*.py",)),
+    (
+        ("controller/gateway/",),
+        (
+            "make pages",
+            "pytest tests/integration/test_dashboard*.py",
+        ),
+    ),
     (("docs/",), ("make docs",)),
     (
         ("pyproject.toml",),

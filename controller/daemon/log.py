@@ -47,11 +47,10 @@ class LogFormatter(JsonFormatter):
 
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """Bound the lengths, and write the level in small letters."""
-        log_data["level"] = log_data["level"].lower()
-        log_data["message"] = log_data["message"][:_MAX_MESSAGE]
+        level, message = log_data["level"].lower(), log_data["message"][:_MAX_MESSAGE]
         if "traceback" in log_data:
             log_data["traceback"] = log_data["traceback"][-4 * _MAX_MESSAGE :]
-        return log_data
+        return log_data | {"level": level, "message": message}
 
 
 def open_log_file(file: Path) -> TextIO:
@@ -101,10 +100,11 @@ class LineWriter(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line, or lose it."""
-        errors = contextlib.nullcontext(sys.stderr)
         with (
             contextlib.suppress(Exception),  # the disk may have space again
-            errors if self._file is None else open_log_file(self._file) as stream,
+            contextlib.nullcontext(sys.stderr)
+            if self._file is None
+            else open_log_file(self._file) as stream,
         ):
             stream.write(f"{record.getMessage()}\n")
             stream.flush()

@@ -118,6 +118,7 @@ def test_log_does_not_block_while_disk_hangs(
     assert heard.call_count == 3001
     thread.close()
     released.set()
+    wait_for(lambda: not thread.queue.unfinished_tasks)  # or they go to the real standard error
 
 
 def test_log_subscriber_gets_records_from_info_on(logger: logging.Logger, tmp_path: Path) -> None:

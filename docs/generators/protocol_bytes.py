@@ -7,15 +7,15 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
-from drivers.codec.can_bus.segments import unpack_frames
-from drivers.contents import Layer, Tone
-from drivers.host.can_wire import CanWire
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import More, Wire
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, QUANTITIES
+from drivers.wires.can_bus.frames import unpack_frames
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import More, Wire
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers

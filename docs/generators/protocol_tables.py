@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.table import (
     COMMAND,
@@ -25,6 +24,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     sensor_reading,
 )
+from drivers.wires.can_bus.canopen import CANOPEN
 from sim.amplifier.state_table import TRANSITIONS
 from word_names import word_names
 

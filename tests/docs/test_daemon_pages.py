@@ -13,7 +13,7 @@ from controller.daemon.config_sections import (
     LogSection,
     TouchSection,
 )
-from controller.daemon.states import DaemonState
+from controller.operation.states import DaemonState
 from model.config.sections import Section
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
 	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -36,6 +36,11 @@ test: .venv/installed-test
 	$(BIN)/pytest $(ENDING) -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'real_time and not alone and not long' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'alone and not long'
+
+# Of these for a minute those that are nearest to what differs from a commit, by default from where
+# this branch has left main. Others: make test-changed SINCE=HEAD~3
+test-changed: .venv/installed-test
+	$(BIN)/python tests/support/changed_tests.py $(if $(SINCE),--since $(SINCE))
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
@@ -71,6 +76,12 @@ lint: .venv/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+	$(PAGES) --check
+
+# Every page, part of a page, client stub and C header that is written from the code.
+PAGES := OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/support $(BIN)/python docs/generators/pages.py
+pages: .venv/installed-test
+	$(PAGES)
 
 # A million damaged frames on every kind of line; `make test` takes a few thousand.
 fuzz: .venv/installed-test

@@ -26,36 +26,7 @@ from model.rig.rig import Rig  # noqa: E402
 from model.table.table_cache import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 from registry import garbage_collection  # noqa: E402
-
-SLOWEST = (
-    "test_dashboard.py",
-    "test_demo.py",
-    "test_desk.py",
-    "test_daemon_faults_process.py",
-    "test_how_to_pages.py",
-    "test_firmware_host.py",
-    "test_latency_measured.py",
-    "test_errors.py",
-    "test_link_faults.py",
-    "test_dashboard_losses.py",
-    "test_rig_check.py",
-    "test_tutorials.py",
-    "test_calibration.py",
-    "test_diagnosis.py",
-    "test_daemon_over_a_wire.py",
-    "test_soak.py",
-    "test_soft_amp_sound.py",
-    "test_group_stops.py",
-    "test_convergence.py",
-    "test_table_commands.py",
-    "test_quick_faults.py",
-    "test_calibrate_on_the_bench.py",
-    "test_identify.py",
-    "test_consistency.py",
-    "test_layout_check.py",
-)
-"""Run in this order before all others: one that started last would leave the other cores idle."""
-
+from slowest_files import SLOWEST  # noqa: E402
 
 # Forty examples of each property, a hundred without it, however long a busy machine takes.
 settings.register_profile(

@@ -1,6 +1,6 @@
 """The methods of the clients that are one method of the API each: made from the registry.
 
-`calls.pyi`, written by docs/generators/client_stub.py, has their signatures for editors and mypy.
+`calls.pyi`, written by `make pages`, has their signatures for editors and mypy.
 """
 
 import inspect

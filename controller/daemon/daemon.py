@@ -166,7 +166,7 @@ class Daemon:
         running: asyncio.Task[None] | None = None
         try:
             await self._server.open(lock.bind())
-            self._log.listener = self._publisher.logged
+            self._log.subscriber = self._publisher.logged
             running = asyncio.create_task(self._supervisor.run(), name="control loop")
             self._inputs.start(self._config.touch)
             if self._dashboard is not None:
@@ -241,7 +241,7 @@ class Daemon:
                 for task in late:  # waiting for an amplifier that does not reply
                     task.cancel()
                     await asyncio.wait({task})
-            self._log.listener = None
+            self._log.subscriber = None
             learning = () if self.learning is None else (self.learning.close(),)
             gateway = () if self._gateway is None else (self._gateway,)
             for task in gateway:

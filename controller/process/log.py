@@ -1,4 +1,4 @@
-"""The daemon's log, in JSON lines, written by a thread.
+"""The daemon's log, in JSON lines, written by a thread (`QueueListener`).
 
 Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
 lost. Each logging call in the code is limited to a few lines a second; the next line says how many
@@ -7,18 +7,19 @@ were skipped. JSON escapes control characters, so that messages cannot forge lin
 
 import contextlib
 import errno
-import json
 import logging
 import os
 import queue
 import stat
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
+
+from pythonjsonlogger.json import JsonFormatter
 
 from controller.process.rate_limit import Rates
 
@@ -28,31 +29,28 @@ _RATE = 1.0  # 1/s after a burst
 _MAX_MESSAGE = 2000  # characters
 _CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
 
-_STANDARD_FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {
-    "message",
-    "asctime",
-    "taskName",
-}
 
+class LogFormatter(JsonFormatter):
+    """Formats a record as JSON: time, level, logger, message, extra fields, traceback.
 
-class JsonFormatter(logging.Formatter):
-    """Formats a record as JSON: time, level, logger, message, extra fields, traceback."""
+    One line of ASCII without control characters.
+    """
 
-    def format(self, record: logging.LogRecord) -> str:
-        """Return one line of ASCII without control characters."""
-        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        fields: dict[str, object] = {
-            "time": f"{seconds}.{int(record.msecs):03d}Z",
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage()[:_MAX_MESSAGE],
-        }
-        for name, value in record.__dict__.items():
-            if name not in _STANDARD_FIELDS:
-                fields[name] = value if isinstance(value, int | float | str | None) else str(value)
-        if record.exc_info:
-            fields["traceback"] = self.formatException(record.exc_info)[-4 * _MAX_MESSAGE :]
-        return json.dumps(fields)
+    converter = staticmethod(time.gmtime)
+    default_time_format = "%Y-%m-%dT%H:%M:%S"
+    default_msec_format = "%s.%03dZ"
+
+    def __init__(self) -> None:
+        names = {"asctime": "time", "levelname": "level", "name": "logger", "exc_info": "traceback"}
+        fields = "asctime", "levelname", "name", "message"
+        super().__init__(fields, rename_fields=names, json_default=str)
+
+    def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
+        """Bound the lengths, and write the level in small letters."""
+        level, message = log_data["level"].lower(), log_data["message"][:_MAX_MESSAGE]
+        if "traceback" in log_data:
+            log_data["traceback"] = log_data["traceback"][-4 * _MAX_MESSAGE :]
+        return log_data | {"level": level, "message": message}
 
 
 def open_log_file(file: Path) -> TextIO:
@@ -90,54 +88,66 @@ class RateLimitFilter(logging.Filter):
         return is_written
 
 
-class LogThread(logging.Handler):
-    """Writes the log until it is closed; `lines` are those that wait for that.
+class LineWriter(logging.Handler):
+    """Appends each record's message to a file, or to standard error.
 
-    file: opened to append each line, whatever has become of it; None for standard error. listener:
-    called with records from level info on in the thread that logs them.
+    file: opened for each line, whatever has become of it; None for standard error.
     """
 
     def __init__(self, file: Path | None) -> None:
         super().__init__()
-        self.setFormatter(JsonFormatter())
-        self.listener: Callable[[logging.LogRecord], None] | None = None
-        self.lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
         self._file = file
-        self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
-        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line, or lose it."""
+        with (
+            contextlib.suppress(Exception),  # the disk may have space again
+            contextlib.nullcontext(sys.stderr)
+            if self._file is None
+            else open_log_file(self._file) as stream,
+        ):
+            stream.write(f"{record.getMessage()}\n")
+            stream.flush()
+
+
+class LogThread(QueueHandler):
+    """Writes the log until it is closed, in a thread; file: None for standard error.
+
+    subscriber: called with records from level info on in the thread that logs them.
+    """
+
+    def __init__(self, file: Path | None) -> None:
+        self._lines = queue.Queue[logging.LogRecord](_MAX_QUEUED)
+        super().__init__(self._lines)
+        self.setFormatter(LogFormatter())
+        self.subscriber: Callable[[logging.LogRecord], None] | None = None
+        self._writer = QueueListener(self._lines, LineWriter(file))
+        self._writer.start()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue the line of a record; never blocks."""
-        with contextlib.suppress(Exception):  # a full queue, or a failing log, stops nothing
-            self.lines.put_nowait(self.format(record))
-        with contextlib.suppress(Exception):  # which is told all the same
-            if self.listener is not None and record.levelno >= logging.INFO:
-                self.listener(record)
+        super().emit(record)
+        with contextlib.suppress(Exception):
+            if self.subscriber is not None and record.levelno >= logging.INFO:
+                self.subscriber(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Lose the line: a full queue, or a failing log, stops nothing."""
 
     def close(self) -> None:
         """Write the queued lines, within a time limit."""
         super().close()
+        with self._lines.all_tasks_done:
+            self._lines.all_tasks_done.wait_for(
+                lambda: not self._lines.unfinished_tasks, _CLOSE_TIMEOUT
+            )
         with contextlib.suppress(queue.Full):
-            self.lines.put(None, timeout=_CLOSE_TIMEOUT)
-            self._thread.join(_CLOSE_TIMEOUT)
-
-    def _write_all(self) -> None:
-        errors = contextlib.nullcontext(sys.stderr)
-        while (line := self.lines.get()) is not None:
-            with (
-                contextlib.suppress(OSError, ValueError),  # the disk may have space again
-                errors if self._file is None else open_log_file(self._file) as stream,
-            ):
-                stream.write(f"{line}\n")
-                stream.flush()
+            self._writer.enqueue_sentinel()
 
 
 def start_log(file: Path | None, *, level: str) -> LogThread:
     """Send all records of this process from a level on to a file, or to standard error."""
     thread = LogThread(file)
     thread.addFilter(RateLimitFilter())
-    root = logging.getLogger()
-    root.handlers[:] = [thread]
-    root.setLevel(level.upper())
-    logging.raiseExceptions = False
+    logging.basicConfig(handlers=[thread], level=level.upper(), force=True)
     return thread

@@ -17,7 +17,6 @@ from importlib.metadata import PackageNotFoundError, entry_points, requires, ver
 from pathlib import Path
 from typing import Any
 
-from packaging.requirements import Requirement
 from pydantic.json_schema import models_json_schema
 
 from controller.api.client import Client
@@ -39,6 +38,8 @@ MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
 _NAMED = ("rig", "layout")  # keys of a daemon's file; a table is large and can be built again
+_REQUIREMENT = re.compile(r"(?im)^[ \t]*([A-Z0-9](?:[A-Z0-9._-]*[A-Z0-9])?)")
+"""The name of the distribution at the start of each line, a requirement of PEP 508."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,7 @@ def write_zip(path: Path, report: Report) -> None:
 def versions() -> dict[str, Any]:
     """Versions of Python, the system, era-haptics and its dependencies, and all plug-ins."""
     dependencies = {}
-    for line in requires("era-haptics") or ():
-        name = Requirement(line).name
+    for name in _REQUIREMENT.findall("\n".join(requires("era-haptics") or ())):
         try:
             dependencies[name] = version(name)
         except PackageNotFoundError:

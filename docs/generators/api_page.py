@@ -1,11 +1,7 @@
-"""The reference part of reference/api.md: methods, topics, types and errors of the API.
-
-`python docs/generators/api_page.py` rewrites it between the page's two marks.
-"""
+"""The reference part of reference/api.md: methods, topics, types and errors of the API."""
 
 import types
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from controller.api.jsonrpc import ERROR_MEANINGS
@@ -13,13 +9,9 @@ from controller.api.methods import METHODS
 from controller.api.schema import Message
 from controller.api.summaries import SUMMARIES
 from controller.api.topics import TOPICS, EventParams
-from page_part import insert
-
-WRITER = "docs/generators/api_page.py"
-PAGE = Path(__file__).parents[1] / "reference" / "api.md"
 
 
-def reference() -> str:
+def api_reference() -> str:
     """All tables, as Markdown."""
     models: dict[str, type[Message]] = {}
     lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
@@ -121,7 +113,3 @@ def _bounds(metadata: Iterable[object]) -> Iterator[str]:
 
 def _summary(model: type[Message]) -> str:
     return " ".join((model.__doc__ or "").split())
-
-
-if __name__ == "__main__":
-    PAGE.write_text(insert(PAGE.read_text("utf-8"), reference(), writer=WRITER), encoding="utf-8")

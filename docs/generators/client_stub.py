@@ -1,19 +1,12 @@
-"""Signatures of the clients' methods that are made from the registry of the API's methods.
-
-`python docs/generators/client_stub.py` writes controller/api/calls.pyi.
-"""
+"""controller/api/calls.pyi: signatures of the clients' methods made from the API's registry."""
 
 import inspect
 import types
-from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
 
-import controller.api
 from controller.api.calls import BY_HAND, signature_of
 from controller.api.methods import METHODS
 from controller.api.schema import Empty
-
-STUB = Path(controller.api.__file__).with_name("calls.pyi")
 
 
 def stub() -> str:
@@ -61,7 +54,3 @@ def _kind(annotation: Any) -> str:
     if get_origin(annotation) in (Union, types.UnionType):
         return " | ".join(map(_kind, get_args(annotation)))
     return "None" if annotation is type(None) else str(annotation.__name__)
-
-
-if __name__ == "__main__":
-    STUB.write_text(stub(), encoding="utf-8")

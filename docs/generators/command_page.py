@@ -1,21 +1,16 @@
 """The reference in docs/reference/commands.md: every command with its arguments and options.
 
-`python docs/generators/command_page.py docs/reference/commands.md` writes it anew between the
-page's two marks, from the commands themselves. What many commands have stands once, above them.
+What many commands have stands once, above them.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 import typer
 from typer.core import TyperGroup
 
 from controller.cli.main import load_commands
-from page_part import insert
 
-WRITER = "docs/generators/command_page.py"
 _MANY = 6
 """So many commands with the same argument or option: it is a common one."""
 
@@ -76,10 +71,3 @@ def _entry(
     for (name, text), shared in zip(records, is_common, strict=True):
         if not shared:
             yield f"- `{name}`: {text}"
-
-
-if __name__ == "__main__":
-    path = Path(sys.argv[1])
-    path.write_text(
-        insert(path.read_text("utf-8"), command_reference(), writer=WRITER), encoding="utf-8"
-    )

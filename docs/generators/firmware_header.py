@@ -1,11 +1,10 @@
-"""Print the C header of protocol 3: `firmware_header.py > firmware/core/protocol.h`.
+"""The C header of protocol 3, firmware/core/protocol.h.
 
 Numbers of states, faults, refusals and messages, ranges of quantities, the place of each field in
 the words of a request, and what those words may be. Replies: `firmware_records.py`.
 """
 
 import re
-import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 
@@ -198,7 +197,3 @@ def _emergencies() -> str:
     ]
     head = "// Of each fault: code of the emergency, and the error register meanwhile (CiA 301).\n"
     return f"{head}#define EMERGENCY_TABLE {''.join(f' {_BREAK}{row}' for row in rows).lstrip()}\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(header())

@@ -1,10 +1,9 @@
-"""Print the C header of what an amplifier sends: `firmware_records.py > firmware/core/records.h`.
+"""The C header of what an amplifier sends, firmware/core/records.h.
 
 Each record as a struct, and a function that appends its words: the firmware fills in fields by
 their names, and the table says in which words they go.
 """
 
-import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from itertools import groupby
@@ -147,7 +146,3 @@ def _wrapped(text: str) -> str:
         break_long_words=False,
     )
     return "".join(f"{line}\n" for line in lines).replace("~", " ")
-
-
-if __name__ == "__main__":
-    sys.stdout.write(records_header())

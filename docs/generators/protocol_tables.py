@@ -1,16 +1,8 @@
-"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.table`.
+"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.table`."""
 
-`python docs/generators/protocol_tables.py docs/reference` writes each anew between two marks, and
-the files amplifier.eds and amplifier.dbc whole.
-"""
-
-import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 
-from amplifier_dbc import dbc_text
-from amplifier_eds import eds_text
 from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.table import (
     COMMAND,
@@ -33,11 +25,9 @@ from drivers.protocol.table import (
     sensor_reading,
 )
 from drivers.wires.can_bus.canopen import CANOPEN
-from page_part import insert
 from sim.amplifier.state_table import TRANSITIONS
 from word_names import word_names
 
-WRITER = "docs/generators/protocol_tables.py"
 _REPLIES: Mapping[str, Record] = {
     **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": MESSAGES["GetStatus"].reply},
     **{"Taken": MESSAGES["Set"].reply, "Faults": MESSAGES["GetFaults"].reply},
@@ -207,8 +197,8 @@ def objects() -> str:
     return _table(("object", "subindex and word, of four channels and eight layers"), rows())
 
 
-PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
-    "protocol.md": {
+TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
+    "protocol": {
         **{"quantities": quantities, "messages": messages, "records": records},
         "states": lambda: f"{_numbers(STATES, 'state')}\n\n{transitions()}",
         "faults": lambda: _list("Faults and their numbers", FAULTS),
@@ -217,23 +207,7 @@ PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
             (_list("Features, by bit", FEATURES), _list("Flags of Status, by bit", STATUS_FLAGS))
         ),
     },
-    "modbus.md": {"mailboxes": mailboxes},
-    "can.md": {"emergencies": emergencies, "objects": objects},
+    "modbus": {"mailboxes": mailboxes},
+    "can": {"emergencies": emergencies, "objects": objects},
 }
-"""What writes each part of each page."""
-FILES: Mapping[str, Callable[[], str]] = {"amplifier.eds": eds_text, "amplifier.dbc": dbc_text}
-
-
-def written(page: str, name: str) -> str:
-    """Return the text of a page by its name, with all its parts as they must be."""
-    for part, write in PARTS[name].items():
-        page = insert(page, write(), writer=f"{WRITER} {part}")
-    return page
-
-
-if __name__ == "__main__":
-    for name in PARTS:
-        path = Path(sys.argv[1]) / name
-        path.write_text(written(path.read_text("utf-8"), name), "utf-8")
-    for name, text in FILES.items():
-        (Path(sys.argv[1]) / name).write_text(text(), "utf-8")
+"""What writes each table, by page and part."""

@@ -1,9 +1,9 @@
 """The entries of docs/reference/python-api.md: signatures and docstrings of `era_haptics`.
 
-`python docs/generators/python_page.py` writes them anew, each block up to the next section, below
-the comment that has its names: `<!-- api: query; Rig: era, fingerprint; Client(): * -->` is a
-function, a class with two of its members, and one that is made elsewhere, with all of its members.
-Functions are a list, a class has a heading and a list of its members.
+Each block goes up to the next section, below the comment that has its names: `<!-- api: query;
+Rig: era, fingerprint; Client(): * -->` is a function, a class with two of its members, and one that
+is made elsewhere, with all of its members. Functions are a list, a class has a heading and a list
+of its members.
 """
 
 import ast
@@ -16,16 +16,13 @@ from typing import Any, TypeAlias
 
 import era_haptics
 
-WRITER = "docs/generators/python_page.py"
-PAGE = Path(__file__).parents[1] / "reference" / "python-api.md"
-
 _BLOCK = re.compile(r"(<!-- api: (.+?) -->\n\n).*?(?=\n## |\Z)", re.DOTALL)
 _WIDTH = 120
 
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def written(page: str) -> str:
+def with_entries(page: str) -> str:
     """The page with every block as its comment and the source have it."""
     return _BLOCK.sub(lambda block: block[1] + "\n".join(_entries(block[2])) + "\n", page)
 
@@ -137,7 +134,3 @@ def _wrapped(text: str, indent: str) -> list[str]:
         break_long_words=False,
         break_on_hyphens=False,
     )
-
-
-if __name__ == "__main__":
-    PAGE.write_text(written(PAGE.read_text("utf-8")), "utf-8")

@@ -9,11 +9,9 @@ import pytest
 from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
-from command_page import WRITER, command_reference
 from controller.cli.main import load_commands
 from model.cli import app
 from model.table import overview
-from page_part import insert
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
@@ -49,11 +47,6 @@ def test_page_lists_every_command_with_its_options() -> None:
         names = {max(option.opts, key=len) for option in command.params}
         options = {name for name in names if name.startswith("--")}
         assert named == options - {"--help"}, name
-
-
-def test_page_is_current() -> None:
-    """Written anew by the program that stands in the page."""
-    assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, f"python {WRITER}"
 
 
 def test_every_command_with_json_tells_its_keys() -> None:

@@ -5,8 +5,7 @@ own, or an `edit` of the prepared ones; what happens `before`; the exit `status`
 `at`, the file with its line, the key or the option that the message names. Entries under `variants`
 share their command line. A case that names era.sock finds a daemon there.
 
-Those `shown` are quoted in docs/reference/errors.md. After a message was reworded,
-`python tests/support/error_cases.py` writes these quotations anew.
+Those `shown` are quoted in docs/reference/errors.md; `make pages` writes these quotations.
 """
 
 import contextlib
@@ -253,13 +252,13 @@ class Quotation:
     status: int
 
 
-def quotations() -> list[Quotation]:
+def quotations(page: str) -> list[Quotation]:
     """The errors of the page in their order, each with the exit status of its section.
 
     Blank lines part those of a section; the first line of each says what is wrong.
     """
     found, status = [], -1
-    for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
+    for section in page.split("\n## ")[1:]:
         if promised := re.search(r"exit status (\d)", section.splitlines()[0]):
             status = int(promised[1])
         for box in section.split("```text\n")[1:]:
@@ -270,19 +269,14 @@ def quotations() -> list[Quotation]:
     return found
 
 
-def _write_page() -> None:
-    """Quote all messages anew."""
+def with_messages(page: str) -> str:
+    """The page with the present message of every error that it quotes."""
     shown = {tuple(case.typed): case for case in cases() if case.shown}
-    page = PAGE.read_text("utf-8")
     with tempfile.TemporaryDirectory() as shelf, filled(Path(shelf)):
-        for quoted in quotations():
+        for quoted in quotations(page):
             case = shown[tuple(quoted.typed)]
             with tempfile.TemporaryDirectory() as folder:
                 text = provoke(case, Path(folder), Path(shelf)).text.rstrip("\n")
             typed = "\n".join(quoted.typed)
             page = page.replace(f"\n{typed}\n{quoted.text}\n", f"\n{typed}\n{text}\n")
-    PAGE.write_text(page, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    _write_page()
+    return page

@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import api_page
-import client_stub
 from controller.api.connection import Connection
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -24,7 +22,6 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, ArmParams, SubscribeParams
 from controller.api.schema import Empty, Message
 from controller.daemon.methods import ApiService
-from page_part import insert
 
 
 def refusal(line: bytes) -> RpcError:
@@ -227,17 +224,6 @@ def test_params_of_any_shape_are_valid_or_refused(method: str, params: dict[str,
     except RpcError as error:
         text = str(error)
     assert text == "" or text.isprintable()
-
-
-def test_reference_page_is_up_to_date() -> None:
-    """The page holds what the generator writes from the models; run it after a change."""
-    page = api_page.PAGE.read_text("utf-8")
-    assert insert(page, api_page.reference(), writer=api_page.WRITER) == page
-
-
-def test_stub_of_the_clients_is_up_to_date() -> None:
-    """Editors and mypy see of each method what is registered of it."""
-    assert client_stub.stub() == client_stub.STUB.read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -23,7 +23,7 @@ from controller.operation.dumps import (
     write_dump,
 )
 from controller.operation.states import DaemonState, Operation
-from controller.process.log import JsonFormatter, LogThread, RateLimitFilter
+from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from controller.process.service_manager import ServiceManager
 from drivers.wires.wire import Reply
 from gateway_bench import wait_for
@@ -44,12 +44,29 @@ def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
 def test_log_lines_cannot_be_forged_and_are_bounded() -> None:
     """Any text stays inside one JSON string of printable ASCII, and a long message is cut."""
     evil = 'x\n{"level":"info","message":"all is well"}\r\x1b[2J\x00\u2028"'
-    line = JsonFormatter().format(record(evil, cause=evil))
+    line = LogFormatter().format(record(evil, cause=evil))
     assert line.isascii()
     assert line.isprintable()
     fields = json.loads(line)
     assert (fields["message"], fields["cause"], fields["level"]) == (evil, evil, "warning")
-    assert len(JsonFormatter().format(record("x" * 10**6))) < 10_000
+    assert len(LogFormatter().format(record("x" * 10**6))) < 10_000
+
+
+def test_log_line_has_the_keys_of_its_page() -> None:
+    """Time in UTC with milliseconds, level, logger, message, what a call adds, and a traceback."""
+    made = record("link: %s", cause=OSError("gone"), remedy=None, skipped=3)
+    made.args = ("lost",)
+    made.created, made.msecs = 1_000_000_000.25, 250.0
+    expected = {"time": "2001-09-09T01:46:40.250Z", "level": "warning", "logger": "era.x"}
+    more = {"message": "link: lost", "cause": "gone", "remedy": None, "skipped": 3}
+    assert json.loads(LogFormatter().format(made)) == {**expected, **more}
+    try:
+        raise ValueError("x" * 10**5)
+    except ValueError:
+        made.exc_info = sys.exc_info()
+    fields = json.loads(LogFormatter().format(made))
+    assert fields.keys() - expected.keys() - more.keys() == {"traceback"}
+    assert fields["traceback"] == "x" * 8000
 
 
 def test_log_limits_rate_of_each_call_except_state_changes() -> None:
@@ -91,31 +108,47 @@ def test_log_does_not_block_while_disk_hangs(
 
     monkeypatch.setattr(sys, "stderr", Hanging())
     thread, heard = LogThread(None), Mock()
-    thread.listener = heard
+    thread.subscriber = heard
     logger.addHandler(thread)
     logger.warning("first")
     assert hangs.wait(20)
     for _ in range(3000):
         logger.warning("more")
-    assert thread.lines.qsize() == 2000
+    assert thread.queue.qsize() == 2000
     assert heard.call_count == 3001
     thread.close()
     released.set()
+    wait_for(lambda: not thread.queue.unfinished_tasks)  # or they go to the real standard error
 
 
-def test_log_listener_gets_records_from_info_on(logger: logging.Logger, tmp_path: Path) -> None:
+def test_log_subscriber_gets_records_from_info_on(logger: logging.Logger, tmp_path: Path) -> None:
     """The file gets all of them."""
     thread = LogThread(tmp_path / "log")
     logger.setLevel(logging.DEBUG)
     logger.addHandler(thread)
     heard: list[str] = []
-    thread.listener = lambda record: heard.append(record.getMessage())
+    thread.subscriber = lambda record: heard.append(record.getMessage())
     logger.debug("detail")
     logger.info("news")
     thread.close()
     assert heard == ["news"]
     lines = (tmp_path / "log").read_text("utf-8").splitlines()
     assert [json.loads(line)["message"] for line in lines] == ["detail", "news"]
+
+
+def test_log_goes_on_after_a_line_that_cannot_be_written(
+    logger: logging.Logger, tmp_path: Path
+) -> None:
+    """Where the folder of its file is missing for a while, what is logged meanwhile is lost."""
+    file = tmp_path / "later" / "log"
+    thread = LogThread(file)
+    logger.addHandler(thread)
+    logger.warning("lost")
+    wait_for(lambda: not thread.queue.unfinished_tasks)
+    file.parent.mkdir()
+    logger.warning("after")
+    thread.close()
+    assert json.loads(file.read_text("utf-8"))["message"] == "after"
 
 
 def test_log_is_reopened_after_rotation(logger: logging.Logger, tmp_path: Path) -> None:

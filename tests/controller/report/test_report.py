@@ -94,6 +94,19 @@ def test_versions_list_packages_of_plug_ins(
     }
 
 
+def test_versions_list_what_requirements_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The valid requirements of PEP 508's own list, whatever follows the name."""
+    lines = [
+        *("A", "A.B-C_D", "aa", "name", "name<=1", "name>=3,<2", "name@http://foo.com"),
+        *("name [fred,bar] @ http://foo.com ; python_version=='2.7'", "name;os_name=='a'"),
+        "numpy >=2 ; extra == 'x'",
+    ]
+    monkeypatch.setattr("controller.report.collect.requires", lambda _: lines)
+    packages = versions()["packages"]
+    assert packages.pop("numpy")[0].isdigit()
+    assert packages == dict.fromkeys(["A", "A.B-C_D", "aa", "name"], "not installed")
+
+
 def test_report_includes_invalid_files(tmp_path: Path) -> None:
     """An invalid file may be the subject: it is included, shown like any other, and listed once."""
     (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")

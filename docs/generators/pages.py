@@ -1,0 +1,105 @@
+"""Every page, part of a page, client stub and C header that is written from the code.
+
+`make pages` writes them; with `--check`, as in `make lint`, the stale ones are named. What depends
+on a package index (constraints.txt, reference/licences.md) and what is measured (docs/measured) is
+written by targets of its own.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import changed_tests
+import error_cases
+from amplifier_dbc import dbc_text
+from amplifier_eds import eds_text
+from api_page import api_reference
+from client_stub import stub
+from command_page import command_reference
+from firmware_header import header
+from firmware_records import records_header
+from metrics_page import metrics
+from protocol_bytes import BYTES
+from protocol_tables import TABLES
+from python_page import with_entries
+
+ROOT = Path(__file__).parents[2]
+END = "<!-- end -->"
+
+Writer: TypeAlias = Callable[[str], str]
+"""From the present text of a file to the text that it must have."""
+
+
+def whole(write: Callable[[], str]) -> Writer:
+    """The writer of a file of which nothing is written by hand."""
+    return lambda _: write()
+
+
+def part(name: str, write: Callable[[], str]) -> Writer:
+    """The writer of what stands between the mark with this name and the next end of a part."""
+    return lambda page: insert(page, write(), name=name)
+
+
+def insert(page: str, text: str, *, name: str) -> str:
+    """The page with this text as its part of a name; ValueError for a page without its marks."""
+    begin = f"<!-- begin: written by {name} -->"
+    found = re.fullmatch(rf"(.*{begin}\n).*?({END}\n.*)", page, re.DOTALL)
+    if found is None:
+        raise ValueError(f"the page has no lines {begin} and {END}")
+    return f"{found[1]}\n{text.rstrip()}\n\n{found[2]}"
+
+
+def _parts(writer: str, parts: Mapping[str, Callable[[], str]]) -> list[Writer]:
+    return [part(f"docs/generators/{writer} {name}", write) for name, write in parts.items()]
+
+
+def _of_protocol(page: str) -> list[Writer]:
+    tables = _parts("protocol_tables.py", TABLES.get(page, {}))
+    return [*tables, *_parts("protocol_bytes.py", BYTES.get(page, {}))]
+
+
+WRITTEN: Mapping[str, Sequence[Writer]] = {
+    "controller/api/calls.pyi": [whole(stub)],  # before python-api.md, which shows it
+    "firmware/core/protocol.h": [whole(header)],
+    "firmware/core/records.h": [whole(records_header)],
+    "docs/reference/amplifier.dbc": [whole(dbc_text)],
+    "docs/reference/amplifier.eds": [whole(eds_text)],
+    **{
+        f"docs/reference/{page}.md": _of_protocol(page)
+        for page in ("protocol", "serial", "modbus", "can")
+    },
+    "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
+    "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
+    "docs/reference/metrics.md": [part("docs/generators/metrics_page.py", metrics)],
+    "docs/reference/python-api.md": [with_entries],
+    "docs/reference/errors.md": [error_cases.with_messages],
+    "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
+}
+"""The writers of each file, by its path from the root."""
+
+
+def main(arguments: Sequence[str], *, root: Path = ROOT) -> int:
+    """Write all files that are stale, or name them and return 1."""
+    is_check, status = "--check" in arguments, 0
+    for name, writers in WRITTEN.items():
+        path = root / name
+        before = text = path.read_text("utf-8") if path.exists() else ""
+        try:
+            for write in writers:
+                text = write(text)
+        except Exception as error:
+            error.add_note(f"while {name} was written")
+            raise
+        if text != before and is_check:
+            sys.stderr.write(f"{name} is stale: run `make pages`\n")
+            status = 1
+        elif text != before:
+            path.write_text(text, encoding="utf-8")
+            sys.stdout.write(f"wrote {name}\n")
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

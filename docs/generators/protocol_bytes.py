@@ -1,0 +1,360 @@
+"""The bytes on docs/reference/{protocol,serial,modbus,can}.md, by the codecs of both ends.
+
+One set and its commit, then other requests, each by a host's wire and a simulated amplifier.
+"""
+
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+
+from drivers.playing.contents import Layer, Tone
+from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
+from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
+from drivers.protocol.table import MESSAGES, QUANTITIES
+from drivers.wires.can_bus.frames import unpack_frames
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import More, Wire
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+
+SESSION, TOKEN = 0x2A17, 0x0102
+_BYTES_PER_LINE = 32
+
+# What protocol.md says in words: frequency, then level and phase of each channel.
+_TONES = (
+    (110.0, ((0.2, 0.0), (0.11, -90.0), (0.06, 135.0), (0.04, 20.5))),
+    (150.0, ((0.05, 60.0), (0.18, 0.0), (0.09, -45.0), (0.07, 170.0))),
+    (190.0, ((0.08, -120.0), (0.03, 15.0), (0.21, 0.0), (0.1, 75.0))),
+    (240.0, ((0.06, 90.0), (0.12, -10.0), (0.05, -60.25), (0.25, 0.0))),
+)
+_BEFORE = ((0.22, 0.1, 0.05, 0.03), (0.04, 0.2, 0.08, 0.06), (0.07, 0.02, 0.23, 0.09))
+
+
+def _integer(name: str, value: float) -> int:
+    return QUANTITIES[name].to_wire(value)
+
+
+def _wire_set(layers: Sequence[Layer]) -> list[LayerSet]:
+    """Return layers in units of the wire."""
+
+    def command(tone: Tone) -> Command:
+        level, phase = _integer("level", tone.level), _integer("phase", tone.phase)
+        frequency = _integer("frequency", tone.frequency)
+        return Command(tone.channel, frequency, level, phase, keep_phase=tone.keep_phase)
+
+    return [
+        LayerSet(
+            *(each.number, _integer("ramp", each.ramp), _integer("valid_for", each.valid_for)),
+            tuple(map(command, each.tones)),
+        )
+        for each in layers
+    ]
+
+
+_JOINED = _wire_set(
+    [
+        Layer(
+            number,
+            tuple(
+                Tone(channel, frequency, level, phase, keep_phase=number < 3)
+                for channel, (level, phase) in enumerate(tones)
+            ),
+            *(0.02, 0.5),
+        )
+        for number, (frequency, tones) in enumerate(_TONES)
+    ]
+)
+_STREAM = (
+    LayerSet(
+        *(0, 20, 500),
+        (
+            Command(0, _integer("frequency", 110), _integer("level", 0.2), 0),
+            Command(
+                *(3, _integer("frequency", 250.5), _integer("level", 1), _integer("phase", -90)),
+                keep_phase=True,
+                onset=Envelope(
+                    _integer("envelope_step", 0.005),
+                    (
+                        (_integer("level", 0.1), _integer("phase", 90)),
+                        (_integer("level", 1), _integer("phase", -0.01)),
+                    ),
+                ),
+            ),
+        ),
+    ),
+    LayerSet(2, 10, 0),
+    LayerSet(3, 0, 800, renew=True),
+)
+(_SET,) = parts(pack_layers(_JOINED), session=SESSION, token=TOKEN, now=False)
+_ARM = {"session": SESSION, "watchdog": 250}
+_COMMIT = {"session": SESSION, "token": TOKEN}
+_STOP = {"ramp": 5}
+
+
+class _Exchange:
+    """A host's wire and a simulated amplifier of four channels, at one moment; notes all bytes.
+
+    kind: serial, tcp, rtu or can; number: sequence, tag or number of the last request.
+    """
+
+    def __init__(self, kind: str, number: int) -> None:
+        self.amplifier = Amplifier("a", channels=4)
+        self._lines: list[str] = []
+        self._is_can = kind == "can"
+        far = {1: self.amplifier}
+        self._wire: Wire
+        self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers
+        if kind == "serial":
+            self._wire = SerialWire(921_600, sequence=number)
+            self._end = SerialAmplifiers(far, self._replied)
+        elif self._is_can:
+            self._wire = CanWire(500_000, sequence=number)
+            self._end = CanAmplifiers(far, self._replied)
+        else:
+            is_rtu = kind == "rtu"
+            self._wire = ModbusWire(115_200 if is_rtu else 0, is_rtu=is_rtu, number=number)
+            self._end = ModbusAmplifiers(far, self._replied, is_rtu=is_rtu)
+
+    def request(self, name: str, values: Values, address: int = 1) -> list[str]:
+        """Send a request; return what went over the line, a line for each frame."""
+        self._lines = []
+        self._send(self._wire.request(address, name, values))
+        return self._lines
+
+    def _send(self, data: bytes) -> None:
+        self._note(">", data)
+        self._end.receive(data, 0.0)
+
+    def _replied(self, data: bytes) -> None:
+        self._note("<", data)
+        for arrival in self._wire.received(data):
+            if isinstance(arrival, More):
+                self._send(arrival.data)
+
+    def _note(self, direction: str, data: bytes) -> None:
+        frames = [(each.id, each.data) for each in unpack_frames(data)] if self._is_can else []
+        for identifier, content in frames:
+            self._lines.append(f"{direction} {identifier:03X} {content.hex(' ').upper()}")
+        if not self._is_can:
+            self._lines.append(f"{direction} {data.hex(' ').upper()}")
+
+
+def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
+    """Return an exchange with an armed amplifier and three layers, after requests by name."""
+    exchange = _Exchange(kind, number)
+    exchange.amplifier.handle("Arm", _ARM, 0.0)
+    layers = [
+        Layer(number, tuple(Tone(channel, tones[0], level) for channel, level in rows), 0.0)
+        for number, (tones, rows) in enumerate(zip(_TONES, map(enumerate, _BEFORE), strict=False))
+    ]
+    (part,) = parts(pack_layers(_wire_set(layers)), session=SESSION, token=TOKEN - 1, now=True)
+    exchange.amplifier.handle("Set", part, 0.0)
+    for name in before:
+        exchange.request(name, _SET if name == "Set" else {})
+    return exchange
+
+
+def _block(shown: Mapping[str, Sequence[str]]) -> str:
+    """Return requests by their titles, each with its frames, as a block of code."""
+    lines = list[str]()
+    for title, frames in shown.items():
+        lines.append(f"# {title}")
+        for frame in frames:
+            lines += textwrap.wrap(frame, 2 + 3 * _BYTES_PER_LINE, subsequent_indent="  ")
+    return textwrap.indent("\n".join(lines), "    ")
+
+
+_KINDS: Mapping[str, str] = {"serial": "serial", "modbus": "tcp", "can": "can"}
+_FIRST: Mapping[str, tuple[int, str]] = {
+    **{"serial": (7, ""), "modbus": (65533, "GetCaps"), "can": (6, "Hello")}
+}
+"""Number before the set, and the request of which the page says nothing."""
+
+
+def _join(page: str) -> str:
+    """Return the set and its commit."""
+    number, before = _FIRST[page]
+    exchange = _vibrating(_KINDS[page], number, *before.split())
+    frames = exchange.request("Set", _SET)
+    sent = [frame for frame in frames if frame.startswith(">")]
+    title = {
+        "serial": f"Set: {len(sent[0].split()) - 1} bytes",
+        "modbus": "Set: written, then its reply read",
+        "can": f"Set: {len(sent)} frames",
+    }
+    return _block({title[page]: frames, "Commit": exchange.request("Commit", _COMMIT)})
+
+
+def _rtu() -> str:
+    """Return the commit on Modbus RTU, and a broadcast."""
+    exchange = _vibrating("rtu", 65531, "GetCaps", "Set")
+    return _block(
+        {
+            "The commit on RTU": exchange.request("Commit", _COMMIT),
+            "Stop along 5 ms, to all, on RTU": exchange.request("Stop", _STOP, 0),
+        }
+    )
+
+
+_MORE: Mapping[str, Sequence[str]] = {
+    "serial": ("", ": an Event, then the reply", "", ": an Event, no reply"),
+    "modbus": (": the identity is read", "", ": code 10, no channel"),
+    "can": (
+        ": NMT start, object 2000 subindex 5, the message",
+        *(": an Event, then the reply", "", ": an Event, no reply"),
+    ),
+}
+"""What is to be seen of Hello, Arm, Ping and Stop on each wire."""
+
+
+def _more(page: str) -> str:
+    """Return requests to an amplifier that is disarmed at first."""
+    requests: Sequence[tuple[str, str, Values, int]] = (
+        ("Hello", "Hello", {}, 1),
+        (f"Arm with session {SESSION:04X}, watchdog 250 ms", "Arm", _ARM, 1),
+        ("Ping of another session, refused", "Ping", {"session": 7}, 1),
+        ("Stop along 5 ms, to all", "Stop", _STOP, 0),
+    )
+    number, before = _FIRST[page]
+    exchange = _Exchange(_KINDS[page], number if page == "modbus" else 5)
+    if page == "modbus":
+        exchange.request(before, {})
+    return _block(
+        {
+            title + seen: exchange.request(name, values, address)
+            for (title, name, values, address), seen in zip(requests, _MORE[page], strict=False)
+        }
+    )
+
+
+def _words(rows: Iterable[tuple[Sequence[int], str]]) -> str:
+    """Return rows of words with what stands beside them, as a block of code."""
+    shown = [(" ".join(f"{word % 0x10000:04X}" for word in words), text) for words, text in rows]
+    width = max(len(words) for words, _ in shown)
+    return "\n".join(f"    {words:{width}}   {text}" for words, text in shown)
+
+
+def _stream(layers: Iterable[LayerSet]) -> Iterator[tuple[Sequence[int], str]]:
+    """Yield the words of a stream with their meaning: of each layer, command and envelope."""
+    for layer in layers:
+        stream = pack_layers([layer])
+        head, at = stream[:3], 3
+        count = len(layer.commands)
+        yield (
+            head,
+            " · ".join(
+                [
+                    f"layer {layer.layer}"
+                    + (
+                        ", renewed"
+                        if layer.renew
+                        else f", {count} commands"
+                        if count
+                        else ", silenced"
+                    ),
+                    *([] if layer.renew else [f"ramp {layer.ramp} ms"]),
+                    *([f"valid for {layer.valid_for} ms"] if layer.valid_for else []),
+                ]
+            ),
+        )
+        for command in layer.commands:
+            yield stream[at : at + 4], _meaning(command)
+            at += 4
+            for name, shape in (("onset", command.onset), ("ending", command.ending)):
+                if shape is not None:
+                    size = 2 + 2 * len(shape.knots)
+                    knots = "".join(
+                        f" · {_level(level)} at {_phase(phase)}" for level, phase in shape.knots
+                    )
+                    step = 1000 * QUANTITIES["envelope_step"].from_wire(shape.step)
+                    yield stream[at : at + size], f"{name}, a knot every {step:g} ms{knots}"
+                    at += size
+
+
+def _meaning(command: Command) -> str:
+    frequency = QUANTITIES["frequency"].from_wire(command.frequency)
+    keep = ", keep phase" if command.keep_phase else ""
+    tone = f"{frequency:g} Hz · {_level(command.level)} · {_phase(command.phase)}"
+    return f"channel {command.channel}{keep} · {tone}"
+
+
+def _level(level: int) -> str:
+    return f"level {QUANTITIES['level'].from_wire(level):g}"
+
+
+def _phase(phase: int) -> str:
+    return f"{QUANTITIES['phase'].from_wire(phase):g}°"
+
+
+def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str]]:
+    """Yield the words of a record with the names of its fields; numbers with their values."""
+    words, at = record.pack(values), 0
+    for field in record.fields:
+        match field:
+            case Number(name=name, quantity=quantity):
+                size = 2 if quantity.wire == "u32" else 1
+                number = f"{quantity.from_wire(values[name]):g} {quantity.unit}".strip()
+                is_token = quantity.name in ("session", "token", "played_token")
+                text = f"{name} {f'{values[name]:04X}' if is_token else number}"
+            case Bits(parts=parts):
+                size, text = 1, ", ".join(f"{name} {values.get(name, 0):d}" for name, _ in parts)
+            case Numbers(name=name, count=count):
+                size, text = values[count], name
+            case Rest():
+                continue
+            case _:
+                raise TypeError(type(field))
+        yield words[at : at + size], text
+        at += size
+
+
+def _in_lines(rows: Iterable[tuple[Sequence[int], str]]) -> Iterator[tuple[Sequence[int], str]]:
+    """Yield rows of one word in lines of four."""
+    words, texts = list[int](), list[str]()
+    for more, text in rows:
+        if words and (len(words) == 4 or len(more) > 1):
+            yield words, " · ".join(texts)
+            words, texts = [], []
+        if len(more) > 1:
+            yield more, text
+        else:
+            words, texts = [*words, *more], [*texts, text]
+    if words:
+        yield words, " · ".join(texts)
+
+
+def _set_words() -> str:
+    """Return the words of the set."""
+    head = _in_lines(_fields(MESSAGES["Set"].request, _SET))
+    return _words([*head, *_stream(_JOINED)])
+
+
+def _reply_words() -> str:
+    """Return those of its reply, of the commit and of the reply to that."""
+    amplifier = _vibrating("serial", 7).amplifier
+    shown = {
+        "Taken": (MESSAGES["Set"].reply, amplifier.handle("Set", _SET, 0.0)),
+        "Commit": (MESSAGES["Commit"].request, _COMMIT),
+        "Status": (MESSAGES["Commit"].reply, amplifier.handle("Commit", _COMMIT, 0.0)),
+    }
+    rows = list[tuple[Sequence[int], str]]()
+    for title, (record, values) in shown.items():
+        (words, text), *others = _in_lines(_fields(record, values))
+        rows += [(words, f"{title}: {text}"), *others]
+    return _words(rows)
+
+
+BYTES: Mapping[str, Mapping[str, Callable[[], str]]] = {
+    "protocol": {
+        **{"set": _set_words, "replies": _reply_words},
+        "stream": lambda: _words(_stream(_STREAM)),
+    },
+    "serial": {"join": partial(_join, "serial"), "more": partial(_more, "serial")},
+    "modbus": {**{"join": partial(_join, "modbus"), "more": partial(_more, "modbus"), "rtu": _rtu}},
+    "can": {"join": partial(_join, "can"), "more": partial(_more, "can")},
+}
+"""What writes each block of bytes, by page and part."""

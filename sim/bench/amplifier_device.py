@@ -3,7 +3,6 @@
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
@@ -95,7 +94,7 @@ class AmplifierDevice:
     def inject_fault(self, window: FaultWindow) -> None:
         """Add a fault that begins now, whatever its `at`."""
         now = clock.now()
-        window = replace(window, at=now - self.faults.begin)
+        window = window.model_copy(update={"at": now - self.faults.begin})
         self.faults.windows = (*self.faults.windows, window)
         self._schedule(window)
 
@@ -106,7 +105,7 @@ class AmplifierDevice:
         active = [window for window in self.faults.windows if window.at <= over < window.end]
         self.faults.windows = ()
         for window in active:
-            self._handle_edge(replace(window, lasts=over - window.at), "end")
+            self._handle_edge(window.model_copy(update={"lasts": over - window.at}), "end")
 
     def close(self) -> None:
         """Cancel the scheduled faults."""

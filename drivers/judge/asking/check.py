@@ -18,9 +18,8 @@ from drivers.judge.asking.client import (
     expect,
     read_as,
 )
-from drivers.judge.asking.material import FULL, Rows
+from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
 from drivers.judge.asking.sent import in_words
-from drivers.judge.asking.stated import STATED, Capabilities
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.table import MESSAGES, VERSION
 from registry import clock

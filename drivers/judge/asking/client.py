@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from drivers import trace
 from drivers.errors import LinkError
@@ -95,13 +95,6 @@ QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to h
 _T = TypeVar("_T")
 
 
-class Port(Protocol):
-    """An open port; what it receives goes to `Client.received`."""
-
-    def write(self, data: bytes) -> None:
-        """Send bytes; raises LinkError."""
-
-
 class When(NamedTuple):
     """An interval in which something happened [s]."""
 
@@ -168,8 +161,8 @@ class Client(ABC):
     transactions: ClassVar[int] = 1
     """What the wire makes of a request that changes something, each with a reply."""
 
-    port: Port
-    """Of its line; given once it is open."""
+    transmit: Callable[[bytes], None]
+    """Sends bytes on its line, once that is open; raises LinkError."""
     name = ""
     """Under which its bytes are traced."""
 
@@ -202,7 +195,7 @@ class Client(ABC):
     def write(self, data: bytes) -> None:
         """Send bytes; raises LinkError."""
         trace.frame(trace.Direction.OUT, data, self.name, str)
-        self.port.write(data)
+        self.transmit(data)
 
     @abstractmethod
     def hear(self, data: bytes) -> bytes:

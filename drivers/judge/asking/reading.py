@@ -30,7 +30,6 @@ from drivers.protocol.table import (
     QUANTITIES,
     REACTION,
     STATES,
-    VERSION,
     has_flag,
     name_of,
 )
@@ -150,14 +149,13 @@ async def hello_for_ever(subject: Subject) -> None:
     """It answers a Hello of any version and length, and no other version of anything else."""
     client = cast(SerialClient, subject.client)
     for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
-        shown = await client.identity(payload, version)
+        shown = await client.hello(payload, version)
         expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
-    status, ping = MESSAGES["GetStatus"].number, MESSAGES["Ping"].number
-    refused = [(status, b"", each, "UNSUPPORTED_VERSION") for each in (0, 2, 4, 255)]
-    for number, payload, version, code in (*refused, (ping, b"\1\0\0", VERSION, "BAD_LENGTH")):
-        answer = await client.exchange_payload(number, payload, version)
-        what = f"refusal of {len(payload)} bytes of version {version}"
-        expect_equal(answer.code, code, what)
+    for version in (0, 2, 4, 255):
+        answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
+        expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
+    answer = await client.exchange(MESSAGES["Ping"].number, [1], behind=b"\0")
+    expect_equal(answer.code, "BAD_LENGTH", "refusal of three bytes")
 
 
 def _shortest(name: str) -> list[int]:

@@ -23,8 +23,17 @@ from drivers.judge.asking.client import (
     require_in_time,
 )
 from drivers.judge.asking.judge import Judge
-from drivers.judge.asking.material import FULL, Material, Rows, Send, layer, play, send
-from drivers.judge.asking.stated import STATED, Capabilities
+from drivers.judge.asking.material import (
+    FULL,
+    STATED,
+    Capabilities,
+    Material,
+    Rows,
+    Send,
+    layer,
+    play,
+    send,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of

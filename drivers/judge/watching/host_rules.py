@@ -9,7 +9,6 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from drivers.judge.watching.amplifier_session import (
     AmplifierSession,
     Deadlines,
-    Delays,
     ExpectedSets,
     check_expected,
     check_set,
@@ -40,13 +39,12 @@ class HostRules:
     """
 
     def __init__(
-        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, delays: Delays
+        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, deadlines: Deadlines
     ) -> None:
         self.expected: ExpectedSets | None = None
         self._sessions = sessions
-        self._delays = delays
+        self._deadlines = deadlines
         self._times = times
-        self._deadlines = Deadlines(delays, times.touch)
         self._contacts: frozenset[Hashable] | None = None
         self._stalled_since: float | None = None
         self._is_arm_requested: bool | None = None
@@ -247,7 +245,7 @@ class HostRules:
             return
         # The control loop waits for all attempts of a request to any of its amplifiers.
         is_waiting = any(each.overdue_at >= last for each in self._sessions.values())
-        longer = self._delays.since(last) + (_ATTEMPTS * self._times.reply if is_waiting else 0.0)
+        longer = self._deadlines.delay_since(last) + is_waiting * _ATTEMPTS * self._times.reply
         if time > last + self._times.heartbeat + self._times.slack + longer:
             session.last_feed = time
             session.report_always(

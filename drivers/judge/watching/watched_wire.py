@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Hashable, Mapping
 
-from drivers.judge.watching.amplifier_session import AmplifierSession, Delays, check_sums
+from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, check_sums
 from drivers.judge.watching.can_decoder import CanDecoder
 from drivers.judge.watching.capture import Direction, Report
 from drivers.judge.watching.config import TimeLimits
@@ -52,14 +52,14 @@ class WatchedWire:
         *,
         host: HostRules,
         times: TimeLimits,
-        delays: Delays,
+        deadlines: Deadlines,
         report: Report,
     ) -> None:
         self.name = name
         self.sessions = dict(sessions)
         self._kind = kind
         self._decoder = decoder_of(kind)
-        self._host, self._times, self._delays, self._report = host, times, delays, report
+        self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
         self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
         self._pending: dict[Hashable, Sent] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
@@ -152,7 +152,8 @@ class WatchedWire:
         """Report replies that are overdue."""
         for key, sent in list(self._pending.items()):
             since = max(sent.since, self._started_at.get("host", -math.inf))
-            due = since + self._times.reply + self._times.slack + self._delays.since(since)
+            due = since + self._times.reply + self._times.slack
+            due += self._deadlines.delay_since(since)
             if now > due and not sent.is_overdue:
                 sent.is_overdue = True
                 session = self.sessions[sent.request.address]

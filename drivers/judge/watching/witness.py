@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any, Literal
 
-from drivers.judge.watching.amplifier_session import AmplifierSession, Delays, ExpectedSets
+from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, ExpectedSets
 from drivers.judge.watching.capture import Direction, Report, Violation, capture_line
 from drivers.judge.watching.config import WitnessConfig, parse_config
 from drivers.judge.watching.host_rules import HostRules
@@ -32,10 +32,10 @@ class Witness:
         self._record = record
         self._now = -math.inf
         self.frames = 0
-        self._delays = Delays()
         self._sessions = {name: self._session(name) for name in self._config.amplifiers}
         times = self._config.times_s
-        self._host = HostRules(self._sessions, times=times, delays=self._delays)
+        self._deadlines = Deadlines(times.touch)
+        self._host = HostRules(self._sessions, times=times, deadlines=self._deadlines)
         self._wires = {
             wire: WatchedWire(
                 wire,
@@ -47,7 +47,7 @@ class Witness:
                 },
                 host=self._host,
                 times=times,
-                delays=self._delays,
+                deadlines=self._deadlines,
                 report=self._report,
             )
             for wire, kind in self._config.wires.items()
@@ -86,7 +86,7 @@ class Witness:
 
         Deadlines of hosts and amplifiers are extended by it: what came in time was seen late.
         """
-        self._delays.note(until, duration)
+        self._deadlines.delayed(until, duration)
 
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""

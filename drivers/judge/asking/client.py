@@ -21,13 +21,18 @@ from drivers.wires.wire import read_nak
 from registry import clock
 
 
-class Violation(Exception):
-    """The amplifier does other than the contract: what must be what, and what was seen.
+class Finding(Exception):
+    """What ends the steps of a check; by itself: nothing is wrong.
 
-    sent: the last set, came: the last bytes of the amplifier, in hexadecimal.
+    seen, expected: of a violation; sent: the last set before it, in words and hexadecimal; came:
+    the last bytes of the amplifier.
     """
 
-    sent = came = ""
+    seen = expected = sent = came = ""
+
+
+class Violation(Finding):
+    """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
         self.expected, self.seen = str(expected), f"{what}: {seen}"
@@ -38,15 +43,15 @@ class Armed(Violation):
     """It is armed, perhaps by another host: nothing is driven."""
 
 
-class Optional(Exception):
+class Optional(Finding):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
 
 
-class Unusable(Exception):
+class Unusable(Finding):
     """A capability that the check needs is not as it must be, which its own check reports."""
 
 
-class Late(Exception):
+class Late(Finding):
     """This machine was too late for what the check needs: it must be made again."""
 
 

@@ -236,11 +236,10 @@ class Subject(Material):
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
         self.expected = None
-        await self.request("Stop", ramp=0)
-        stopped = await self.settle()
+        stopped = await self.settle(await self.request("Stop", ramp=0))
         cleared = await self.request("Clear", latch=stopped["latch"])
         expect_equal(cleared["state"], OFF, "state after Clear")
-        await self.watch()
+        self.expected = Judge(self.can, cleared.values, cleared.when)
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
@@ -343,16 +342,15 @@ class Subject(Material):
         self.heard_at = end
         require_in_time(clock.now() <= end + _OVERSLEPT, "a pause took too long")
 
-    async def settle(self) -> Answer:
-        """Read statuses until it is silent and in a state that lasts."""
-        due = clock.now() + _SETTLED
-        while True:
-            reply = await self.status()
-            if not any(reply["levels"]) and reply["state"] not in (*_MOVING, ENABLED):
-                return reply
+    async def settle(self, reply: Answer | None = None) -> Answer:
+        """Read statuses behind a reply until it is silent and in a state that lasts."""
+        due, reply = clock.now() + _SETTLED, reply or await self.status()
+        while any(reply["levels"]) or reply["state"] in (*_MOVING, ENABLED):
             seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
             expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
             await asyncio.sleep(_POLL)
+            reply = await self.status()
+        return reply
 
     async def follow(self, duration: float | None = None) -> None:
         """Read statuses for a time [s] from the last change on, None until all is settled.

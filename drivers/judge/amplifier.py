@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.judge.outputs import ExpectedOutputs, Report, Unclear, one_of
+from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import Problem, achieved_problem
@@ -27,7 +27,6 @@ from drivers.protocol.table import (
 )
 
 ROUNDED = 0.002  # s; of times in milliseconds
-_DRIFT = 1e-3  # of a time; of the amplifier's clock
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
 OFF, STOPPED = STATES["SWITCH_ON_DISABLED"], STATES["QUICK_STOP_ACTIVE"]
@@ -124,7 +123,7 @@ class ExpectedAmplifier:
         """When the watchdog trips if it is not fed, at the earliest and at the latest."""
         if self.watchdog == math.inf:  # not known
             return _NEVER
-        early, late = self.watchdog * (1 - _DRIFT), (self.watchdog + _TRIP) * (1 + _DRIFT)
+        early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
         return self.fed[0] + early - ROUNDED, self.fed[1] + late
 
     # What it does
@@ -237,7 +236,7 @@ class ExpectedAmplifier:
             self._unclear("a part came as its set expired")
         elif known is not None and seen not in known:
             what = f"missing, staged, played after part {part['index']} of set {token}"
-            self.report("commit", end, what, must=" or ".join(map(str, known)), seen=seen)
+            self.report("commit", end, what, must=one_of(known), seen=seen)
         if reply["played"]:
             self._play(token, when)
 
@@ -298,7 +297,7 @@ class ExpectedAmplifier:
         known = self._states(when)
         if now not in known:
             what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
-            must = " or ".join(map(self._name_of, known))
+            must = one_of(map(self._name_of, known))
             self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
             return False
         if fault and fault != self.fault and self._may_fail and not self.is_shown:
@@ -391,7 +390,7 @@ class ExpectedAmplifier:
         faults = [(each["fault"], each["age"] / 1000) for each in listed]
         left = iter(faults)
         for fault, since in self._faults:
-            drift = _DRIFT * (when[1] - since[0])
+            drift = DRIFT * (when[1] - since[0])
             slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
             low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
             if not any(each == fault and low <= age <= high for each, age in left):

@@ -15,7 +15,8 @@ from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, has_flag
 
 _LATE = 0.002  # s; by which a set may begin later
-_DRIFT = 1e-3  # of a time; of the amplifier's clock
+DRIFT = 1e-3
+"""Of a time; of the amplifier's clock."""
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
@@ -149,7 +150,7 @@ class ExpectedOutputs:
     def _widened(self, when: Interval) -> Interval:
         """Return an interval as the amplifier's clock may have it."""
         since = self.began[0]
-        extra = self._slack + _DRIFT * (when[1] - since)
+        extra = self._slack + DRIFT * (when[1] - since)
         return when[0] - extra, when[1] + extra
 
     def sure(self, when: Interval) -> set[int]:

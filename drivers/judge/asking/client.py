@@ -259,9 +259,8 @@ class Client(ABC):
         """Note an attempt from a time on that came too late; returns whether to make it again."""
         if self.slow_reply:
             return False
-        if self.attempts < _MAX_ATTEMPTS:
-            self.attempts += 1
-            self.wasted += clock.now() - since
+        self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
+        self.wasted += clock.now() - since
         return self.attempts < _MAX_ATTEMPTS and self.wasted < _MAX_WASTED
 
     @contextmanager

@@ -392,14 +392,10 @@ class HostRules:
         if is_under_way and time < session.last_stop + self._times.reply:
             return  # which must go on until it is confirmed
         session.stop_requested_at = time
-
-        def is_sent() -> bool:
-            return session.stop_requested_at != time or not session.is_open
-
         self._deadlines.expect(
             time,
             self._times.stop,
-            ("stop", session, is_sent),
+            ("stop", session, lambda: session.stop_requested_at != time or not session.is_open),
             f"stop requested at {time:.4f} s, not sent to {session.name}",
         )
 

@@ -2,7 +2,8 @@
 
 import math
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 
 from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, check_sums
 from drivers.judge.watching.can_decoder import CanDecoder
@@ -32,13 +33,14 @@ _PRESENT = ("GetStatus", "GetFaults")
 _CONSTANT = (HELLO, "GetCaps")
 
 
-def decoder_of(kind: str) -> Decoder:
-    """Return a decoder for a kind of wire."""
-    if kind == "serial":
-        return SerialDecoder()
-    if kind.startswith("modbus"):
-        return ModbusDecoder(over_tcp=kind == "modbus-tcp")
-    return CanDecoder(kind)
+DECODERS: Mapping[str, Callable[[], Decoder]] = {
+    "serial": SerialDecoder,
+    "modbus-tcp": partial(ModbusDecoder, over_tcp=True),
+    "modbus-rtu": partial(ModbusDecoder, over_tcp=False),
+    "socketcand": partial(CanDecoder, "socketcand"),
+    "slcan": partial(CanDecoder, "slcan"),
+}
+"""Decoders by the kind of wire."""
 
 
 class WatchedWire:
@@ -58,7 +60,7 @@ class WatchedWire:
         self.name = name
         self.sessions = dict(sessions)
         self._kind = kind
-        self._decoder = decoder_of(kind)
+        self._decoder = DECODERS[kind]()
         self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
         self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
         self._pending: dict[Hashable, Sent] = {}  # by key of the reply
@@ -72,7 +74,7 @@ class WatchedWire:
 
     def opened(self, time: float) -> None:
         """Note that a host has opened it: its amplifiers are not identified yet."""
-        self._decoder, self._started_at = decoder_of(self._kind), {}
+        self._decoder, self._started_at = DECODERS[self._kind](), {}
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None

@@ -8,7 +8,7 @@ others are refused, since nothing longer than four bytes can be written.
 import struct
 import zlib
 
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import MESSAGES, TEXTS
 from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from sim.transport.far_end import AmplifierPort
 
@@ -31,7 +31,6 @@ class SdoAbort(Exception):
 
 
 _INDEX = CANOPEN["objects"]
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
 
 
 class ObjectServer:
@@ -123,7 +122,7 @@ class ObjectServer:
             numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
             return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
         if index == _INDEX["texts"]:
-            texts = [identity[name].encode() for name in _TEXTS]
+            texts = [identity[field.name].encode() for field in TEXTS]
             return [*texts, identity["versions"].to_bytes(2, "little")]
         if index == _INDEX["capabilities"]:
             return self._words("GetCaps", now)

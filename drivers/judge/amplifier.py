@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import Problem, achieved_problem
+from drivers.protocol.achieved import TONE, Problem, achieved_problem
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.table import (
@@ -226,6 +226,9 @@ class ExpectedAmplifier:
         """Compare the reply to a part of a set, and play a set that is played at once."""
         token, end = part["token"], when[1]
         self._expect("credit", end, "token of a reply to Set", token, reply["token"])
+        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
+        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
+            self._expect("plays", end, f"exact of set {token}", 1, reply["exact"])
         if token == self.token:
             self._expect("commit", end, "played of a repeated set", 1, reply["played"])
         if token == self.token or token != reply["token"]:

@@ -4,6 +4,7 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from inspect import isawaitable
 from typing import Any, TypeAlias
 
@@ -161,9 +162,8 @@ def reading(place: str, *kinds: str, drives: bool = False) -> Callable[[Steps], 
     return make
 
 
-def driving(place: str, *kinds: str) -> Callable[[Steps], Check]:
-    """Make a check that arms the amplifier and drives its channels."""
-    return reading(place, *kinds, drives=True)
+driving = partial(reading, drives=True)
+"""Makes a check that arms the amplifier and drives its channels."""
 
 
 async def identified(client: Client, level: float) -> Subject:
@@ -240,7 +240,6 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
     finding = Finding()
     subject: Subject | None = None
     client.heard.clear()
-    client.events.clear()
     try:
         subject = await identified(client, level)
         if check.drives:

@@ -142,12 +142,11 @@ class Answer:
 class Client(ABC):
     """One amplifier at an address of a line.
 
-    heard: messages that no request was waiting for; events: those of type Event; order: types of
-    all, as they came. reply_words: the longest reply to each message by its number, where it is
-    known. quiet: time [s] in which a reply comes; timeout: for which one is awaited. wire_time: on
-    the wire [s], of a request and a reply by their words; transit: of the longest reply. session:
-    that was begun last. loss: why the line was lost. came: bytes of the amplifier since the last
-    request.
+    heard: messages that no request was waiting for, but Events; order: all, as they came.
+    reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
+    in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
+    request and a reply by their words; transit: of the longest reply. session: that was begun last.
+    loss: why the line was lost. came: bytes of the amplifier since the last request.
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
@@ -174,8 +173,7 @@ class Client(ABC):
     def __init__(self, address: int) -> None:
         self.address = address
         self.heard: list[Heard] = []
-        self.events: list[Heard] = []
-        self.order: list[int] = []
+        self.order: list[Heard] = []
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit = 0.0
@@ -300,8 +298,9 @@ class Client(ABC):
 
     def take(self, message: Heard, *, is_event: bool = False) -> None:
         """Keep a message that was heard."""
-        (self.events if is_event else self.heard).append(message)
-        self.order.append(message.type)
+        if not is_event:
+            self.heard.append(message)
+        self.order.append(message)
         self._news.set()
 
     async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:

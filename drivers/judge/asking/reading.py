@@ -181,11 +181,10 @@ async def events(subject: Subject) -> None:
     require(client.has_events, "this wire carries no Events")
     await client.look_around()
     is_stated = subject.has("events") and not (client.kind == "serial" and client.neighbours)
-    client.events.clear()
     client.order.clear()
     await subject.arm(0.0)
     types = [EVENT, MESSAGES["Arm"].number][not is_stated :]
-    seen = [each & _TYPE for each in client.order]
+    seen = [each.type & _TYPE for each in client.order]
     expect_equal(seen, types, "types of the messages after Arm, the Event before the reply")
     await subject.run(
         [
@@ -202,7 +201,8 @@ async def events(subject: Subject) -> None:
         *(("SWITCHED_ON", 0, first), ("SWITCH_ON_DISABLED", 0, first)),
         *(("QUICK_STOP_ACTIVE", 0, second), ("SWITCH_ON_DISABLED", 0, second)),
     ]
-    reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
+    found = [each for each in client.order if each.type & _TYPE == EVENT]
+    reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in found]
     reported = [(name_of(STATES, each["state"]), each["fault"], each["latch"]) for each in reports]
     # A state that lasts no time may be left out or told.
     needed = [each for each in required if each[0] not in _MOMENTARY or each in reported]

@@ -19,7 +19,6 @@ from drivers.judge.watching.decoded import (
     is_carried_out,
 )
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import TONE
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
 
@@ -111,13 +110,6 @@ class WatchedAmplifier(ExpectedAmplifier):
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return
         self.granted(name, sent.request.values, values, (sent.earliest, end))
-
-    def _take(self, part: Values, reply: Values, when: Interval) -> None:
-        """Compare the reply to a part of a set; one that plays finely and is cool plays exactly."""
-        super()._take(part, reply, when)
-        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
-        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
-            self._expect("plays", when[1], f"exact of set {part['token']}", 1, reply["exact"])
 
     def refused(self, request: Request, time: float) -> None:
         """Note a refusal; what silences must not be refused, nor a commit of what is staged."""

@@ -7,6 +7,7 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require
 from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
 from drivers.protocol.table import QUANTITIES
 
@@ -84,7 +85,7 @@ async def steps_as_stated(subject: Subject) -> None:
 
 def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **values: int) -> Send:
     """Send words as a set of one part, which must be refused; channels: one of which is named."""
-    part = {"index": 0, "parts": 1, "stream": words, **values}
+    part: Values = {"index": 0, "parts": 1, "stream": words, **values}
     return send("Set", code=code, channels=channels or (None,), **part)
 
 

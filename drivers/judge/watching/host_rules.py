@@ -14,7 +14,7 @@ from drivers.judge.watching.amplifier_session import (
     check_set,
 )
 from drivers.judge.watching.config import TimeLimits
-from drivers.judge.watching.decoded import A_READ, FEEDING, HELLO, Request, Sent
+from drivers.judge.watching.decoded import A_READ, FEEDING, HELLO, Request
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating
 from drivers.protocol.table import LATCHED, QUANTITIES
@@ -112,18 +112,22 @@ class HostRules:
         return request.name in _SILENCING or (request.name == "GetStatus" and is_silencing)
 
     def check_order(
-        self, session: AmplifierSession, sent: Sent, pending: Collection[Sent], preempted_by: int
+        self,
+        session: AmplifierSession,
+        request: Request,
+        pending: Collection[Request],
+        preempted_by: int,
     ) -> None:
         """Check that no reply is pending that a request must wait for.
 
         preempted_by: number of the last request before which others may lose their replies. A
         reading gives way, and the status of an amplifier that has left a request without a reply.
         """
-        mute = {each.request.address for each in pending if each.is_overdue}
+        mute = {each.address for each in pending if each.is_overdue}
         for each in pending:
-            name = each.request.name
-            is_reading = name in _READINGS or (name == "GetStatus" and each.request.address in mute)
-            waits = sent.started_at - each.started_at
+            name = each.name
+            is_reading = name in _READINGS or (name == "GetStatus" and each.address in mute)
+            waits = request.started_at - each.started_at
             # A last lift preempts too, even if a finger has come since.
             is_preempted = each.number < preempted_by or each.started_at <= self._last_lift
             # The host counts from its write: the bytes may have waited in a transport since.
@@ -131,8 +135,8 @@ class HostRules:
             if not (is_preempted or is_given_up or is_reading):
                 session.report_always(
                     "credit",
-                    sent.started_at,
-                    f"host sent {sent.request.name} to {session.name} {waits * 1e3:.1f} ms after "
+                    request.started_at,
+                    f"host sent {request.name} to {session.name} {waits * 1e3:.1f} ms after "
                     f"{name}, whose reply is pending",
                 )
 

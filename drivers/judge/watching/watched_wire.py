@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, check_sums
@@ -19,7 +20,6 @@ from drivers.judge.watching.decoded import (
     Notice,
     Reply,
     Request,
-    Sent,
     SerialDecoder,
 )
 from drivers.judge.watching.host_rules import HostRules
@@ -63,7 +63,7 @@ class WatchedWire:
         self._decoder = DECODERS[kind]()
         self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
         self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
-        self._pending: dict[Hashable, Sent] = {}  # by key of the reply
+        self._pending: dict[Hashable, Request] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
@@ -84,8 +84,8 @@ class WatchedWire:
     def closed(self, time: float) -> None:
         """Note that the host has closed or lost it."""
         for sent in self._pending.values():
-            if sent.request.name in CHANGING:  # it may be executed unheard
-                self.sessions[sent.request.address].amplifier.forget()
+            if sent.name in CHANGING:  # it may be executed unheard
+                self.sessions[sent.address].amplifier.forget()
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
@@ -103,12 +103,12 @@ class WatchedWire:
         self._pending = {
             key: sent
             for key, sent in self._pending.items()
-            if self.sessions[sent.request.address] is not session
+            if self.sessions[sent.address] is not session
         }
 
     def is_pending(self, session: AmplifierSession) -> bool:
         """Whether an amplifier has not replied to a request yet."""
-        return any(self.sessions[one.request.address] is session for one in self._pending.values())
+        return any(self.sessions[one.address] is session for one in self._pending.values())
 
     def is_disturbed(self, time: float) -> bool:
         """Whether faults are injected at a time [s], or were shortly before."""
@@ -141,7 +141,7 @@ class WatchedWire:
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
-                since = started_at if message.started_at is None else message.started_at
+                since = min(started_at, message.started_at)
                 self._damaged(direction, time, message.text, since)
             elif direction == "amplifier" and message is not None:
                 self._sent(time, raw, message, started_at)
@@ -158,10 +158,10 @@ class WatchedWire:
             due += self._deadlines.delay_since(since)
             if now > due and not sent.is_overdue:
                 sent.is_overdue = True
-                session = self.sessions[sent.request.address]
+                session = self.sessions[sent.address]
                 session.overdue_at = now
                 if not (session.is_mute or self.is_disturbed(due)):
-                    what = f"no reply to {sent.request.name} of {sent.started_at:.4f} s"
+                    what = f"no reply to {sent.name} of {sent.started_at:.4f} s"
                     session.report_always("answer", now, f"{session.name}: {what}")
             if now > sent.started_at + _PENDING_TIMEOUT:
                 del self._pending[key]
@@ -181,10 +181,11 @@ class WatchedWire:
             self._noticed(time, message)
         if not isinstance(message, Request):
             return
-        if message.started_at is not None:
-            started_at = min(started_at, message.started_at)
         self._number += 1
-        sent = Sent(self._number, message, started_at, since=time, earliest=started_at)
+        started_at = min(started_at, message.started_at)
+        sent = replace(
+            message, number=self._number, started_at=started_at, since=time, earliest=started_at
+        )
         addressed = self.sessions.get(message.address)
         sessions = self.sessions.values() if message.address == 0 else (addressed,)
         for session in [each for each in sessions if each is not None]:
@@ -202,8 +203,7 @@ class WatchedWire:
             if message.key is None:
                 self._move(session, message)
 
-    def _check_request(self, session: AmplifierSession, time: float, sent: Sent) -> None:
-        request = sent.request
+    def _check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
         problem = request.problem
         if request.name == "Set" and not problem:
             problem = session.amplifier.sets.sent(request.values, time)
@@ -212,15 +212,13 @@ class WatchedWire:
         if request.problem:
             return
         if self._host.is_preempting(session, time, request):
-            self._preempted_by = sent.number
-        elif not self.is_disturbed(sent.started_at):
+            self._preempted_by = request.number
+        elif not self.is_disturbed(request.started_at):
             is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1
             pending = [
-                one
-                for one in self._pending.values()
-                if not (is_to_each and one.request.name in BROADCAST)
+                one for one in self._pending.values() if not (is_to_each and one.name in BROADCAST)
             ]
-            self._host.check_order(session, sent, pending, self._preempted_by)
+            self._host.check_order(session, request, pending, self._preempted_by)
         self._host.check_request(session, time, request)
 
     def _noticed(self, time: float, notice: Notice) -> None:
@@ -231,7 +229,7 @@ class WatchedWire:
             sent.since, sent.end = math.inf, time
         elif notice.what == "read on" and sent is not None:
             sent.since = time
-            if sent.request.name in _PRESENT:
+            if sent.name in _PRESENT:
                 sent.earliest, sent.end = time, None
         elif notice.what == "event" and session is not None:
             session.amplifier.event_reported(notice.values, time)
@@ -254,16 +252,16 @@ class WatchedWire:
             self._noticed(time, message)
 
     def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
-        sent = self._pending.pop(reply.key, None)
-        if sent is None:
+        request = self._pending.pop(reply.key, None)
+        if request is None:
             self._check_unexpected(session, time, reply)
             return
         self._replied.append(reply.key)
-        request, amplifier = sent.request, session.amplifier
+        amplifier = session.amplifier
         if reply.problem:
             what = f"{session.name} replied to {request.name}: {reply.problem}"
             session.report("garbage", time, what)
-        amplifier.unanswered = [one for one in amplifier.unanswered if one is not sent]
+        amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
             amplifier.refused(request, time)
         elif request.problem or reply.problem:
@@ -272,10 +270,12 @@ class WatchedWire:
                 session.report_always("garbage", time, what)
             amplifier.forget()
         elif reply.values is not None:  # else not all of it was read
-            self._granted(session, time, sent, reply)
+            self._granted(session, time, request, reply)
 
-    def _granted(self, session: AmplifierSession, time: float, sent: Sent, reply: Reply) -> None:
-        request, amplifier, values = sent.request, session.amplifier, reply.values or {}
+    def _granted(
+        self, session: AmplifierSession, time: float, request: Request, reply: Reply
+    ) -> None:
+        amplifier, values = session.amplifier, reply.values or {}
         if request.name in _CONSTANT:
             session.check_constant(request.name, values, time)
         if request.name == "GetCaps":
@@ -285,9 +285,9 @@ class WatchedWire:
             amplifier.forget()
         self._host.status_heard(session, values)
         token = amplifier.token
-        amplifier.replied(sent, values, time if sent.end is None else sent.end)
+        amplifier.replied(request, values, time if request.end is None else request.end)
         if amplifier.token != token and not self.is_disturbed(time):
-            check_sums(session, sent.earliest)
+            check_sums(session, request.earliest)
         self._move(session, request)
 
     def _move(self, session: AmplifierSession, request: Request) -> None:

@@ -157,14 +157,15 @@ class ExpectedAmplifier:
         is_late = reply.get("state") in (REACTING, FAULT)  # it may have expired before
         if name in FEEDING and self.state in (None, ENABLED) and not is_late:
             self.fed = when
-        if name == "Set":
-            self._take(values, reply, when)
-        elif name == "GetAchieved":
-            self._check_achieved(values["layer"], reply, when)
-        elif name == "GetFaults":
-            self._check_faults(reply["faults"], when)
-        else:
-            self.carry_out(name, values, reply, when)
+        match name:
+            case "Set":
+                self._take(values, reply, when)
+            case "GetAchieved":
+                self._check_achieved(values["layer"], reply, when)
+            case "GetFaults":
+                self._check_faults(reply["faults"], when)
+            case _:
+                self.carry_out(name, values, reply, when)
         if "levels" in reply:
             self.check(reply, when)
 
@@ -189,26 +190,27 @@ class ExpectedAmplifier:
         has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
         if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
             self._trip(FAULTS["WATCHDOG"], self._expired_by(when[1]), "the watchdog")  # first
-        if name == "Arm":
-            if not self.is_enabled or values["session"] != self.session:
-                self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
-                self.token = 0
-            self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
-            self.watchdog, self.fed = values["watchdog"] / 1000, when
-        elif name == "Silence":
-            self._fall_silent(ENABLED, when, ramp, cause)
-        elif name == "Disarm" and self.state is not None:
-            state = _SWITCHED_ON if self.is_enabled else self.state
-            self._fall_silent(state, when, ramp, cause)
-        elif name == "Stop" and self.state is not None:
-            self._latch_again()
-            self._fall_silent(self.state if self.is_in_fault else STOPPED, when, ramp, cause)
-        elif name == "Clear" and self.state in LATCHED:
-            self._clear(values["latch"], shown["state"], when)
-        elif name == "Commit":
-            self._commit(values["token"], when)
-        elif name == "Set" and values["now"]:
-            self._play(values["token"], when)
+        match name:
+            case "Arm":
+                if not self.is_enabled or values["session"] != self.session:
+                    self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
+                    self.token = 0
+                self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
+                self.watchdog, self.fed = values["watchdog"] / 1000, when
+            case "Silence":
+                self._fall_silent(ENABLED, when, ramp, cause)
+            case "Disarm" if self.state is not None:
+                state = _SWITCHED_ON if self.is_enabled else self.state
+                self._fall_silent(state, when, ramp, cause)
+            case "Stop" if self.state is not None:
+                self._latch_again()
+                self._fall_silent(self.state if self.is_in_fault else STOPPED, when, ramp, cause)
+            case "Clear" if self.state in LATCHED:
+                self._clear(values["latch"], shown["state"], when)
+            case "Commit":
+                self._commit(values["token"], when)
+            case "Set" if values["now"]:
+                self._play(values["token"], when)
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
         """Leave a stop or a fault, once all is silent, where its cause is gone."""

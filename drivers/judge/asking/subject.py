@@ -86,14 +86,17 @@ class Subject(Material):
     async def run(self, rows: Rows) -> None:
         """Carry rows out in turn; after each, the status must show what is expected."""
         for row in rows:
-            if isinstance(row, float):
-                await self.pause(row)
-            elif isinstance(row, LayerSet | Send):
-                await self.send(row if isinstance(row, Send) else play(row))
-            elif isinstance(row, Sequence):
-                await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
-            else:
-                await row()
+            match row:
+                case float():
+                    await self.pause(row)
+                case LayerSet():
+                    await self.play(row)
+                case Send():
+                    await self.send(row)
+                case Sequence():
+                    await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
+                case _:
+                    await row()
             await self.status()
 
     async def send(self, row: Send) -> Answer:

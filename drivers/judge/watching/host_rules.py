@@ -163,15 +163,17 @@ class HostRules:
 
     def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Note that a request was not refused."""
-        if request.name == HELLO:
-            session.is_identified = True
-        elif request.name == "Arm":
-            was_stopped, session.is_stopped = session.is_stopped, False
-            if was_stopped:
-                session.report("stop", time, f"{session.name} armed before its stop was cleared")
-            session.armed_at = session.last_feed = time
-        elif request.name == "Clear":
-            session.is_stopped = False
+        match request.name:
+            case "Hello":
+                session.is_identified = True
+            case "Arm":
+                was_stopped, session.is_stopped = session.is_stopped, False
+                if was_stopped:
+                    what = f"{session.name} armed before its stop was cleared"
+                    session.report("stop", time, what)
+                session.armed_at = session.last_feed = time
+            case "Clear":
+                session.is_stopped = False
 
     def status_heard(self, session: AmplifierSession, values: Values) -> None:
         """Note a status: whether it confirms a stop, or the end of a disarm.
@@ -316,22 +318,23 @@ class HostRules:
             if session.vibrates(time) and not session.is_stopped:
                 self._check_release(session, time, values["ramp"])
             session.silence_sent(time)
-        if name == "Disarm":
-            session.is_disarming = True
-        elif name == "Stop":
-            is_confirmed = session.is_stopped and session.first_stop is None
-            session.is_stopped, session.stop_requested_at, session.session = True, None, None
-            session.is_requested = False
-            if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
-                session.first_stop = time if session.first_stop is None else session.first_stop
-                self._expect_confirmation(session, time, session.first_stop)
-            if self._is_arm_requested:
-                self._is_arm_requested, self._last_silencing = False, time
-        elif name == "Arm":
-            session.session, session.last_set = values["session"], None
-            session.silence_sent(time)
-        elif layers is not None and (name == "Commit" or values["now"]):
-            self._note_playing(session, time, values["token"], layers)
+        match name:
+            case "Disarm":
+                session.is_disarming = True
+            case "Stop":
+                is_confirmed = session.is_stopped and session.first_stop is None
+                session.is_stopped, session.stop_requested_at, session.session = True, None, None
+                session.is_requested = False
+                if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
+                    session.first_stop = time if session.first_stop is None else session.first_stop
+                    self._expect_confirmation(session, time, session.first_stop)
+                if self._is_arm_requested:
+                    self._is_arm_requested, self._last_silencing = False, time
+            case "Arm":
+                session.session, session.last_set = values["session"], None
+                session.silence_sent(time)
+            case "Commit" | "Set" if layers is not None and (name == "Commit" or values["now"]):
+                self._note_playing(session, time, values["token"], layers)
 
     def _note_playing(
         self, session: AmplifierSession, time: float, token: int, layers: Sequence[LayerSet]

@@ -225,31 +225,33 @@ class WatchedWire:
         """Process what is no request, and no reply."""
         sent = self._pending.get(notice.key)
         session = self.sessions.get(notice.address)
-        if notice.what == "carried out" and sent is not None:
-            sent.since, sent.end = math.inf, time
-        elif notice.what == "read on" and sent is not None:
-            sent.since = time
-            if sent.name in _PRESENT:
-                sent.earliest, sent.end = time, None
-        elif notice.what == "event" and session is not None:
-            session.amplifier.event_reported(notice.values, time)
-        elif notice.what == "other host" and session is not None and notice.text in FEEDING:
-            session.heard_other_host = time
-            session.amplifier.forget()
+        match notice.what:
+            case "carried out" if sent is not None:
+                sent.since, sent.end = math.inf, time
+            case "read on" if sent is not None:
+                sent.since = time
+                if sent.name in _PRESENT:
+                    sent.earliest, sent.end = time, None
+            case "event" if session is not None:
+                session.amplifier.event_reported(notice.values, time)
+            case "other host" if session is not None and notice.text in FEEDING:
+                session.heard_other_host = time
+                session.amplifier.forget()
 
     def _received(self, time: float, message: Message) -> None:
         """Process a frame of an amplifier."""
         session = self.sessions.get(message.address)
-        if isinstance(message, Reply) and session is not None:
-            self._process_reply(session, time, message)
-        elif isinstance(message, Notice) and message.what == "boot" and session is not None:
-            if session.amplifier.is_enabled:
-                session.report("state", time, f"{session.name} restarted while enabled")
-            session.forget_amplifier()
-            session.amplifier.restarted(time)
-            session.is_mute = True
-        elif isinstance(message, Notice):
-            self._noticed(time, message)
+        match message:
+            case Reply() if session is not None:
+                self._process_reply(session, time, message)
+            case Notice(what="boot") if session is not None:
+                if session.amplifier.is_enabled:
+                    session.report("state", time, f"{session.name} restarted while enabled")
+                session.forget_amplifier()
+                session.amplifier.restarted(time)
+                session.is_mute = True
+            case Notice():
+                self._noticed(time, message)
 
     def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
         request = self._pending.pop(reply.key, None)

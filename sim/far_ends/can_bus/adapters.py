@@ -102,23 +102,24 @@ class SocketcandClient(FarEnd):
                 self._element(content.strip())
 
     def _element(self, element: bytes) -> None:
-        if not self._is_open:
-            self._is_open = element == f"open {BUS_NAME}".encode()
-            self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
-            if not self._is_open:
-                self._send(b"")
-        elif element == b"rawmode":
-            self._send(b"< ok >")
-            if not self._is_raw:
-                self._is_raw = True
-                self._bus.join(self._listener)
-        elif element == b"echo":
-            self._send(b"< echo >")
-        elif element.startswith(b"send "):
-            if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
-                self._bus.send(frame, sender=self._listener)
-        else:
-            self._send(b"< error unknown command >")
+        match element:
+            case _ if not self._is_open:
+                self._is_open = element == f"open {BUS_NAME}".encode()
+                self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
+                if not self._is_open:
+                    self._send(b"")
+            case b"rawmode":
+                self._send(b"< ok >")
+                if not self._is_raw:
+                    self._is_raw = True
+                    self._bus.join(self._listener)
+            case b"echo":
+                self._send(b"< echo >")
+            case _ if element.startswith(b"send "):
+                if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
+                    self._bus.send(frame, sender=self._listener)
+            case _:
+                self._send(b"< error unknown command >")
 
     def _hear(self, frame: CanFrame) -> None:
         stamp = f"{clock.now():.6f}"  # only differences are meaningful

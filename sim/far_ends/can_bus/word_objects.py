@@ -30,7 +30,8 @@ class SdoAbort(Exception):
         self.code = code
 
 
-_INDEX = CANOPEN["objects"]
+_NAMES = {index: name for name, index in CANOPEN["objects"].items()}
+"""Of objects by their index."""
 
 
 class ObjectServer:
@@ -101,7 +102,7 @@ class ObjectServer:
 
     def _write(self, index: int, subindex: int, data: bytes, now: float) -> None:
         self.read(index, subindex, now)
-        if index != _INDEX["heartbeat_producer"]:
+        if _NAMES[index] != "heartbeat_producer":
             raise SdoAbort(READ_ONLY)
         if len(data) != 2:
             raise SdoAbort(BAD_LENGTH)
@@ -109,25 +110,26 @@ class ObjectServer:
 
     def _entries(self, index: int, now: float) -> bytes | list[bytes]:
         """Return an object, or its subindices from 1 on."""
-        if index == _INDEX["device_type"]:
-            return _u32(CANOPEN["device_type"])
-        if index == _INDEX["error_register"]:
-            return bytes([CANOPEN["emergencies"][self._amplifier.fault]["error_register"]])
-        if index == _INDEX["emergency_cob_id"]:
-            return _u32(cob_id("emergency", self._node))
-        if index == _INDEX["heartbeat_producer"]:
-            return self.heartbeat.to_bytes(2, "little")
         identity = self._amplifier.identity
-        if index == _INDEX["identity"]:
-            numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
-            return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
-        if index == _INDEX["texts"]:
-            texts = [identity[field.name].encode() for field in TEXTS]
-            return [*texts, identity["versions"].to_bytes(2, "little")]
-        if index == _INDEX["capabilities"]:
-            return self._words("GetCaps", now)
-        if index == _INDEX["status"]:
-            return self._words("GetStatus", now)
+        match _NAMES.get(index):
+            case "device_type":
+                return _u32(CANOPEN["device_type"])
+            case "error_register":
+                return bytes([CANOPEN["emergencies"][self._amplifier.fault]["error_register"]])
+            case "emergency_cob_id":
+                return _u32(cob_id("emergency", self._node))
+            case "heartbeat_producer":
+                return self.heartbeat.to_bytes(2, "little")
+            case "identity":
+                numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
+                return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
+            case "texts":
+                texts = [identity[field.name].encode() for field in TEXTS]
+                return [*texts, identity["versions"].to_bytes(2, "little")]
+            case "capabilities":
+                return self._words("GetCaps", now)
+            case "status":
+                return self._words("GetStatus", now)
         raise SdoAbort(NO_OBJECT)
 
     def _words(self, name: str, now: float) -> list[bytes]:

@@ -17,8 +17,8 @@ class AmplifierDevice:
 
     Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
     all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is
-    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back. Its time
-    is that of the running event loop.
+    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back; listeners:
+    with the values of every Event, and its time [s]. Its time is that of the running event loop.
     """
 
     def __init__(
@@ -29,6 +29,7 @@ class AmplifierDevice:
         self.faults = Faults() if faults is None else faults
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
+        self.identity, self.listeners = self._amplifier.identity, self._amplifier.listeners
         self.plug_listeners: list[Callable[[bool], None]] = []
         self.boot_listeners: list[Callable[[], None]] = []
         self._unplugged = 0  # active unplug faults
@@ -46,11 +47,6 @@ class AmplifierDevice:
         return self._unplugged == 0
 
     @property
-    def identity(self) -> Values:
-        """Values of its identity."""
-        return self._amplifier.identity
-
-    @property
     def state(self) -> str:
         """Name of its state."""
         return self._amplifier.state
@@ -59,11 +55,6 @@ class AmplifierDevice:
     def fault(self) -> str:
         """Name of its fault."""
         return self._amplifier.fault
-
-    @property
-    def listeners(self) -> list[Callable[[Values, float], None]]:
-        """Called with the values of every Event, and its time [s]."""
-        return self._amplifier.listeners
 
     @property
     def next_event(self) -> float:

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from functools import partial
 from typing import cast
 
@@ -282,8 +283,7 @@ async def addresses(subject: Subject) -> None:
 
 async def _is_at(client: Client, address: int) -> bool:
     client.address = address
-    try:
+    with suppress(Violation):
         await client.hello()
-    except Violation:
-        return False
-    return True
+        return True
+    return False

@@ -143,11 +143,12 @@ class HostRules:
     def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Check a request to one amplifier; a broadcast is checked for each."""
         layers: Sequence[LayerSet] | None = None
-        if request.name == "Set":
-            layers = session.amplifier.sets.whole(request.values["token"])
-        elif request.name == "Commit" and session.staged is not None:
-            token, staged = session.staged
-            layers = staged if token == request.values["token"] else None
+        match request.name:
+            case "Set":
+                layers = session.amplifier.sets.whole(request.values["token"])
+            case "Commit" if session.staged is not None:
+                token, staged = session.staged
+                layers = staged if token == request.values["token"] else None
         self._check_stop(session, time, request)
         if request.name in FEEDING:
             self._check_feeding(session, time, request)

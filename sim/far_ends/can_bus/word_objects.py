@@ -23,11 +23,7 @@ _EXPEDITED = 2
 
 
 class SdoAbort(Exception):
-    """Aborts a transfer with a code."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"{code:#010x}")
-        self.code = code
+    """Aborts a transfer with a code, its only argument."""
 
 
 _NAMES = {index: name for name, index in CANOPEN["objects"].items()}
@@ -69,7 +65,7 @@ class ObjectServer:
                 raise SdoAbort(UNKNOWN_COMMAND)
         except SdoAbort as abort:
             self._rest = None
-            return struct.pack("<BHBL", 0x80, *self._object, abort.code)
+            return struct.pack("<BHBL", 0x80, *self._object, *abort.args)
         self._rest = None
         return b""
 

@@ -17,8 +17,9 @@ class AmplifierDevice:
 
     Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
     all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is
-    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back; listeners:
-    with the values of every Event, and its time [s]. Its time is that of the running event loop.
+    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back;
+    listeners: with the values of every Event, and its time [s]. Its time is that of the running
+    event loop.
     """
 
     def __init__(

@@ -69,7 +69,9 @@ class ExpectedOutputs:
         self.cause = cause
         self.is_exact, self.may_derate, self.interferes = True, False, False
         self._report, self._unclear, self._slack = report, unclear, slack
-        self._plays = UncertainPlayback(playback_of(can) if can else silent())
+        self.playback = playback_of(can) if can else silent()
+        """What plays, with each commit in the middle of its interval."""
+        self._plays = UncertainPlayback(self.playback)
         self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
         self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
         self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
@@ -80,11 +82,6 @@ class ExpectedOutputs:
     def forget(self) -> None:
         """Treat what plays as unknown."""
         self._unknown = [math.inf] * _LAYERS
-
-    @property
-    def playback(self) -> Playback:
-        """What plays, with each commit in the middle of its interval."""
-        return self._plays.playback
 
     # What happens
 

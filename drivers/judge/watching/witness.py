@@ -52,6 +52,8 @@ class Witness:
             )
             for wire, kind in self._config.wires.items()
         }
+        self.wires = tuple(self._wires)
+        """The names of the wires."""
 
     def _session(self, name: str) -> AmplifierSession:
         config = self._config.amplifiers[name]
@@ -69,11 +71,6 @@ class Witness:
         slack = self._config.times_s.slack
         amplifier = WatchedAmplifier(name, slack=slack, report=report, report_always=report_always)
         return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
-
-    @property
-    def wires(self) -> tuple[str, ...]:
-        """The names of the wires."""
-        return tuple(self._wires)
 
     def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""

@@ -354,7 +354,7 @@ class Bench:
 
     def _apply(self, index: int, playing: Voices) -> None:
         """Let an output move the base of an ERA, after its amplifier's delay."""
-        delay = self.imperfections.delay(self._wired[index].amplifier)
+        delay = self.imperfections.delays.get(self._wired[index].amplifier, 0.0)
         late, since = delayed(playing, delay) if delay else playing, self.time + delay
         self._plant.set_input(index, self._motion(index, late), since=since)
         self._played.append((self._applied_outputs[index], since))

@@ -67,7 +67,7 @@ class Plant:
     ) -> None:
         self.time = time
         self._plates = LoadedPlateCache(reduced, eras, loads)
-        self.loaded: LoadedPlate = self._plates.under((), time=time)
+        self.loaded: LoadedPlate = self._plates.solution((), time=time)()
         self.contacts: Mapping[str, FingertipLoad] = {}
         # Amplitude of each free vibration at the time of the present solution.
         self._free = np.zeros(len(self.loaded.plate.decay), dtype=complex)

@@ -6,7 +6,7 @@ Capabilities are read beyond their ranges too, and which of them cannot be so.
 import math
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 from drivers.judge.asking.client import Unusable, require
@@ -56,9 +56,8 @@ def play(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
     return send("Set", layers=layers, now=now, **values)
 
 
-def stage(*layers: LayerSet, **values: Any) -> Send:
-    """Make a set that is staged."""
-    return play(*layers, now=0, **values)
+stage = partial(play, now=0)
+"""Makes a set that is staged."""
 
 
 _WORD = 0xFFFF

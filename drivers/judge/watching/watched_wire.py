@@ -171,7 +171,7 @@ class WatchedWire:
             self._damaged_at = time
         if not self.is_disturbed(started_at):
             sender = "host" if direction == "amplifier" else "amplifier"
-            self._report.add("garbage", self.name, time, f"{sender} sent {why}")
+            self._report.add(self.name, "garbage", time, f"{sender} sent {why}")
 
     def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
         """Process a frame of the host."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, ExpectedSets
@@ -57,9 +58,7 @@ class Witness:
 
     def _session(self, name: str) -> AmplifierSession:
         config = self._config.amplifiers[name]
-
-        def report_always(invariant: str, time: float, sentence: str) -> None:
-            self._report.add(invariant, config.wire, time, sentence)
+        report_always = partial(self._report.add, config.wire)
 
         def is_disturbed(time: float) -> bool:
             return self._wires[config.wire].is_disturbed(time)

@@ -53,7 +53,10 @@ class Probe(Protocol):
         ...
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Take samples: times (n,) [s], accelerations (n, p) [m/s²]; calls are contiguous."""
+        """Take samples: times (n,) [s], one at least, accelerations (n, p) [m/s²].
+
+        Calls are contiguous.
+        """
         ...
 
 
@@ -334,7 +337,9 @@ class Bench:
         return [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
 
     def _pass_on(self, times: FloatArray, felt: FloatArray, shapes: Sequence[FloatArray]) -> None:
-        """Hand samples at these shapes over to the fingers and to each probe."""
+        """Hand samples at these shapes over to the fingers and to each probe, if there are any."""
+        if not len(times):
+            return
         ends = np.cumsum([len(each) for each in shapes])[:-1]
         under_fingers, *others = np.split(felt, ends, axis=1)
         self._fingers.record(times, under_fingers)

@@ -89,7 +89,7 @@ class ToneReader:
         self._normal += columns.T @ columns
         self._right += columns.T @ read
         self._is_overloaded |= (np.abs(read) >= self._reach).any(axis=0)
-        if len(times) and times[-1] + 1 / rate > self.end:
+        if times[-1] + 1 / rate > self.end:
             self._bench.forget_reader(self)
 
     def tones(self) -> list[tuple[bool, list[complex]]]:

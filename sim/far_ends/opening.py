@@ -9,6 +9,7 @@ from contextlib import (
     AbstractAsyncContextManager,
     AsyncExitStack,
     asynccontextmanager,
+    closing,
     contextmanager,
 )
 from dataclasses import dataclass, field, replace
@@ -130,13 +131,8 @@ async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
 
 @contextmanager
 def _bus_with(devices: Devices, bitrate: int | None) -> Iterator[CanBus]:
-    bus = CanBus(bitrate)
-    nodes = BusNodes(bus, devices)
-    try:
+    with closing(CanBus(bitrate)) as bus, closing(BusNodes(bus, devices)):
         yield bus
-    finally:
-        nodes.close()
-        bus.close()
 
 
 @asynccontextmanager

@@ -197,10 +197,10 @@ def assign_wires(
         if name in assigned:
             raise InputError(f"--wire {text}: must be given once per amplifier{_EXAMPLE}")
         assigned[name] = _wire_of_option(kind, text, defaults)
-    for name, url in amplifiers.items():
-        if name not in assigned:
-            assigned[name] = common or _wire_of_url(name, url, defaults)
-    return {name: assigned[name] for name in amplifiers}
+    return {
+        name: assigned.get(name) or common or _wire_of_url(name, url, defaults)
+        for name, url in amplifiers.items()
+    }
 
 
 def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:

@@ -204,11 +204,10 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         return damaged("a frame of the wrong direction")
     key = (frame.address, frame.sequence, frame.type) if frame.address else None
     is_hello = frame.type == HELLO_NUMBER
-    message: Message
     try:
         words = () if is_hello else unpack_words(frame.payload)
         if direction == "amplifier":
-            message = request_of(frame.type, words, frame.address, key)
+            message: Message = request_of(frame.type, words, frame.address, key)
         elif is_hello:
             message = Reply(frame.address, key, unpack_identity(frame.payload))
         else:

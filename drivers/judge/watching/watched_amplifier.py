@@ -129,17 +129,19 @@ class WatchedAmplifier(ExpectedAmplifier):
         for request in earlier if self.state is not None else ():
             started_at, is_broadcast = request.started_at, request.key is None
             until, _ = self.sets.staged_until(request.values.get("token"))
-            if is_carried_out(request, status):
-                last = min(end, started_at + REACTION) if is_broadcast else end
-                when = started_at, max(last, started_at)
-                self.carry_out(request.name, request.values, status, when)
-            elif request.name == "Arm":
-                self.token = None  # 0, if it was carried out before what disarmed again
-            elif is_broadcast and request.name == "Stop":
-                self.report("stop", end, "answer to a broadcast Stop", must="obeyed", seen="none")
-            elif is_broadcast and started_at + REACTION <= until:
-                what = f"answer to a broadcast Commit of set {request.values['token']}"
-                self.report("commit", end, what, must="obeyed", seen="none")
+            match request.name:
+                case _ if is_carried_out(request, status):
+                    last = min(end, started_at + REACTION) if is_broadcast else end
+                    when = started_at, max(last, started_at)
+                    self.carry_out(request.name, request.values, status, when)
+                case "Arm":
+                    self.token = None  # 0, if it was carried out before what disarmed again
+                case "Stop" if is_broadcast:
+                    what = "answer to a broadcast Stop"
+                    self.report("stop", end, what, must="obeyed", seen="none")
+                case _ if is_broadcast and started_at + REACTION <= until:
+                    what = f"answer to a broadcast Commit of set {request.values['token']}"
+                    self.report("commit", end, what, must="obeyed", seen="none")
 
     # reports
 

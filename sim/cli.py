@@ -149,7 +149,9 @@ def sim(
         simulation = Simulation(
             loaded,
             wires,
-            faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
+            faults=load_faults(faults, amplifiers=loaded.amplifiers)
+            if faults
+            else FaultFile(faults=[]),
             fingers={
                 str(number): parse_point(text, what="--finger")
                 for number, text in enumerate(finger or [], start=1)

@@ -61,7 +61,7 @@ def host_of(hosted: HostedRig) -> Amplifier:
 
 def fault(hosted: HostedRig, kind: FaultKind, **options: object) -> None:
     """Begin a fault."""
-    hosted.devices["main"].inject_fault(FaultWindow(kind, **options))  # type: ignore[arg-type]
+    hosted.devices["main"].inject_fault(FaultWindow(fault=kind, **options))  # type: ignore[arg-type]
 
 
 async def play(hosted: HostedRig, *levels: float) -> None:

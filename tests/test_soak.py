@@ -90,7 +90,7 @@ PLANS = {
     "held on serial": held(),
     "held on modbus-tcp": held(wire="modbus-tcp"),
     "held on socketcand": held(wire="socketcand"),
-    "unplugged": held(FaultInjection(2.0, 0, FaultWindow("unplug", lasts=1.5))),
+    "unplugged": held(FaultInjection(2.0, 0, FaultWindow(fault="unplug", lasts=1.5))),
     "stopped": held(commands=(OperatorAction(1.8, "stop"), OperatorAction(2.6, "ready"))),
     "stalled": held(commands=(OperatorAction(1.8, "stall", 0.6),)),
 }

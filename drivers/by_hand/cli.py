@@ -255,7 +255,7 @@ def _show_result(result: "CheckResult") -> None:
     if result.reason:
         print(f"         {result.reason} ({result.check.place})")
     for name in ("sent", "came"):
-        if text := getattr(result, name):
+        if text := getattr(result.finding, name):
             print(f"         {name}: {text}")
 
 

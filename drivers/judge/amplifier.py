@@ -9,10 +9,10 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.judge.outputs import ExpectedOutputs, Report, Unclear, one_of
+from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import Problem, achieved_problem
+from drivers.protocol.achieved import TONE, Problem, achieved_problem
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.table import (
@@ -27,7 +27,6 @@ from drivers.protocol.table import (
 )
 
 ROUNDED = 0.002  # s; of times in milliseconds
-_DRIFT = 1e-3  # of a time; of the amplifier's clock
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
 OFF, STOPPED = STATES["SWITCH_ON_DISABLED"], STATES["QUICK_STOP_ACTIVE"]
@@ -124,7 +123,7 @@ class ExpectedAmplifier:
         """When the watchdog trips if it is not fed, at the earliest and at the latest."""
         if self.watchdog == math.inf:  # not known
             return _NEVER
-        early, late = self.watchdog * (1 - _DRIFT), (self.watchdog + _TRIP) * (1 + _DRIFT)
+        early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
         return self.fed[0] + early - ROUNDED, self.fed[1] + late
 
     # What it does
@@ -158,14 +157,15 @@ class ExpectedAmplifier:
         is_late = reply.get("state") in (REACTING, FAULT)  # it may have expired before
         if name in FEEDING and self.state in (None, ENABLED) and not is_late:
             self.fed = when
-        if name == "Set":
-            self._take(values, reply, when)
-        elif name == "GetAchieved":
-            self._check_achieved(values["layer"], reply, when)
-        elif name == "GetFaults":
-            self._check_faults(reply["faults"], when)
-        else:
-            self.carry_out(name, values, reply, when)
+        match name:
+            case "Set":
+                self._take(values, reply, when)
+            case "GetAchieved":
+                self._check_achieved(values["layer"], reply, when)
+            case "GetFaults":
+                self._check_faults(reply["faults"], when)
+            case _:
+                self.carry_out(name, values, reply, when)
         if "levels" in reply:
             self.check(reply, when)
 
@@ -190,26 +190,27 @@ class ExpectedAmplifier:
         has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
         if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
             self._trip(FAULTS["WATCHDOG"], self._expired_by(when[1]), "the watchdog")  # first
-        if name == "Arm":
-            if not self.is_enabled or values["session"] != self.session:
-                self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
-                self.token = 0
-            self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
-            self.watchdog, self.fed = values["watchdog"] / 1000, when
-        elif name == "Silence":
-            self._fall_silent(ENABLED, when, ramp, cause)
-        elif name == "Disarm" and self.state is not None:
-            state = _SWITCHED_ON if self.is_enabled else self.state
-            self._fall_silent(state, when, ramp, cause)
-        elif name == "Stop" and self.state is not None:
-            self._latch_again()
-            self._fall_silent(self.state if self.is_in_fault else STOPPED, when, ramp, cause)
-        elif name == "Clear" and self.state in LATCHED:
-            self._clear(values["latch"], shown["state"], when)
-        elif name == "Commit":
-            self._commit(values["token"], when)
-        elif name == "Set" and values["now"]:
-            self._play(values["token"], when)
+        match name:
+            case "Arm":
+                if not self.is_enabled or values["session"] != self.session:
+                    self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
+                    self.token = 0
+                self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
+                self.watchdog, self.fed = values["watchdog"] / 1000, when
+            case "Silence":
+                self._fall_silent(ENABLED, when, ramp, cause)
+            case "Disarm" if self.state is not None:
+                state = _SWITCHED_ON if self.is_enabled else self.state
+                self._fall_silent(state, when, ramp, cause)
+            case "Stop" if self.state is not None:
+                self._latch_again()
+                self._fall_silent(self.state if self.is_in_fault else STOPPED, when, ramp, cause)
+            case "Clear" if self.state in LATCHED:
+                self._clear(values["latch"], shown["state"], when)
+            case "Commit":
+                self._commit(values["token"], when)
+            case "Set" if values["now"]:
+                self._play(values["token"], when)
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
         """Leave a stop or a fault, once all is silent, where its cause is gone."""
@@ -227,6 +228,9 @@ class ExpectedAmplifier:
         """Compare the reply to a part of a set, and play a set that is played at once."""
         token, end = part["token"], when[1]
         self._expect("credit", end, "token of a reply to Set", token, reply["token"])
+        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
+        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
+            self._expect("plays", end, f"exact of set {token}", 1, reply["exact"])
         if token == self.token:
             self._expect("commit", end, "played of a repeated set", 1, reply["played"])
         if token == self.token or token != reply["token"]:
@@ -237,7 +241,7 @@ class ExpectedAmplifier:
             self._unclear("a part came as its set expired")
         elif known is not None and seen not in known:
             what = f"missing, staged, played after part {part['index']} of set {token}"
-            self.report("commit", end, what, must=" or ".join(map(str, known)), seen=seen)
+            self.report("commit", end, what, must=one_of(known), seen=seen)
         if reply["played"]:
             self._play(token, when)
 
@@ -298,7 +302,7 @@ class ExpectedAmplifier:
         known = self._states(when)
         if now not in known:
             what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
-            must = " or ".join(map(self._name_of, known))
+            must = one_of(map(self._name_of, known))
             self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
             return False
         if fault and fault != self.fault and self._may_fail and not self.is_shown:
@@ -391,7 +395,7 @@ class ExpectedAmplifier:
         faults = [(each["fault"], each["age"] / 1000) for each in listed]
         left = iter(faults)
         for fault, since in self._faults:
-            drift = _DRIFT * (when[1] - since[0])
+            drift = DRIFT * (when[1] - since[0])
             slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
             low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
             if not any(each == fault and low <= age <= high for each, age in left):

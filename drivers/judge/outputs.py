@@ -15,7 +15,8 @@ from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, has_flag
 
 _LATE = 0.002  # s; by which a set may begin later
-_DRIFT = 1e-3  # of a time; of the amplifier's clock
+DRIFT = 1e-3
+"""Of a time; of the amplifier's clock."""
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
@@ -68,7 +69,9 @@ class ExpectedOutputs:
         self.cause = cause
         self.is_exact, self.may_derate, self.interferes = True, False, False
         self._report, self._unclear, self._slack = report, unclear, slack
-        self._plays = UncertainPlayback(playback_of(can) if can else silent())
+        self.playback = playback_of(can) if can else silent()
+        """What plays, with each commit in the middle of its interval."""
+        self._plays = UncertainPlayback(self.playback)
         self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
         self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
         self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
@@ -79,11 +82,6 @@ class ExpectedOutputs:
     def forget(self) -> None:
         """Treat what plays as unknown."""
         self._unknown = [math.inf] * _LAYERS
-
-    @property
-    def playback(self) -> Playback:
-        """What plays, with each commit in the middle of its interval."""
-        return self._plays.playback
 
     # What happens
 
@@ -149,7 +147,7 @@ class ExpectedOutputs:
     def _widened(self, when: Interval) -> Interval:
         """Return an interval as the amplifier's clock may have it."""
         since = self.began[0]
-        extra = self._slack + _DRIFT * (when[1] - since)
+        extra = self._slack + DRIFT * (when[1] - since)
         return when[0] - extra, when[1] + extra
 
     def sure(self, when: Interval) -> set[int]:

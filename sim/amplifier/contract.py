@@ -107,6 +107,7 @@ class Amplifier:
         """Reset all but the temperature and the fault history."""
         can = self.capabilities
         self.playback = playback_of(can)
+        self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
         self._watchdog = 0.0
         self._last_fed = 0.0
@@ -282,10 +283,6 @@ class Amplifier:
                     raise Refusal("no sensors are there", "UNKNOWN_TYPE")
                 return self._sensing.handle(name, values, now)
         return None
-
-    @property
-    def _channels(self) -> range:
-        return range(self.playback.channels)
 
     def _is_foreign(self, session: int, name: str) -> bool:
         """Whether a session is not the one that is held, or to arm, has ended."""

@@ -3,7 +3,6 @@
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
@@ -18,8 +17,9 @@ class AmplifierDevice:
 
     Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
     all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is
-    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back. Its time
-    is that of the running event loop.
+    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back;
+    listeners: with the values of every Event, and its time [s]. Its time is that of the running
+    event loop.
     """
 
     def __init__(
@@ -30,6 +30,7 @@ class AmplifierDevice:
         self.faults = Faults() if faults is None else faults
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
+        self.identity, self.listeners = self._amplifier.identity, self._amplifier.listeners
         self.plug_listeners: list[Callable[[bool], None]] = []
         self.boot_listeners: list[Callable[[], None]] = []
         self._unplugged = 0  # active unplug faults
@@ -47,11 +48,6 @@ class AmplifierDevice:
         return self._unplugged == 0
 
     @property
-    def identity(self) -> Values:
-        """Values of its identity."""
-        return self._amplifier.identity
-
-    @property
     def state(self) -> str:
         """Name of its state."""
         return self._amplifier.state
@@ -60,11 +56,6 @@ class AmplifierDevice:
     def fault(self) -> str:
         """Name of its fault."""
         return self._amplifier.fault
-
-    @property
-    def listeners(self) -> list[Callable[[Values, float], None]]:
-        """Called with the values of every Event, and its time [s]."""
-        return self._amplifier.listeners
 
     @property
     def next_event(self) -> float:
@@ -95,7 +86,7 @@ class AmplifierDevice:
     def inject_fault(self, window: FaultWindow) -> None:
         """Add a fault that begins now, whatever its `at`."""
         now = clock.now()
-        window = replace(window, at=now - self.faults.begin)
+        window = window.model_copy(update={"at": now - self.faults.begin})
         self.faults.windows = (*self.faults.windows, window)
         self._schedule(window)
 
@@ -106,7 +97,7 @@ class AmplifierDevice:
         active = [window for window in self.faults.windows if window.at <= over < window.end]
         self.faults.windows = ()
         for window in active:
-            self._handle_edge(replace(window, lasts=over - window.at), "end")
+            self._handle_edge(window.model_copy(update={"lasts": over - window.at}), "end")
 
     def close(self) -> None:
         """Cancel the scheduled faults."""

@@ -53,7 +53,10 @@ class Probe(Protocol):
         ...
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Take samples: times (n,) [s], accelerations (n, p) [m/s²]; calls are contiguous."""
+        """Take samples: times (n,) [s], one at least, accelerations (n, p) [m/s²].
+
+        Calls are contiguous.
+        """
         ...
 
 
@@ -78,7 +81,8 @@ class Bench:
         self.sample_rate = sample_rate
         self.imperfections = imperfections
         self._probes: list[Probe] = []
-        self._time = now
+        self.time = now
+        """The present time [s]."""
         # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
         self._plant = _plant_of(imperfections.plate.realised(rig), now)
         self._sampled_until = now  # up to when [s] fingers and probes have samples
@@ -112,11 +116,6 @@ class Bench:
         self._played: deque[tuple[Voices, float]] = deque()
 
     @property
-    def time(self) -> float:
-        """The present time [s]."""
-        return self._time
-
-    @property
     def fingers(self) -> Fingers:
         """The fingers, with what they have felt up to the present time."""
         self._sample_plate()
@@ -131,21 +130,21 @@ class Bench:
     def advance(self, now: float) -> None:
         """Advance to a time [s]; each event happens at its own time."""
         self._advance(now)
-        if self._time - self._sampled_until >= _MAX_BEHIND:
+        if self.time - self._sampled_until >= _MAX_BEHIND:
             self._sample_what_is_solved()
 
     def _advance(self, now: float) -> None:
         """Advance the amplifiers to a time [s], and the plate with them if probes listen."""
-        if now - self._time > KEPT and not self._probes:  # older samples are not kept
+        if now - self.time > KEPT and not self._probes:  # older samples are not kept
             self._sample_plate()
             self._advance_amplifiers(now - KEPT)
-            self._sampled_until = self._time
-            self._plant.skip(self._time)
-        while now - self._time > _MAX_STEP:
-            self._advance_amplifiers(self._time + _MAX_STEP)
+            self._sampled_until = self.time
+            self._plant.skip(self.time)
+        while now - self.time > _MAX_STEP:
+            self._advance_amplifiers(self.time + _MAX_STEP)
             self._sample_plate()
         self._advance_amplifiers(now)
-        behind = self._time - self._sampled_until
+        behind = self.time - self._sampled_until
         if self._probes or behind > KEPT:
             self._sample_plate()
         elif behind > _MAX_STEP:
@@ -160,10 +159,10 @@ class Bench:
 
     def exchange(self, amplifier: str, name: str, values: Values, *, now: float) -> Values:
         """Return the values of an amplifier's reply to a request at a time [s]; raises Refusal."""
-        if now > self._time:
+        if now > self.time:
             self._advance(now)
         try:
-            return self.amplifiers[amplifier].handle(name, values, self._time)
+            return self.amplifiers[amplifier].handle(name, values, self.time)
         finally:
             self._update_plant()
 
@@ -204,9 +203,9 @@ class Bench:
         before, self._contacts = self._contacts, self._contacts_at(positions)
         solve = None
         if self._contacts != before:
-            solution = self._plant.solution(self._contacts, time=self._time)
+            solution = self._plant.solution(self._contacts, time=self.time)
             solve = partial(_tabulated, solution, self.sample_rate)
-        placement = Placement(self._time, positions, self._contacts, solve)
+        placement = Placement(self.time, positions, self._contacts, solve)
         if len(self._placements) > 1 and placement.supersedes(*list(self._placements)[-2:]):
             self._placements.pop()
         self._placements.append(placement)
@@ -223,7 +222,7 @@ class Bench:
         """
         self.advance(now)
         self._sample_plate()
-        plant = _plant_of(errors.realised(self.rig), self._time)
+        plant = _plant_of(errors.realised(self.rig), self.time)
         plant.set_contacts(self._plant.contacts)
         for index, playing in enumerate(self._applied_outputs):
             plant.set_input(index, self._motion(index, playing))
@@ -232,7 +231,7 @@ class Bench:
         self._shapes_at.cache_clear()
         self._fingers.place(self._fingers.layout.positions, reduced=plant.reduced)
         for sensing in self._sensing:
-            sensing.changed(self._time)
+            sensing.changed(self.time)
 
     def place_sensors(self, sensors: Sequence[Accelerometer]) -> None:
         """Replace the sensors of the first amplifier beside those at its ERAs."""
@@ -261,7 +260,7 @@ class Bench:
         while True:
             events = [amplifier.next_event for amplifier in amplifiers]
             moment = min([to_time, *events])
-            self._time = max(self._time, moment)
+            self.time = max(self.time, moment)
             for amplifier, event in zip(amplifiers, events, strict=True):
                 if event <= moment or amplifier.is_derated:
                     amplifier.tick(moment)
@@ -288,7 +287,7 @@ class Bench:
 
         solves: fingers that are unsolved by then; otherwise to the first of them.
         """
-        end = min(until, self._time)
+        end = min(until, self.time)
         while self._placements and self._placements[0].time <= end and not self._is_sampling:
             if not (solves or self._placements[0].is_solved):
                 end = self._placements[0].time
@@ -338,7 +337,9 @@ class Bench:
         return [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
 
     def _pass_on(self, times: FloatArray, felt: FloatArray, shapes: Sequence[FloatArray]) -> None:
-        """Hand samples at these shapes over to the fingers and to each probe."""
+        """Hand samples at these shapes over to the fingers and to each probe, if there are any."""
+        if not len(times):
+            return
         ends = np.cumsum([len(each) for each in shapes])[:-1]
         under_fingers, *others = np.split(felt, ends, axis=1)
         self._fingers.record(times, under_fingers)
@@ -353,13 +354,13 @@ class Bench:
             if playing is not commanded and playing != commanded:
                 self._commanded[index] = playing
                 self._apply(index, playing)
-        while self._played and self._played[0][1] < self._time - KEPT:
+        while self._played and self._played[0][1] < self.time - KEPT:
             self._played.popleft()
 
     def _apply(self, index: int, playing: Voices) -> None:
         """Let an output move the base of an ERA, after its amplifier's delay."""
-        delay = self.imperfections.delay(self._wired[index].amplifier)
-        late, since = delayed(playing, delay) if delay else playing, self._time + delay
+        delay = self.imperfections.delays.get(self._wired[index].amplifier, 0.0)
+        late, since = delayed(playing, delay) if delay else playing, self.time + delay
         self._plant.set_input(index, self._motion(index, late), since=since)
         self._played.append((self._applied_outputs[index], since))
         self._applied_outputs[index] = late

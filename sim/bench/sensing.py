@@ -89,7 +89,7 @@ class ToneReader:
         self._normal += columns.T @ columns
         self._right += columns.T @ read
         self._is_overloaded |= (np.abs(read) >= self._reach).any(axis=0)
-        if len(times) and times[-1] + 1 / rate > self.end:
+        if times[-1] + 1 / rate > self.end:
             self._bench.forget_reader(self)
 
     def tones(self) -> list[tuple[bool, list[complex]]]:
@@ -170,7 +170,11 @@ class Sensing:
         return {
             "unit": SENSOR_UNITS["ACCELERATION"],
             "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
-            **{"x": _place(sensor.x), "y": _place(sensor.y), "range": _binary32(sensor.reach)},
+            **{
+                "x": _place(sensor.x),
+                "y": _place(sensor.y),
+                "range": float(np.float32(sensor.reach)),
+            },
             "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
         }
 
@@ -242,7 +246,3 @@ def _place(at: float) -> int:
     """A coordinate [m] as the protocol states it."""
     last = _Q["place"].from_wire(UNKNOWN_PLACE - 1)
     return _Q["place"].to_wire(at) if at <= last else UNKNOWN_PLACE
-
-
-def _binary32(value: float) -> float:
-    return float(np.float32(value))

@@ -1,6 +1,7 @@
 """The running simulation: its bench, devices, sensors and recording."""
 
 import asyncio
+import math
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,11 +43,12 @@ class SimulationContext:
         if self.step is not None:
             return  # the first who reads the plate solves it
         if self._solving is None or self._solving.done():
-            self._solving = asyncio.create_task(self._solve(), name="solve the plate")
+            self._solving = asyncio.create_task(self.solved(math.inf), name="solve the plate")
 
     async def solved(self, until: float) -> None:
-        """Wait until the plate under the fingers is solved up to a time [s]."""
+        """Solve the plate under the fingers up to a time [s], or wait until it is."""
         while (placement := self.bench.unsolved) is not None and placement.time <= until:
+            # An error is raised once more where the plate is read.
             await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
 
     async def stop_solving(self) -> None:
@@ -54,11 +56,6 @@ class SimulationContext:
         if self._solving is not None:
             self._solving.cancel()
             await asyncio.wait({self._solving})
-
-    async def _solve(self) -> None:
-        while (placement := self.bench.unsolved) is not None:
-            # An error is raised once more where the plate is read.
-            await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
 
     def record(self, path: Path) -> None:
         """Start recording the present sensors and fingers; InputError while another one runs."""

@@ -5,6 +5,7 @@ import ctypes.util
 import re
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import closing
 from functools import cache
 
 from drivers.errors import LinkError
@@ -167,11 +168,8 @@ def jack_name(other: str) -> str:
 
 def check_free(other: str, channels: int) -> None:
     """Raise LinkError where another program plays to one of the first ports of a client."""
-    client = JackClient("era-check")
-    try:
+    with closing(JackClient("era-check")) as client:
         client.check_free(client.ports_of(other, IS_INPUT)[:channels], device=other)
-    finally:
-        client.close()
 
 
 def jack_devices(flag: int) -> dict[str, int]:
@@ -179,11 +177,8 @@ def jack_devices(flag: int) -> dict[str, int]:
 
     flag: IS_INPUT or IS_OUTPUT. Raises InputError, LinkError.
     """
-    client = JackClient("era-list")
-    try:
+    with closing(JackClient("era-list")) as client:
         ports = _names(libjack().jack_get_ports(client.pointer, None, _AUDIO, flag))
-    finally:
-        client.close()
     return {f"jack:{name}": n for name, n in Counter(p.split(":")[0] for p in ports).items()}
 
 

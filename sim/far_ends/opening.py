@@ -9,6 +9,7 @@ from contextlib import (
     AbstractAsyncContextManager,
     AsyncExitStack,
     asynccontextmanager,
+    closing,
     contextmanager,
 )
 from dataclasses import dataclass, field, replace
@@ -130,13 +131,8 @@ async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
 
 @contextmanager
 def _bus_with(devices: Devices, bitrate: int | None) -> Iterator[CanBus]:
-    bus = CanBus(bitrate)
-    nodes = BusNodes(bus, devices)
-    try:
+    with closing(CanBus(bitrate)) as bus, closing(BusNodes(bus, devices)):
         yield bus
-    finally:
-        nodes.close()
-        bus.close()
 
 
 @asynccontextmanager
@@ -201,10 +197,10 @@ def assign_wires(
         if name in assigned:
             raise InputError(f"--wire {text}: must be given once per amplifier{_EXAMPLE}")
         assigned[name] = _wire_of_option(kind, text, defaults)
-    for name, url in amplifiers.items():
-        if name not in assigned:
-            assigned[name] = common or _wire_of_url(name, url, defaults)
-    return {name: assigned[name] for name in amplifiers}
+    return {
+        name: assigned.get(name) or common or _wire_of_url(name, url, defaults)
+        for name, url in amplifiers.items()
+    }
 
 
 def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:

@@ -50,21 +50,20 @@ Toward: TypeAlias = Literal["amplifier", "host"]
 _DAMAGING = ("corrupt", "truncate", "incomplete_set")
 
 
-@dataclass(frozen=True)
-class FaultWindow:
-    """A fault that is active from `at` for `lasts` [s].
+class FaultWindow(Section):
+    """A fault that is active from `at` for `lasts` [s], as a fault file has it.
 
     amplifier: None for all. Of frames: share 0..1 that is hit; toward: the direction, None for
     both; delay [s]: maximum, uniformly distributed.
     """
 
     fault: FaultKind
-    at: float = 0.0
-    lasts: float = math.inf
+    at: Annotated[float, Quantity(TIME, at_least=0)] = 0.0
+    lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
     amplifier: str | None = None
-    share: float = 1.0
+    share: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
     toward: Toward | None = None
-    delay: float = 0.1
+    delay: Annotated[float, Quantity(TIME, above=0, at_most=10)] = 0.1
 
     @property
     def end(self) -> float:
@@ -142,53 +141,35 @@ class Faults:
         return window.at <= time - self.begin < window.end
 
 
-class _FaultSection(Section):
-    fault: FaultKind
-    at: Annotated[float, Quantity(TIME, at_least=0)] = 0.0
-    lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
-    amplifier: str | None = None
-    share: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
-    toward: Toward | None = None
-    delay: Annotated[float, Quantity(TIME, above=0, at_most=10)] = 0.1
-
-
-class _FaultFileSection(Section):
-    seed: int = 0
-    faults: list[_FaultSection]
-
-
-@dataclass(frozen=True)
-class FaultFile:
+class FaultFile(Section):
     """Fault windows for the amplifiers of a rig."""
 
-    windows: tuple[FaultWindow, ...]
     seed: int = 0
+    faults: list[FaultWindow]
 
     def of(self, amplifier: str, *, begin: float) -> Faults:
         """The faults of one amplifier; begin [s]: when their time scale begins."""
-        own = [window for window in self.windows if window.amplifier in (None, amplifier)]
+        own = [window for window in self.faults if window.amplifier in (None, amplifier)]
         return Faults(own, begin=begin, seed=self.seed)
 
 
 def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
     """Read a fault file; raises ConfigError with every problem, by file, line and key."""
     document = read_document(path)
-    validation = Validation(document, _FaultFileSection)
+    validation = Validation(document, FaultFile)
     listed = document.data.get("faults")
     for number, entry in enumerate(listed if isinstance(listed, list) else []):
         name = entry.get("amplifier") if isinstance(entry, dict) else None
         if isinstance(name, str) and name not in amplifiers:
             known = ", ".join(sorted(amplifiers))
             validation.add(("faults", number, "amplifier"), f"must be one of {known}, got {name!r}")
-    section = validation.finish()
-    windows = tuple(FaultWindow(**window.model_dump()) for window in section.faults)
-    return FaultFile(windows, seed=section.seed)
+    return validation.finish()
 
 
 def parse_fault(given: Mapping[str, Any]) -> FaultWindow:
     """Parse one fault, with the keys of a fault file; raises InputError."""
     try:
-        return FaultWindow(**_FaultSection.model_validate(dict(given)).model_dump())
+        return FaultWindow.model_validate(dict(given))
     except ValidationError as error:
         key, problem = first_problem(error)
         raise InputError(f"{key}: {problem}") from None

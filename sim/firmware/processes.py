@@ -226,13 +226,13 @@ class FirmwareBench(Bench):
         if self._start is None or abs(now - self._start - last / RATE) > _MAX_LAG:
             self._start = now - last / RATE
         times: FloatArray = self._start + np.arange(self._count + 0.5, last) / RATE
-        self._count, self._time = last, float(times[-1])
+        self._count, self.time = last, float(times[-1])
         bases = levels * self._gains * [era.stroke for era in self.rig.eras]
         shapes = self._listening()
         felt = self._sampled.advance(bases, shapes=np.concatenate(shapes))
         self._pass_on(times, felt, shapes)
         self._recent.append((float(times[0]), levels))
-        while self._recent[0][0] < self._time - KEPT:
+        while self._recent[0][0] < self.time - KEPT:
             self._recent.popleft()
 
     def _sample(self, end: float) -> None:

@@ -97,8 +97,6 @@ class Fingers:
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""
-        if not len(times):
-            return
         if accelerations.shape[1]:
             self._pieces.append((self.layout, times, accelerations.astype(np.float32, copy=False)))
         while self._pieces and self._pieces[0][1][-1] < times[-1] - KEPT:

@@ -123,10 +123,6 @@ class Imperfections:
                     f"got {name}"
                 )
 
-    def delay(self, amplifier: str) -> float:
-        """Delay from a command of this amplifier to the base motion [s]."""
-        return self.delays.get(amplifier, 0.0)
-
     def errors_of(self, era: str, rig: Rig) -> ChannelErrors:
         """Errors of the channel to which an ERA is wired."""
         return self.channels.get(rig.wiring[era], ChannelErrors())

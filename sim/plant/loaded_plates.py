@@ -99,14 +99,13 @@ class LoadedPlateCache:
         self._solved = lru_cache(_MAX_SOLVED)(self._solve)
         self._reduced_at = lru_cache(_MAX_SOLVED)(self._reduce)
 
-    def under(self, contacts: Sequence[FingertipLoad], *, time: float) -> LoadedPlate:
-        """The plate under these contacts from a time [s]; calls must be in order of time."""
-        return self.solution(contacts, time=time)()
-
     def solution(
         self, contacts: Sequence[FingertipLoad], *, time: float
     ) -> Callable[[], LoadedPlate]:
-        """What solves the plate under these contacts, in any thread; called as `under`."""
+        """What solves the plate under these contacts from a time [s] on, in any thread.
+
+        Calls must be in order of time.
+        """
         resting = tuple(sorted({(each.x, each.y, each.foot) for each in contacts}))
         for point in self._resting:
             self._lifted.pop(point, None)

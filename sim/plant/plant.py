@@ -53,7 +53,8 @@ class _Stretch(NamedTuple):
 class Plant:
     """A reduced plate on its ERAs with loads, at rest at `time` [s].
 
-    Raises InputError for ERAs that do not support the plate.
+    loaded: the plate under the present contacts; contacts: by id of the finger. Raises InputError
+    for ERAs that do not support the plate.
     """
 
     def __init__(
@@ -66,34 +67,24 @@ class Plant:
     ) -> None:
         self.time = time
         self._plates = LoadedPlateCache(reduced, eras, loads)
-        self._current: LoadedPlate = self._plates.under((), time=time)
-        self._contacts: Mapping[str, FingertipLoad] = {}
+        self.loaded: LoadedPlate = self._plates.solution((), time=time)()
+        self.contacts: Mapping[str, FingertipLoad] = {}
         # Amplitude of each free vibration at the time of the present solution.
-        self._free = np.zeros(len(self._current.plate.decay), dtype=complex)
+        self._free = np.zeros(len(self.loaded.plate.decay), dtype=complex)
         # The motion of each ERA's base; those that follow, by time [s] and ERA.
         self._inputs: list[Motion] = [()] * len(eras)
         self._scheduled: dict[float, dict[int, Motion]] = {}
         # The sets of motions and the solutions that were found together, and the present ones.
         self._motions = BaseMotions(self._inputs)
         self._set = 0
-        self._forced = self._current.plate.driven(self._motions, [0], [time])
+        self._forced = self.loaded.plate.driven(self._motions, [0], [time])
         self._solution = 0
         self._sampler: Sampler | None = None  # until the contacts change
 
     @property
     def reduced(self) -> ReducedPlate:
         """The plate in its present coordinates, which depend on the contacts."""
-        return self._current.reduced
-
-    @property
-    def loaded(self) -> LoadedPlate:
-        """The plate under the present contacts."""
-        return self._current
-
-    @property
-    def contacts(self) -> Mapping[str, FingertipLoad]:
-        """The present contacts by id of the finger."""
-        return self._contacts
+        return self.loaded.reduced
 
     def set_input(self, era: int, motion: Motion, *, since: float | None = None) -> None:
         """Set the base motion of an ERA after a time [s], by default the present one.
@@ -122,16 +113,16 @@ class Plant:
         Displacement and velocity of the plate, and of the phalanges of fingers that stay, are
         continuous; energy in pulp, masses and joint of a finger comes and goes with it.
         """
-        if contacts == self._contacts:
+        if contacts == self.contacts:
             return
-        before = self._current, self._contacts
+        before = self.loaded, self.contacts
         state = np.concatenate(self.state)
-        self._current = loaded or self.solution(contacts, time=self.time)()
-        self._contacts = dict(contacts)
-        remainder = carried_state(state, before, (self._current, contacts))
-        self._forced = self._current.plate.driven(self._motions, [self._set], [self.time])
+        self.loaded = loaded or self.solution(contacts, time=self.time)()
+        self.contacts = dict(contacts)
+        remainder = carried_state(state, before, (self.loaded, contacts))
+        self._forced = self.loaded.plate.driven(self._motions, [self._set], [self.time])
         self._solution = 0
-        self._free = self._current.plate.to_free @ (remainder - self._forced.state(0, self.time))
+        self._free = self.loaded.plate.to_free @ (remainder - self._forced.state(0, self.time))
         self._sampler = None
 
     def advance(
@@ -151,7 +142,7 @@ class Plant:
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
-        shapes = self._current.plate.with_phalanges(shapes)
+        shapes = self.loaded.plate.with_phalanges(shapes)
         # Few points are sampled directly, many by way of the coordinates.
         is_direct = len(shapes) < 2 * shapes.shape[1]
         points = shapes if is_direct else np.eye(shapes.shape[1])
@@ -193,7 +184,7 @@ class Plant:
             or not np.array_equal(kept.points, points)
         ):
             kept = self._sampler = Sampler(
-                self._current, points, sample_rate=sample_rate, precision=precision
+                self.loaded, points, sample_rate=sample_rate, precision=precision
             )
         return kept
 
@@ -204,7 +195,7 @@ class Plant:
         Of the coordinates of `reduced`, then of each contact's phalanx [m], [m/s].
         """
         self._advance(self.time)
-        plate, since = self._current.plate, self._forced.times[self._solution]
+        plate, since = self.loaded.plate, self._forced.times[self._solution]
         free = self._free * np.exp(plate.decay * (self.time - since))
         x = (plate.free_state @ free).real + self._forced.state(self._solution, self.time)
         r = len(x) // 2
@@ -246,7 +237,7 @@ class Plant:
     def _cross(self, changes: Sequence[_Change], stretches: list[_Stretch]) -> None:
         """Advance to the last of a few changes; displacement and velocity stay continuous."""
         numbers, times = range(len(changes)), [change.time for change in changes]
-        plate, before = self._current.plate, self._forced.times[self._solution]
+        plate, before = self.loaded.plate, self._forced.times[self._solution]
         forced = plate.driven(self._motions, [change.set_number for change in changes], times)
         states = forced.as_free([*numbers, *numbers[:-1]], times + times[1:])
         first = self._forced.as_free([self._solution], times[:1])

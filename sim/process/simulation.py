@@ -45,7 +45,7 @@ class Simulation:
 
     rig: Rig
     wires: Mapping[str, Wire]
-    faults: FaultFile = field(default_factory=lambda: FaultFile(()))
+    faults: FaultFile = field(default_factory=lambda: FaultFile(faults=[]))
     fingers: Mapping[str, Position] = field(default_factory=dict)
     imperfections: Imperfections = field(default_factory=Imperfections)
     sensors: Sequence[Accelerometer] = ()

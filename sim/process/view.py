@@ -37,8 +37,7 @@ class PlateView:
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep the peaks of accelerations (n, p) [m/s²]."""
-        if len(times):
-            np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
+        np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
 
     def take(self) -> FloatArray:
         """Return the peaks and fade them."""

@@ -54,8 +54,6 @@ class Accelerometers:
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Read accelerations: times (n,) [s], (n, s) [m/s²]."""
-        if not len(times):
-            return
         rate = self._bench.sample_rate
         read = readings(self.sensors, accelerations, sample_rate=rate, rng=self._rng)
         self._pieces.append((times, read))
@@ -145,7 +143,7 @@ class Recorder:
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Spool readings: times (n,) [s], accelerations (n, p) [m/s²]."""
-        if not len(times) or self._failure is not None:
+        if self._failure is not None:
             return
         if not self._count:
             self._start = float(times[0])

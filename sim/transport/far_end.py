@@ -104,13 +104,10 @@ class TerminalEnd:
         )
         self._served = Served(make_end(self._line.outward.send))
         self._terminal = make_terminal(self._line.inward.send, unpluggable=unpluggable)
+        self.port = self._terminal.port
+        """The path of the host's side."""
         if unpluggable:
             device.plug_listeners.append(self._plug)
-
-    @property
-    def port(self) -> str:
-        """The path of the host's side."""
-        return self._terminal.port
 
     async def __aenter__(self) -> Self:
         """Serve in the running event loop."""

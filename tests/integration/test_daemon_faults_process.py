@@ -257,7 +257,7 @@ async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> 
         dumps = {*(tmp_path / "dumps").glob("*")}  # of a reply lost before, on a busy machine
         assert size > 0
         await plays_on("disk full", daemon, era, journal)
-        far.device.inject_fault(FaultWindow("arc"))
+        far.device.inject_fault(FaultWindow(fault="arc"))
         await until_state(era, "FAULT")
         assert loudness(far) == 0
         far.device.recover()

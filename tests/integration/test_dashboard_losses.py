@@ -42,7 +42,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             before = (await tab.evaluate(EVENTS))[
                 -1:
             ]  # a short loss on a busy machine joins this one
-            bench.far.device.inject_fault(FaultWindow("hang"))
+            bench.far.device.inject_fault(FaultWindow(fault="hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
             assert await tab.evaluate(REASON) == "link-lost"
             await tab.until(BANNER, lambda text: "after 2\u00a0s" in text)  # of the bench

@@ -21,7 +21,7 @@ from daemon_bench import READY, daemon_at, far_end, until_state
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.members import GroupState
-from drivers.judge.asking.opening import opened
+from drivers.judge.asking import opened
 from drivers.opening import Lines
 from long_form import in_turn, shortly
 from model.fem.mesh import Mesh
@@ -124,7 +124,7 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         await four.hold(0.3)
         assert all(level > 0 for each in four.levels().values() for level in each)
         four.witness.disturb()
-        four.far.devices[lost].inject_fault(FaultWindow("hang"))
+        four.far.devices[lost].inject_fault(FaultWindow(fault="hang"))
         holding = asyncio.create_task(four.hold(0.6))
         await asyncio.sleep(OWN)
         assert not any(four.levels()[lost])
@@ -177,7 +177,7 @@ async def test_daemon_reaches_it_at_the_first_opening(
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, READY)
             assert [*far.machine.attempts.values()] == [openings]
-            far.device.inject_fault(FaultWindow("unplug"))
+            far.device.inject_fault(FaultWindow(fault="unplug"))
             await until_state(era, "COMM_LOST")
             far.device.recover()
             await until_state(era, READY)
@@ -207,7 +207,7 @@ async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[A
 async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float) -> None:
     """That of a board that restarts, or three attempts of 0.5 s; the error names the remedy."""
     async with far_side(WIRES[wire], RIG) as far:
-        far.device.inject_fault(FaultWindow("hang"))
+        far.device.inject_fault(FaultWindow(fault="hang"))
         began = clock.now()
         with pytest.raises(LinkTimeout) as told:
             await actions.identify(far.url)

@@ -42,7 +42,7 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
     group = await opened_group(line_to(device))
     await group.arm()
     await group.apply({"main": [layer((0, 110.0, 1.0))]})
-    device.inject_fault(FaultWindow("unplug", lasts=1.0))
+    device.inject_fault(FaultWindow(fault="unplug", lasts=1.0))
     with pytest.raises(LinkError, match="unplugged"):
         await group.beat()
     with pytest.raises(LinkError, match="unplugged"):

@@ -326,7 +326,7 @@ class FarEnd:
 
     def fault(self, kind: FaultKind, **given: Any) -> None:
         """Let a fault begin, until `recover` unless it has an end."""
-        self.device.inject_fault(FaultWindow(kind, **given))
+        self.device.inject_fault(FaultWindow(fault=kind, **given))
         self.disturb()
 
     def lie(self, answer: Callable[[str, Values], Values | None]) -> None:

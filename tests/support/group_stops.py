@@ -147,12 +147,12 @@ def _drawn(rng: random.Random, toward: Toward) -> list[FaultWindow]:
     """Return what loses, delays and doubles; sometimes nothing passes, or all does."""
     drawn = rng.random()
     if drawn < 0.1:
-        return [FaultWindow("drop", toward=toward)]
+        return [FaultWindow(fault="drop", toward=toward)]
     if drawn < 0.25:
         return []
     delay = rng.choice((0.005, 0.04, _MAX_DELAY))
     return [
-        FaultWindow(fault, share=rng.choice((0.0, 0.1, 0.3, 0.6)), toward=toward, delay=delay)
+        FaultWindow(fault=fault, share=rng.choice((0.0, 0.1, 0.3, 0.6)), toward=toward, delay=delay)
         for fault in _FRAME_FAULTS
     ]
 

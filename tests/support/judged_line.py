@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 from drivers.judge.asking import CHECKS, LEVEL, CheckResult, of_kind
+from drivers.judge.asking import CLIENTS as BY_PROTOCOL
 from drivers.judge.asking.check import run_checks
-from drivers.judge.asking.opening import CLIENTS as BY_PROTOCOL
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from virtual_loop import run_virtual
@@ -29,14 +29,14 @@ Judged: TypeAlias = Amplifier | Callable[[Callable[[bytes], None]], FarEnd]
 
 
 class JudgedLine:
-    """A line to an amplifier at address 1 and its neighbours; a `Port` of its client."""
+    """A line to an amplifier at address 1 and its neighbours; its client writes to it."""
 
     def __init__(
         self, kind: str, far: Judged, neighbours: Mapping[int, Amplifier] | None = None
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
-        self.client.port = self
+        self.client.transmit = self.write
         self._due = 0.0
         self._ticked: list[Amplifier | FarEnd] = []
         if isinstance(far, Amplifier):

@@ -91,7 +91,7 @@ def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counte
             chain.witness.disturb()
             chain.operation.passing = (0.0, LATEST)
             for end in chain.far_ends:
-                end.device.inject_fault(FaultWindow("duplicate", share=_DOUBLED))
+                end.device.inject_fault(FaultWindow(fault="duplicate", share=_DOUBLED))
             counts = Counter[str](taps=taps)
             for finger in range(_RESTING + 1, _RESTING + 1 + taps):
                 if rng.random() < _OPERATED:

@@ -92,8 +92,8 @@ class RandomGroup(Chain):
         await self.open()
         for step in range(steps):
             if step == 0 and lossy_steps:
-                lost = FaultWindow("drop", share=_LOST)
-                self.disturb(lost, FaultWindow("duplicate", share=_DOUBLED))
+                lost = FaultWindow(fault="drop", share=_LOST)
+                self.disturb(lost, FaultWindow(fault="duplicate", share=_DOUBLED))
             elif step == lossy_steps and lossy_steps:
                 self.recover()
                 await asyncio.sleep(0.6)

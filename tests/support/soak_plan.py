@@ -192,7 +192,7 @@ def _rearming(rng: random.Random, begin: float, length: float) -> list[Action]:
 def _fault_window(rng: random.Random) -> FaultWindow:
     if rng.random() < 0.6:
         return FaultWindow(
-            rng.choice(FRAME_FAULTS),
+            fault=rng.choice(FRAME_FAULTS),
             lasts=rng.choice((0.02, 0.1, 0.5, 2.0)) * rng.uniform(0.5, 1.5),
             share=rng.choice((0.05, 0.2, 0.5, 1.0)),
             toward=rng.choice((None, "host", "amplifier")),
@@ -200,7 +200,7 @@ def _fault_window(rng: random.Random) -> FaultWindow:
         )
     fault = rng.choice(AMPLIFIER_FAULTS)
     scale = {"over_temperature": 2.0, "unplug": 0.6}.get(fault, 0.3)
-    return FaultWindow(fault, lasts=scale * rng.uniform(0.05, 1.5))
+    return FaultWindow(fault=fault, lasts=scale * rng.uniform(0.05, 1.5))
 
 
 def _touch_sequences(rng: random.Random, begin: float, length: float) -> list[TouchSequence]:

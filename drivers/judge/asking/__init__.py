@@ -4,8 +4,12 @@ Run against hardware by its URL, and by the project's tests over every wire in v
 that only read come first; the others arm the amplifier and drive its channels.
 """
 
-from collections.abc import Callable
+import random
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
+from functools import partial
 
+from drivers.errors import LinkError
 from drivers.judge.asking import (
     can_frames,
     modbus_frames,
@@ -18,10 +22,24 @@ from drivers.judge.asking import (
     states,
 )
 from drivers.judge.asking.check import Check, CheckResult, Report, Result, run_checks
-from drivers.judge.asking.opening import opened
+from drivers.judge.asking.client import Client, Late, Violation
 from drivers.judge.asking.subject import LEVEL
+from drivers.protocol.table import MAX_WORDS
+from drivers.wires.known import address_of
+from registry import clock
 
-__all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]
+__all__ = [
+    "CHECKS",
+    "CLIENTS",
+    "LEVEL",
+    "Check",
+    "CheckResult",
+    "Report",
+    "Result",
+    "judge",
+    "of_kind",
+    "opened",
+]
 
 CHECKS: tuple[Check, ...] = (
     *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
@@ -54,6 +72,44 @@ def of_kind(kind: str) -> list[tuple[int, Check]]:
     """Return the checks of a kind of wire, each with its number."""
     numbered = enumerate(CHECKS, 1)
     return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
+
+
+CLIENTS: Mapping[str, Callable[[int], Client]] = {
+    "serial": serial_frames.SerialClient,
+    "CAN": can_frames.CanClient,
+    "Modbus RTU": partial(modbus_frames.ModbusClient, is_rtu=True),
+    "Modbus TCP": partial(modbus_frames.ModbusClient, is_rtu=False),
+}
+"""Clients by the protocol that a wire's settings name."""
+
+
+@asynccontextmanager
+async def opened(url: str) -> AsyncIterator[Client]:
+    """The client of an amplifier by its URL while its line is open, and its board has started.
+
+    Raises CommandError for a URL that is none, LinkError for a line that cannot be opened.
+    """
+    address = address_of(url)
+    protocol = str(address.settings["protocol"])
+    if protocol not in CLIENTS:
+        raise LinkError(f"{url}: wire must be {', '.join(CLIENTS)}, got {protocol}")
+    client = CLIENTS[protocol](address.number)
+    client.name = url
+    port = await address.open_port(client.received, client.lost)
+    client.transmit = port.write
+    try:
+        boots_until = clock.now() + address.boot_time
+        while clock.now() < boots_until:  # what a board says while it starts is no reply
+            with suppress(Violation, Late):
+                await client.hello()
+                break
+        client.session = random.getrandbits(16)
+        client.wire_time = address.make_wire().exchange_time
+        client.transit = client.wire_time(0, MAX_WORDS)
+        yield client
+    finally:
+        port.close()
+        await port.wait_closed()
 
 
 async def judge(

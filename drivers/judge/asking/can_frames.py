@@ -120,9 +120,8 @@ class CanClient(Client):
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frames of a request."""
-        node = self.address if to is None else to
-        sequence = self.next_number() if node else 0
-        return self.packed(segments(sequence, number, words), to=node)
+        sequence = 0 if to == 0 else self.next_number()
+        return self.packed(segments(sequence, number, words), to=to)
 
     def packed(self, data: Sequence[bytes], *, to: int | None = None) -> bytes:
         """Return frames with these data to a node."""

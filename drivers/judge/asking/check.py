@@ -2,8 +2,9 @@
 
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from inspect import isawaitable
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ from drivers.errors import CommandError
 from drivers.judge.asking.client import (
     Armed,
     Client,
+    Finding,
     Late,
     Optional,
     Unusable,
@@ -18,14 +20,15 @@ from drivers.judge.asking.client import (
     expect,
     read_as,
 )
-from drivers.judge.asking.material import FULL, Rows
-from drivers.judge.asking.sent import in_words
-from drivers.judge.asking.stated import STATED, Capabilities
+from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.table import MESSAGES, VERSION
+from drivers.protocol.records import Refusal
+from drivers.protocol.sets import Command, LayerSet, unpack_layers
+from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
 from registry import clock
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check
+_ARMED = "not run: it is armed, perhaps by another host"
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
 Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]
@@ -59,27 +62,26 @@ class Result(StrEnum):
     NOT_RUN = "not_run"
 
 
+_RESULTS = {
+    Finding: Result.PASSED,
+    Optional: Result.SKIPPED,
+    Late: Result.SKIPPED,
+    Unusable: Result.NOT_RUN,
+}
+"""Of checks by what they found; all else has failed."""
+
+
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Result of a check; reason, seen, expected: of a violation, or why it was skipped.
-
-    sent: the last set before a violation, in words and hexadecimal; came: the last bytes.
-    has_verdict: unless this machine or the line was always too slow for it. is_armed: the
-    amplifier is armed, so that nothing may be driven.
-    """
+    """Result of a check, the reason that it was not passed, and what it found."""
 
     check: Check
     number: int
     result: Result
     reason: str = ""
-    seen: str = ""
-    expected: str = ""
+    finding: Finding = field(default_factory=Finding)
     seconds: float = 0.0
     attempts: int = 1
-    has_verdict: bool = True
-    sent: str = ""
-    came: str = ""
-    is_armed: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Make a row with stable keys."""
@@ -90,12 +92,12 @@ class CheckResult:
             "place": self.check.place,
             "result": self.result.value,
             "reason": self.reason,
-            "seen": self.seen,
-            "expected": self.expected,
+            "seen": self.finding.seen,
+            "expected": self.finding.expected,
             "seconds": round(self.seconds, 3),
             "attempts": self.attempts,
-            "sent": self.sent,
-            "came": self.came,
+            "sent": self.finding.sent,
+            "came": self.finding.came,
         }
 
 
@@ -121,7 +123,7 @@ class Report:
         """The worst result: failed, incomplete or passed."""
         if any(each.result is Result.FAILED for each in self.results):
             return "failed"
-        is_incomplete = self.not_run or not all(each.has_verdict for each in self.results)
+        is_incomplete = self.not_run or any(isinstance(each.finding, Late) for each in self.results)
         return "incomplete" if is_incomplete else "passed"
 
     @property
@@ -160,9 +162,8 @@ def reading(place: str, *kinds: str, drives: bool = False) -> Callable[[Steps], 
     return make
 
 
-def driving(place: str, *kinds: str) -> Callable[[Steps], Check]:
-    """Make a check that arms the amplifier and drives its channels."""
-    return reading(place, *kinds, drives=True)
+driving = partial(reading, drives=True)
+"""Makes a check that arms the amplifier and drives its channels."""
 
 
 async def identified(client: Client, level: float) -> Subject:
@@ -197,8 +198,8 @@ async def run_checks(
     for number, check in checks:
         if (took := clock.now() - began) > _MAX_TIME:
             why_none = why_none or f"not run: the checks before took {took:.0f} s"
-        is_barred = check.drives and any(each.is_armed for each in (*before, *results))
-        if why := "not run: it is armed, perhaps by another host" if is_barred else why_none:
+        is_armed = any(isinstance(each.finding, Armed) for each in (*before, *results))
+        if why := _ARMED if check.drives and is_armed else why_none:
             result = CheckResult(check, number, Result.NOT_RUN, why)
         else:
             result, why_none = await _run(number, check, client, level)
@@ -208,46 +209,37 @@ async def run_checks(
 
 
 async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, str]:
-    began, is_again, why = clock.now(), True, ""
-    finding: Exception | None = None
+    began = clock.now()
     with client.watching():
-        while is_again:
+        while True:
             since = clock.now()
             finding, why = await _attempt(check, client, level)
             is_late = isinstance(finding, Late)
-            is_again = is_late and not why and client.was_late(since)
-    reason = "" if finding is None else str(finding)
-    kinds = {Optional: Result.SKIPPED, Late: Result.SKIPPED, Unusable: Result.NOT_RUN}
+            if not is_late or why or not client.was_late(since):
+                break
+    reason = str(finding)
     if is_late:
-        late = f"this machine was late by {1e3 * client.lag:.0f} ms"
-        reason = (
-            f"no verdict in {client.attempts or 1} attempts: {reason}; {client.slow_reply or late}"
-        )
+        late = client.slow_reply or f"this machine was late by {1e3 * client.lag:.0f} ms"
+        reason = f"no verdict in {client.attempts or 1} attempts: {reason}; {late}"
     if isinstance(finding, Unusable):
         reason = f"not run: {reason}"
     result = CheckResult(
-        check=check,
-        number=number,
-        result=kinds.get(type(finding), Result.FAILED) if finding else Result.PASSED,
-        reason=reason,
-        seen=getattr(finding, "seen", ""),
-        expected=getattr(finding, "expected", ""),
+        check,
+        number,
+        _RESULTS.get(type(finding), Result.FAILED),
+        reason,
+        finding,
         seconds=clock.now() - began,
         attempts=client.attempts + (not is_late),
-        has_verdict=not is_late,
-        sent=getattr(finding, "sent", ""),
-        came=getattr(finding, "came", ""),
-        is_armed=isinstance(finding, Armed),
     )
     return result, why and f"not run: after {check.name} {why}"
 
 
-async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, str]:
+async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding, str]:
     """Run the steps once; return what they found, and why nothing more can be run, or ""."""
-    finding: Exception | None = None
+    finding = Finding()
     subject: Subject | None = None
     client.heard.clear()
-    client.events.clear()
     try:
         subject = await identified(client, level)
         if check.drives:
@@ -265,7 +257,7 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
             expected="none",
             seen=client.heard[:1],
         )
-    except (Violation, Optional, Late, Unusable) as found:
+    except Finding as found:
         finding = found
     if isinstance(finding, Violation):
         finding.came = client.came.hex(" ")
@@ -289,3 +281,38 @@ async def _left(
             if clock.now() > due:
                 return found
     return None
+
+
+_FLAGS = "after", "renew", "keep_phase", "skip_ending", "onset", "ending"
+_TONE = ("frequency", "{:g} Hz"), ("level", "{:g}"), ("phase", "at {:g} degrees")
+
+
+def in_words(parts: Sequence[Sequence[int]]) -> str:
+    """Return the meaning of a set by its parts, then their words; empty without any."""
+    if not parts:
+        return ""
+    try:
+        read = [MESSAGES["Set"].request.unpack(each, is_strict=True) for each in parts]
+        stream = {each["index"]: each["stream"] for each in read}
+        layers = unpack_layers([word for index in sorted(stream) for word in stream[index]])
+        now = "at once" if read[0]["now"] else "staged"
+        meaning = "; ".join([f"set {read[0]['token']}, {now}", *map(_layer, layers)])
+    except Refusal as refusal:
+        meaning = f"no whole set: {refusal}"
+    return f"{meaning} = {' | '.join(' '.join(f'{word:04X}' for word in each) for each in parts)}"
+
+
+def _flags(one: LayerSet | Command) -> str:
+    """Return what is set of a layer or a command; an envelope with its step and knots."""
+    found = [(name, value) for name in _FLAGS if (value := getattr(one, name, None))]
+    return "".join(f" {name}" if value is True else f" {name} {value}" for name, value in found)
+
+
+def _layer(one: LayerSet) -> str:
+    head = f"layer {one.layer}{_flags(one)}, ramp {one.ramp} ms, valid for {one.valid_for} ms"
+    return ": ".join([head, *filter(None, [", ".join(map(_tone, one.commands))])])
+
+
+def _tone(one: Command) -> str:
+    tone = [form.format(QUANTITIES[name].from_wire(getattr(one, name))) for name, form in _TONE]
+    return f"channel {one.channel} {' '.join(tone)}{_flags(one)}"

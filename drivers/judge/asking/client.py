@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from drivers import trace
 from drivers.errors import LinkError
@@ -21,13 +21,18 @@ from drivers.wires.wire import read_nak
 from registry import clock
 
 
-class Violation(Exception):
-    """The amplifier does other than the contract: what must be what, and what was seen.
+class Finding(Exception):
+    """What ends the steps of a check; by itself: nothing is wrong.
 
-    sent: the last set, came: the last bytes of the amplifier, in hexadecimal.
+    seen, expected: of a violation; sent: the last set before it, in words and hexadecimal; came:
+    the last bytes of the amplifier.
     """
 
-    sent = came = ""
+    seen = expected = sent = came = ""
+
+
+class Violation(Finding):
+    """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
         self.expected, self.seen = str(expected), f"{what}: {seen}"
@@ -38,15 +43,15 @@ class Armed(Violation):
     """It is armed, perhaps by another host: nothing is driven."""
 
 
-class Optional(Exception):
+class Optional(Finding):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
 
 
-class Unusable(Exception):
+class Unusable(Finding):
     """A capability that the check needs is not as it must be, which its own check reports."""
 
 
-class Late(Exception):
+class Late(Finding):
     """This machine was too late for what the check needs: it must be made again."""
 
 
@@ -95,13 +100,6 @@ QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to h
 _T = TypeVar("_T")
 
 
-class Port(Protocol):
-    """An open port; what it receives goes to `Client.received`."""
-
-    def write(self, data: bytes) -> None:
-        """Send bytes; raises LinkError."""
-
-
 class When(NamedTuple):
     """An interval in which something happened [s]."""
 
@@ -144,12 +142,11 @@ class Answer:
 class Client(ABC):
     """One amplifier at an address of a line.
 
-    heard: messages that no request was waiting for; events: those of type Event; order: types of
-    all, as they came. reply_words: the longest reply to each message by its number, where it is
-    known. quiet: time [s] in which a reply comes; timeout: for which one is awaited. wire_time: on
-    the wire [s], of a request and a reply by their words; transit: of the longest reply. session:
-    that was begun last. loss: why the line was lost. came: bytes of the amplifier since the last
-    request.
+    heard: messages that no request was waiting for, but Events; order: all, as they came.
+    reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
+    in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
+    request and a reply by their words; transit: of the longest reply. session: that was begun last.
+    loss: why the line was lost. came: bytes of the amplifier since the last request.
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
@@ -168,16 +165,15 @@ class Client(ABC):
     transactions: ClassVar[int] = 1
     """What the wire makes of a request that changes something, each with a reply."""
 
-    port: Port
-    """Of its line; given once it is open."""
+    transmit: Callable[[bytes], None]
+    """Sends bytes on its line, once that is open; raises LinkError."""
     name = ""
     """Under which its bytes are traced."""
 
     def __init__(self, address: int) -> None:
         self.address = address
         self.heard: list[Heard] = []
-        self.events: list[Heard] = []
-        self.order: list[int] = []
+        self.order: list[Heard] = []
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit = 0.0
@@ -202,7 +198,7 @@ class Client(ABC):
     def write(self, data: bytes) -> None:
         """Send bytes; raises LinkError."""
         trace.frame(trace.Direction.OUT, data, self.name, str)
-        self.port.write(data)
+        self.transmit(data)
 
     @abstractmethod
     def hear(self, data: bytes) -> bytes:
@@ -261,9 +257,8 @@ class Client(ABC):
         """Note an attempt from a time on that came too late; returns whether to make it again."""
         if self.slow_reply:
             return False
-        if self.attempts < _MAX_ATTEMPTS:
-            self.attempts += 1
-            self.wasted += clock.now() - since
+        self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
+        self.wasted += clock.now() - since
         return self.attempts < _MAX_ATTEMPTS and self.wasted < _MAX_WASTED
 
     @contextmanager
@@ -303,8 +298,9 @@ class Client(ABC):
 
     def take(self, message: Heard, *, is_event: bool = False) -> None:
         """Keep a message that was heard."""
-        (self.events if is_event else self.heard).append(message)
-        self.order.append(message.type)
+        if not is_event:
+            self.heard.append(message)
+        self.order.append(message)
         self._news.set()
 
     async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:

@@ -66,25 +66,19 @@ class SerialClient(Client):
         """Return the frame of a Hello to an address."""
         return self.frame(HELLO, b"", to=address, version=NEUTRAL)
 
-    async def hello(self) -> Values:
-        """Read the identity."""
-        return await self.identity(b"", NEUTRAL)
-
-    async def identity(self, payload: bytes, version: int) -> Values:
-        """Read the identity by a Hello of any length and version."""
+    async def hello(self, payload: bytes = b"", version: int = NEUTRAL) -> Values:
+        """Read the identity, by a Hello of any length and version."""
         frame = (await self._replied(HELLO, payload, version)).frame
         seen = frame.kind, frame.version
         expect_equal(seen, (HELLO | REPLY, NEUTRAL), "type, version of the reply to Hello")
         return read_as("identity", unpack_identity, frame.payload)
 
-    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
-        """Send a message and await its reply."""
-        return await self.exchange_payload(number, pack_words(words), VERSION)
-
-    async def exchange_payload(self, number: int, payload: bytes, version: int) -> Answer:
-        """Send a payload under a version and await its reply."""
+    async def exchange(
+        self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION
+    ) -> Answer:
+        """Send a message, with bytes behind its words, under a version; await its reply."""
         sent = clock.now()
-        heard = await self._replied(number, payload, version)
+        heard = await self._replied(number, pack_words(words) + behind, version)
         answer = Answer("", None, heard.words, When(sent, heard.at))
         if heard.type == NAK | REPLY:
             answer = self.refusal(sent, heard.at, number, heard.words)
@@ -207,5 +201,5 @@ async def tolerated_frames(subject: Subject) -> None:
         await subject.request("Ping", session=1)
     client.invalid.clear()
     for _ in range(3):
-        await client.exchange_payload(_PING, pack_words([1]), VERSION)
+        await client.exchange(_PING, [1])
     expect_equal(client.invalid, [], "damaged replies")

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require
@@ -84,17 +83,10 @@ async def steps_as_stated(subject: Subject) -> None:
         expect_within(len(found), 0, 2, what)
 
 
-class _Flawed(NamedTuple):
-    """Words of a set that must be refused; channels: one of which the refusal names."""
-
-    words: list[int]
-    code: str = "BAD_VALUE"
-    channels: tuple[int | None, ...] = (None,)
-
-    def sent(self, *, token: int, now: int) -> Send:
-        """Send it as a set of one part."""
-        part: Values = {"token": token, "index": 0, "parts": 1, "now": now, "stream": self.words}
-        return send("Set", **part, code=self.code, channels=self.channels)
+def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **values: int) -> Send:
+    """Send words as a set of one part, which must be refused; channels: one of which is named."""
+    part: Values = {"index": 0, "parts": 1, "stream": words, **values}
+    return send("Set", code=code, channels=channels or (None,), **part)
 
 
 def _flawed_tones(subject: Subject) -> Iterator[Command]:
@@ -118,22 +110,22 @@ def _flawed_tones(subject: Subject) -> Iterator[Command]:
             )
 
 
-def _flawed_sets(subject: Subject) -> Iterator[_Flawed]:
+def _flawed_sets(subject: Subject) -> Iterator[Send]:
     """Yield sets that must be refused: beside a good layer, and as words that no set can have."""
     tone, good = subject.tone(), layer(1, subject.tone(0, 0.5))
     channels, layers, ramp = len(subject.channels), len(subject.layers), subject.can["ramp_max"]
     for one in _flawed_tones(subject):
-        yield _Flawed(pack_layers([good, layer(0, one)]), channels=(one.channel,))
-    yield _Flawed(pack_layers([good, layer(0, tone, tone)]), "BAD_CHANNEL", (0,))
+        yield _part(pack_layers([good, layer(0, one)]), "BAD_VALUE", one.channel)
+    yield _part(pack_layers([good, layer(0, tone, tone)]), "BAD_CHANNEL", 0)
     if channels < 16:
         beyond = pack_layers([good, layer(0, replace(tone, channel=channels))])
-        yield _Flawed(beyond, "BAD_CHANNEL", (channels,))
+        yield _part(beyond, "BAD_CHANNEL", channels)
     for layer_set in (
         *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
         *([layer(layers, tone)] if layers < 16 else []),
         *([layer(0, tone, ramp=ramp + 1)] if ramp < 1000 else []),
     ):
-        yield _Flawed(pack_layers([good, layer_set]))
+        yield _part(pack_layers([good, layer_set]))
     words = pack_layers([layer(0, tone)])
     for at, word, named in (
         (0, words[0] | 1 << 15, (None,)),
@@ -144,9 +136,9 @@ def _flawed_sets(subject: Subject) -> Iterator[_Flawed]:
         (6, _PHASE.maximum + 1, (None, 0)),
         (6, 0x10000 + _PHASE.minimum - 1, (None, 0)),
     ):
-        yield _Flawed([*words[:at], word, *words[at + 1 :]], channels=named)
+        yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
     for wrong in (words[:-1], [*words, 0], [words[0] + 1, *words[1:]]):
-        yield _Flawed(wrong, "BAD_LENGTH")
+        yield _part(wrong, "BAD_LENGTH")
 
 
 @driving(_PLACE)
@@ -156,20 +148,20 @@ def all_or_nothing(subject: Subject) -> Rows:
         row
         for token, each in enumerate(_flawed_sets(subject), 2)
         for row in (
-            each.sent(token=token, now=1),
-            each.sent(token=token, now=0),
+            replace(each, values={**each.values, "token": token, "now": 1}),
+            replace(each, values={**each.values, "token": token, "now": 0}),
             send("Commit", token=token, code="BAD_TOKEN"),
         )
     ]
-    last, silent = len(flawed) // 3 + 2, _Flawed(pack_layers([layer(0)]), "BAD_TOKEN")
+    last, silent = len(flawed) // 3 + 2, pack_layers([layer(0)])
     return [
         subject.arm,
         subject.one(),
         *flawed,
         play(subject.one(level=0.5), token=last),
         stage(subject.one(level=0.25)),
-        silent.sent(token=last - 1, now=1),
-        send("Set", raw=[subject.next_session, 0, 1 << 1, *silent.words], code="BAD_TOKEN"),
+        _part(silent, "BAD_TOKEN", token=last - 1, now=1),
+        send("Set", raw=[subject.next_session, 0, 1 << 1, *silent], code="BAD_TOKEN"),
         send("Commit", token=last + 1),
     ]
 

@@ -1,5 +1,7 @@
 """Checks of sets in parts and by tokens: staged, committed once, in their order, for a second."""
 
+from functools import partial
+
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require
 from drivers.judge.asking.material import Material, Rows, layer, play, send, stage
@@ -162,16 +164,19 @@ def tokens_wrap(subject: Subject) -> Rows:
 def newer_sets_replace(subject: Subject) -> Rows:
     """It keeps the newest staged set alone, and plays what comes with *now* at once."""
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
-
-    def dropped(token: int) -> Rows:
-        return [send("Commit", token=token, code=_OLD)]
-
+    dropped = partial(send, "Commit", code=_OLD)
     return [
-        *(subject.arm, stage(quarter), stage(half), *dropped(1)),
+        *(subject.arm, stage(quarter), stage(half), dropped(token=1)),
         *(stage(subject.one(), token=1, code=_OLD), send("Commit", token=2)),
-        *(stage(subject.one()), half, *dropped(3)),
-        *(stage(subject.one()), send("Silence", ramp=0), *dropped(5)),
-        *(stage(subject.one()), send("Disarm", ramp=0), subject.settle, subject.arm, *dropped(6)),
+        *(stage(subject.one()), half, dropped(token=3)),
+        *(stage(subject.one()), send("Silence", ramp=0), dropped(token=5)),
+        *(
+            stage(subject.one()),
+            send("Disarm", ramp=0),
+            subject.settle,
+            subject.arm,
+            dropped(token=6),
+        ),
     ]
 
 

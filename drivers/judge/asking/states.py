@@ -180,16 +180,22 @@ def silence(subject: Subject) -> Rows:
 
 async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
     """Play sets and starve it: it trips at its time [s], is silent 5 ms later, and lists it."""
-    first: Rows = [partial(subject.arm, time), *sets]
-    rows: Rows = (
-        *first,
-        *(subject.starve, 0.8 * time, subject.settle, send("GetFaults")),
-        *(play(*sets[:1], code="WRONG_STATE"), 0.05),
-        send("Arm", session=77, watchdog=round(1000 * time), code="WRONG_STATE"),
-        send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
-        *(send("Disarm", ramp=0), subject.clear),
+    await subject.run(
+        [
+            partial(subject.arm, time),
+            *sets,
+            subject.starve,
+            0.8 * time,
+            subject.settle,
+            send("GetFaults"),
+            play(*sets[:1], code="WRONG_STATE"),
+            0.05,
+            send("Arm", session=77, watchdog=round(1000 * time), code="WRONG_STATE"),
+            send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
+            send("Disarm", ramp=0),
+            subject.clear,
+        ]
     )
-    await subject.run(rows)
 
 
 @driving(_SESSIONS)

@@ -23,8 +23,17 @@ from drivers.judge.asking.client import (
     require_in_time,
 )
 from drivers.judge.asking.judge import Judge
-from drivers.judge.asking.material import FULL, Material, Rows, Send, layer, play, send
-from drivers.judge.asking.stated import STATED, Capabilities
+from drivers.judge.asking.material import (
+    FULL,
+    STATED,
+    Capabilities,
+    Material,
+    Rows,
+    Send,
+    layer,
+    play,
+    send,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
@@ -77,14 +86,17 @@ class Subject(Material):
     async def run(self, rows: Rows) -> None:
         """Carry rows out in turn; after each, the status must show what is expected."""
         for row in rows:
-            if isinstance(row, float):
-                await self.pause(row)
-            elif isinstance(row, LayerSet | Send):
-                await self.send(row if isinstance(row, Send) else play(row))
-            elif isinstance(row, Sequence):
-                await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
-            else:
-                await row()
+            match row:
+                case float():
+                    await self.pause(row)
+                case LayerSet():
+                    await self.play(row)
+                case Send():
+                    await self.send(row)
+                case Sequence():
+                    await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
+                case _:
+                    await row()
             await self.status()
 
     async def send(self, row: Send) -> Answer:
@@ -227,11 +239,10 @@ class Subject(Material):
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
         self.expected = None
-        await self.request("Stop", ramp=0)
-        stopped = await self.settle()
+        stopped = await self.settle(await self.request("Stop", ramp=0))
         cleared = await self.request("Clear", latch=stopped["latch"])
         expect_equal(cleared["state"], OFF, "state after Clear")
-        await self.watch()
+        self.expected = Judge(self.can, cleared.values, cleared.when)
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
@@ -334,16 +345,15 @@ class Subject(Material):
         self.heard_at = end
         require_in_time(clock.now() <= end + _OVERSLEPT, "a pause took too long")
 
-    async def settle(self) -> Answer:
-        """Read statuses until it is silent and in a state that lasts."""
-        due = clock.now() + _SETTLED
-        while True:
-            reply = await self.status()
-            if not any(reply["levels"]) and reply["state"] not in (*_MOVING, ENABLED):
-                return reply
+    async def settle(self, reply: Answer | None = None) -> Answer:
+        """Read statuses behind a reply until it is silent and in a state that lasts."""
+        due, reply = clock.now() + _SETTLED, reply or await self.status()
+        while any(reply["levels"]) or reply["state"] in (*_MOVING, ENABLED):
             seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
             expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
             await asyncio.sleep(_POLL)
+            reply = await self.status()
+        return reply
 
     async def follow(self, duration: float | None = None) -> None:
         """Read statuses for a time [s] from the last change on, None until all is settled.

@@ -39,7 +39,9 @@ class CanDecoder(Decoder):
         super().__init__()
         self._form = _FORMS[kind]
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
-        self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
+        self._counters = WireCounters()
+        # Messages of a sender, by its identifier and whether they are numbered.
+        self._senders: dict[tuple[int, bool], Assembler] = {}
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
@@ -56,29 +58,40 @@ class CanDecoder(Decoder):
             sender = self._sender(frame)
             take = self._from_host if direction == "amplifier" else self._from_bus
             message = take(time, frame, sender)
-            if sender.cut_short is not None:
-                number, started_at = sender.cut_short
+            if sender.given_up is not None:
+                number, started_at = sender.given_up
                 seen.append((b"", damaged(f"message {number} without all frames", started_at)))
-                sender.cut_short = None
+                sender.given_up = None
             seen.append((piece, message))
         return seen
 
-    def _sender(self, frame: CanFrame) -> "_Sender":
+    def _sender(self, frame: CanFrame) -> Assembler:
         is_numbered = frame.data[:1] != b"\0"
-        return self._senders.setdefault((frame.id, is_numbered), _Sender(is_numbered=is_numbered))
+        made = Assembler(self._counters, is_numbered=is_numbered)
+        return self._senders.setdefault((frame.id, is_numbered), made)
 
-    def _from_host(self, time: float, frame: CanFrame, sender: "_Sender") -> Message | None:
+    def _words(self, time: float, frame: CanFrame, sender: Assembler) -> Words | Notice | None:
+        """Take a frame; returns the message that it completes, or that it fits none."""
+        before = self._counters.invalid_frames
+        words = sender.add(frame.data, time)
+        return (
+            damaged("a frame that fits no message")
+            if self._counters.invalid_frames > before
+            else words
+        )
+
+    def _from_host(self, time: float, frame: CanFrame, sender: Assembler) -> Message | None:
         node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
         self._sent.append(frame)
         if frame.id == cob_id("nmt") and len(frame.data) == 2:
             return None if frame.data[0] == _NMT_START else Notice("boot", frame.data[1])
-        words = sender.add(time, frame.data) if kind == REQUEST else None
+        words = self._words(time, frame, sender) if kind == REQUEST else None
         if not isinstance(words, Words):
             return words
         key = (node, words.number, words.type) if node else None
-        return request_of(words.type, words.words, node, key, sender.started_at)
+        return request_of(words.type, words.words, node, key, sender.began)
 
-    def _from_bus(self, time: float, frame: CanFrame, sender: "_Sender") -> Message | None:
+    def _from_bus(self, time: float, frame: CanFrame, sender: Assembler) -> Message | None:
         node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
         if frame.id == cob_id("heartbeat", node) and frame.data == b"\0":
             return Notice("boot", node)
@@ -86,39 +99,9 @@ class CanDecoder(Decoder):
             is_first = len(frame.data) == BLOCK and frame.data[1] == 0
             name = NAMES.get(frame.data[2]) if is_first else None
             return Notice("other host", node, text=name) if name else None
-        words = sender.add(time, frame.data) if kind == REPLY and node else None
+        words = self._words(time, frame, sender) if kind == REPLY and node else None
         if not isinstance(words, Words):
             return words
         if words.number == 0 and words.type != EVENT:
             return damaged(f"a message of type {words.type} without a number")
         return sent_by_amplifier(words.type, words.words, node, words.number)
-
-
-class _Sender:
-    """Messages of one identifier; started_at: time of the first frame of the last one [s].
-
-    cut_short: number and begin of a message that the last frame ended before it was whole.
-    """
-
-    def __init__(self, *, is_numbered: bool) -> None:
-        self.started_at = 0.0
-        self.cut_short: tuple[int | None, float] | None = None
-        self._counters = WireCounters()
-        self._assembler = Assembler(self._counters, is_numbered=is_numbered)
-        self._number: int | None = None  # of the last frame
-        self._is_whole = True
-
-    def add(self, time: float, data: bytes) -> Words | Notice | None:
-        """Take the data of a frame; returns the message that it completes."""
-        if len(data) != BLOCK:
-            return damaged(f"a frame of {len(data)} bytes, must be {BLOCK}")
-        if data[0] != self._number or (self._is_whole and data[1] == 0):
-            self.cut_short = None if self._is_whole else (self._number, self.started_at)
-            self._number, self._is_whole, self.started_at = data[0], False, time
-        before = self._counters.invalid_frames, self._counters.unexpected_frames
-        words = self._assembler.add(data, time)
-        if words is None and self._counters.invalid_frames > before[0]:
-            return damaged("a frame that fits no message")
-        # An older one, or a copy, is no beginning of a message.
-        self._is_whole |= words is not None or self._counters.unexpected_frames > before[1]
-        return words

@@ -121,8 +121,8 @@ class Report:
                 violation.frames.append(line)
         self._followed = [each for each in self._followed if len(each[0].frames) < each[1]]
 
-    def add(self, invariant: str, wire: str, time: float, sentence: str) -> None:
-        """Add a violation of a rule."""
+    def add(self, wire: str, invariant: str, time: float, sentence: str) -> None:
+        """Add a violation of a rule on a wire."""
         if len(self.found) < _MAX_VIOLATIONS:
             frames = [*self._frames.get(wire, ())]
             self.found.append(Violation(invariant, wire, time, sentence, frames))

@@ -1,5 +1,6 @@
 """Messages as they are decoded and sent, alike for every kind of wire; those of a serial line."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
@@ -40,12 +41,14 @@ BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_b
 _WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(eq=False, slots=True)
 class Request:
     """A request. address: 0 for broadcast; key: of its reply, None where there is none.
 
-    values: of its record; problem: what is wrong with it, or ""; started_at: when the first of its
-    frames passed, None where it has one [s].
+    values: of its record; problem: what is wrong with it, or ""; started_at: when its first byte
+    passed, infinite where it has one frame, until that is known [s]. number: in the order of
+    requests. since: from which on its amplifier has to respond, infinite while it is the host's
+    turn; earliest, end: between which it is carried out, None for until its reply [s].
     """
 
     name: str
@@ -53,7 +56,12 @@ class Request:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     problem: str = ""
-    started_at: float | None = None
+    started_at: float = math.inf
+    number: int = 0
+    since: float = math.inf
+    earliest: float = math.inf
+    end: float | None = None
+    is_overdue: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +85,7 @@ class Notice:
     carried out: the amplifier has carried the request of a key out; read on: the host goes on with
     it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
     has reset it. other host: its request, by name. damaged: a frame that is none, and why.
-    started_at: when the first of its frames passed, None where it is one [s].
+    started_at: when the first of its frames passed, infinite where it is one [s].
     """
 
     what: Literal["carried out", "read on", "event", "boot", "other host", "damaged"]
@@ -85,7 +93,7 @@ class Notice:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     text: str = ""
-    started_at: float | None = None
+    started_at: float = math.inf
 
 
 class Decoder(ABC):
@@ -104,7 +112,7 @@ DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
 
-def damaged(why: str, started_at: float | None = None) -> Notice:
+def damaged(why: str, started_at: float = math.inf) -> Notice:
     """Return what is said of bytes that form no message."""
     return Notice("damaged", text=why, started_at=started_at)
 
@@ -114,7 +122,7 @@ def request_of(
     words: Sequence[int],
     address: int,
     key: Hashable,
-    started_at: float | None = None,
+    started_at: float = math.inf,
 ) -> Request:
     """Read a request by the number of its message."""
     name, values = NAMES.get(number, f"type {number}"), Values()
@@ -154,23 +162,6 @@ def sent_by_amplifier(
     if number not in NAMES:
         return damaged(f"a reply of unknown type {number}")
     return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))
-
-
-@dataclass(eq=False, slots=True)
-class Sent:
-    """A request as it was sent, in this order; started_at [s]: when its first byte passed.
-
-    since: from which on its amplifier has to respond, infinite while it is the host's turn;
-    earliest, end: between which it is carried out, None for until its reply [s].
-    """
-
-    number: int
-    request: Request
-    started_at: float
-    since: float
-    earliest: float
-    end: float | None = None
-    is_overdue: bool = False
 
 
 _CARRIED_OUT: dict[str, Callable[[Values, Values], bool]] = {
@@ -213,11 +204,10 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         return damaged("a frame of the wrong direction")
     key = (frame.address, frame.sequence, frame.type) if frame.address else None
     is_hello = frame.type == HELLO_NUMBER
-    message: Message
     try:
         words = () if is_hello else unpack_words(frame.payload)
         if direction == "amplifier":
-            message = request_of(frame.type, words, frame.address, key)
+            message: Message = request_of(frame.type, words, frame.address, key)
         elif is_hello:
             message = Reply(frame.address, key, unpack_identity(frame.payload))
         else:

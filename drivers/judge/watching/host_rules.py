@@ -9,13 +9,12 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from drivers.judge.watching.amplifier_session import (
     AmplifierSession,
     Deadlines,
-    Delays,
     ExpectedSets,
     check_expected,
     check_set,
 )
 from drivers.judge.watching.config import TimeLimits
-from drivers.judge.watching.decoded import A_READ, FEEDING, HELLO, Request, Sent
+from drivers.judge.watching.decoded import A_READ, FEEDING, HELLO, Request
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating
 from drivers.protocol.table import LATCHED, QUANTITIES
@@ -40,13 +39,12 @@ class HostRules:
     """
 
     def __init__(
-        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, delays: Delays
+        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, deadlines: Deadlines
     ) -> None:
         self.expected: ExpectedSets | None = None
         self._sessions = sessions
-        self._delays = delays
+        self._deadlines = deadlines
         self._times = times
-        self._deadlines = Deadlines(delays, times.touch)
         self._contacts: frozenset[Hashable] | None = None
         self._stalled_since: float | None = None
         self._is_arm_requested: bool | None = None
@@ -114,18 +112,22 @@ class HostRules:
         return request.name in _SILENCING or (request.name == "GetStatus" and is_silencing)
 
     def check_order(
-        self, session: AmplifierSession, sent: Sent, pending: Collection[Sent], preempted_by: int
+        self,
+        session: AmplifierSession,
+        request: Request,
+        pending: Collection[Request],
+        preempted_by: int,
     ) -> None:
         """Check that no reply is pending that a request must wait for.
 
         preempted_by: number of the last request before which others may lose their replies. A
         reading gives way, and the status of an amplifier that has left a request without a reply.
         """
-        mute = {each.request.address for each in pending if each.is_overdue}
+        mute = {each.address for each in pending if each.is_overdue}
         for each in pending:
-            name = each.request.name
-            is_reading = name in _READINGS or (name == "GetStatus" and each.request.address in mute)
-            waits = sent.started_at - each.started_at
+            name = each.name
+            is_reading = name in _READINGS or (name == "GetStatus" and each.address in mute)
+            waits = request.started_at - each.started_at
             # A last lift preempts too, even if a finger has come since.
             is_preempted = each.number < preempted_by or each.started_at <= self._last_lift
             # The host counts from its write: the bytes may have waited in a transport since.
@@ -133,19 +135,20 @@ class HostRules:
             if not (is_preempted or is_given_up or is_reading):
                 session.report_always(
                     "credit",
-                    sent.started_at,
-                    f"host sent {sent.request.name} to {session.name} {waits * 1e3:.1f} ms after "
+                    request.started_at,
+                    f"host sent {request.name} to {session.name} {waits * 1e3:.1f} ms after "
                     f"{name}, whose reply is pending",
                 )
 
     def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Check a request to one amplifier; a broadcast is checked for each."""
         layers: Sequence[LayerSet] | None = None
-        if request.name == "Set":
-            layers = session.amplifier.sets.whole(request.values["token"])
-        elif request.name == "Commit" and session.staged is not None:
-            token, staged = session.staged
-            layers = staged if token == request.values["token"] else None
+        match request.name:
+            case "Set":
+                layers = session.amplifier.sets.whole(request.values["token"])
+            case "Commit" if session.staged is not None:
+                token, staged = session.staged
+                layers = staged if token == request.values["token"] else None
         self._check_stop(session, time, request)
         if request.name in FEEDING:
             self._check_feeding(session, time, request)
@@ -161,15 +164,17 @@ class HostRules:
 
     def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Note that a request was not refused."""
-        if request.name == HELLO:
-            session.is_identified = True
-        elif request.name == "Arm":
-            was_stopped, session.is_stopped = session.is_stopped, False
-            if was_stopped:
-                session.report("stop", time, f"{session.name} armed before its stop was cleared")
-            session.armed_at = session.last_feed = time
-        elif request.name == "Clear":
-            session.is_stopped = False
+        match request.name:
+            case "Hello":
+                session.is_identified = True
+            case "Arm":
+                was_stopped, session.is_stopped = session.is_stopped, False
+                if was_stopped:
+                    what = f"{session.name} armed before its stop was cleared"
+                    session.report("stop", time, what)
+                session.armed_at = session.last_feed = time
+            case "Clear":
+                session.is_stopped = False
 
     def status_heard(self, session: AmplifierSession, values: Values) -> None:
         """Note a status: whether it confirms a stop, or the end of a disarm.
@@ -247,7 +252,7 @@ class HostRules:
             return
         # The control loop waits for all attempts of a request to any of its amplifiers.
         is_waiting = any(each.overdue_at >= last for each in self._sessions.values())
-        longer = self._delays.since(last) + (_ATTEMPTS * self._times.reply if is_waiting else 0.0)
+        longer = self._deadlines.delay_since(last) + is_waiting * _ATTEMPTS * self._times.reply
         if time > last + self._times.heartbeat + self._times.slack + longer:
             session.last_feed = time
             session.report_always(
@@ -314,22 +319,23 @@ class HostRules:
             if session.vibrates(time) and not session.is_stopped:
                 self._check_release(session, time, values["ramp"])
             session.silence_sent(time)
-        if name == "Disarm":
-            session.is_disarming = True
-        elif name == "Stop":
-            is_confirmed = session.is_stopped and session.first_stop is None
-            session.is_stopped, session.stop_requested_at, session.session = True, None, None
-            session.is_requested = False
-            if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
-                session.first_stop = time if session.first_stop is None else session.first_stop
-                self._expect_confirmation(session, time, session.first_stop)
-            if self._is_arm_requested:
-                self._is_arm_requested, self._last_silencing = False, time
-        elif name == "Arm":
-            session.session, session.last_set = values["session"], None
-            session.silence_sent(time)
-        elif layers is not None and (name == "Commit" or values["now"]):
-            self._note_playing(session, time, values["token"], layers)
+        match name:
+            case "Disarm":
+                session.is_disarming = True
+            case "Stop":
+                is_confirmed = session.is_stopped and session.first_stop is None
+                session.is_stopped, session.stop_requested_at, session.session = True, None, None
+                session.is_requested = False
+                if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
+                    session.first_stop = time if session.first_stop is None else session.first_stop
+                    self._expect_confirmation(session, time, session.first_stop)
+                if self._is_arm_requested:
+                    self._is_arm_requested, self._last_silencing = False, time
+            case "Arm":
+                session.session, session.last_set = values["session"], None
+                session.silence_sent(time)
+            case "Commit" | "Set" if layers is not None and (name == "Commit" or values["now"]):
+                self._note_playing(session, time, values["token"], layers)
 
     def _note_playing(
         self, session: AmplifierSession, time: float, token: int, layers: Sequence[LayerSet]
@@ -394,14 +400,10 @@ class HostRules:
         if is_under_way and time < session.last_stop + self._times.reply:
             return  # which must go on until it is confirmed
         session.stop_requested_at = time
-
-        def is_sent() -> bool:
-            return session.stop_requested_at != time or not session.is_open
-
         self._deadlines.expect(
             time,
             self._times.stop,
-            ("stop", session, is_sent),
+            ("stop", session, lambda: session.stop_requested_at != time or not session.is_open),
             f"stop requested at {time:.4f} s, not sent to {session.name}",
         )
 

@@ -15,11 +15,9 @@ from drivers.judge.watching.decoded import (
     REPLIES,
     STATUS_RECORD,
     Request,
-    Sent,
     is_carried_out,
 )
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import TONE
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
 
@@ -69,7 +67,7 @@ class WatchedAmplifier(ExpectedAmplifier):
     def forget(self, cause: str = "what was not heard") -> None:
         """Treat all as unknown until the next status."""
         super().forget(cause)
-        self.unanswered: list[Sent] = []
+        self.unanswered: list[Request] = []
 
     def restarted(self, time: float) -> None:
         """Note a restart: disarmed and silent."""
@@ -88,36 +86,29 @@ class WatchedAmplifier(ExpectedAmplifier):
 
     # requests
 
-    def sent(self, sent: Sent) -> None:
+    def sent(self, request: Request) -> None:
         """Note a request without a reply, or none yet, that may be carried out soon."""
-        if sent.request.name in FEEDING:
+        if request.name in FEEDING:
             self._fed_before = self.fed[1]
-            self.fed = self.fed[0], max(self.fed[1], sent.started_at + REACTION)
-        if sent.request.name in CHANGING:
-            self.unanswered.append(sent)
+            self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
+        if request.name in CHANGING:
+            self.unanswered.append(request)
 
-    def replied(self, sent: Sent, values: Values, end: float) -> None:
+    def replied(self, request: Request, values: Values, end: float) -> None:
         """Apply a request carried out until a time [s], and compare its reply.
 
         A reply that the wire delayed beyond that of a newer request says nothing of now.
         """
-        if sent.number < self._answered:
+        if request.number < self._answered:
             return
-        self._answered = sent.number
-        name = sent.request.name
-        self.advance(sent.earliest)
+        self._answered = request.number
+        name = request.name
+        self.advance(request.earliest)
         if REPLIES.get(name) is STATUS_RECORD:
-            self._resolve(sent.number, values, end)
+            self._resolve(request.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return
-        self.granted(name, sent.request.values, values, (sent.earliest, end))
-
-    def _take(self, part: Values, reply: Values, when: Interval) -> None:
-        """Compare the reply to a part of a set; one that plays finely and is cool plays exactly."""
-        super()._take(part, reply, when)
-        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
-        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
-            self._expect("plays", when[1], f"exact of set {part['token']}", 1, reply["exact"])
+        self.granted(name, request.values, values, (request.earliest, end))
 
     def refused(self, request: Request, time: float) -> None:
         """Note a refusal; what silences must not be refused, nor a commit of what is staged."""
@@ -135,21 +126,22 @@ class WatchedAmplifier(ExpectedAmplifier):
         """Apply earlier requests without a reply that were carried out by a status."""
         earlier = [each for each in self.unanswered if each.number < number]
         self.unanswered = [each for each in self.unanswered if each.number >= number]
-        for each in earlier if self.state is not None else ():
-            request, started_at = each.request, each.started_at
-            is_broadcast = request.key is None
+        for request in earlier if self.state is not None else ():
+            started_at, is_broadcast = request.started_at, request.key is None
             until, _ = self.sets.staged_until(request.values.get("token"))
-            if is_carried_out(request, status):
-                last = min(end, started_at + REACTION) if is_broadcast else end
-                when = started_at, max(last, started_at)
-                self.carry_out(request.name, request.values, status, when)
-            elif request.name == "Arm":
-                self.token = None  # 0, if it was carried out before what disarmed again
-            elif is_broadcast and request.name == "Stop":
-                self.report("stop", end, "answer to a broadcast Stop", must="obeyed", seen="none")
-            elif is_broadcast and started_at + REACTION <= until:
-                what = f"answer to a broadcast Commit of set {request.values['token']}"
-                self.report("commit", end, what, must="obeyed", seen="none")
+            match request.name:
+                case _ if is_carried_out(request, status):
+                    last = min(end, started_at + REACTION) if is_broadcast else end
+                    when = started_at, max(last, started_at)
+                    self.carry_out(request.name, request.values, status, when)
+                case "Arm":
+                    self.token = None  # 0, if it was carried out before what disarmed again
+                case "Stop" if is_broadcast:
+                    what = "answer to a broadcast Stop"
+                    self.report("stop", end, what, must="obeyed", seen="none")
+                case _ if is_broadcast and started_at + REACTION <= until:
+                    what = f"answer to a broadcast Commit of set {request.values['token']}"
+                    self.report("commit", end, what, must="obeyed", seen="none")
 
     # reports
 

@@ -2,9 +2,11 @@
 
 import math
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
+from functools import partial
 
-from drivers.judge.watching.amplifier_session import AmplifierSession, Delays, check_sums
+from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, check_sums
 from drivers.judge.watching.can_decoder import CanDecoder
 from drivers.judge.watching.capture import Direction, Report
 from drivers.judge.watching.config import TimeLimits
@@ -18,7 +20,6 @@ from drivers.judge.watching.decoded import (
     Notice,
     Reply,
     Request,
-    Sent,
     SerialDecoder,
 )
 from drivers.judge.watching.host_rules import HostRules
@@ -32,13 +33,14 @@ _PRESENT = ("GetStatus", "GetFaults")
 _CONSTANT = (HELLO, "GetCaps")
 
 
-def decoder_of(kind: str) -> Decoder:
-    """Return a decoder for a kind of wire."""
-    if kind == "serial":
-        return SerialDecoder()
-    if kind.startswith("modbus"):
-        return ModbusDecoder(over_tcp=kind == "modbus-tcp")
-    return CanDecoder(kind)
+DECODERS: Mapping[str, Callable[[], Decoder]] = {
+    "serial": SerialDecoder,
+    "modbus-tcp": partial(ModbusDecoder, over_tcp=True),
+    "modbus-rtu": partial(ModbusDecoder, over_tcp=False),
+    "socketcand": partial(CanDecoder, "socketcand"),
+    "slcan": partial(CanDecoder, "slcan"),
+}
+"""Decoders by the kind of wire."""
 
 
 class WatchedWire:
@@ -52,16 +54,16 @@ class WatchedWire:
         *,
         host: HostRules,
         times: TimeLimits,
-        delays: Delays,
+        deadlines: Deadlines,
         report: Report,
     ) -> None:
         self.name = name
         self.sessions = dict(sessions)
         self._kind = kind
-        self._decoder = decoder_of(kind)
-        self._host, self._times, self._delays, self._report = host, times, delays, report
+        self._decoder = DECODERS[kind]()
+        self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
         self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
-        self._pending: dict[Hashable, Sent] = {}  # by key of the reply
+        self._pending: dict[Hashable, Request] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
@@ -72,7 +74,7 @@ class WatchedWire:
 
     def opened(self, time: float) -> None:
         """Note that a host has opened it: its amplifiers are not identified yet."""
-        self._decoder, self._started_at = decoder_of(self._kind), {}
+        self._decoder, self._started_at = DECODERS[self._kind](), {}
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None
@@ -82,8 +84,8 @@ class WatchedWire:
     def closed(self, time: float) -> None:
         """Note that the host has closed or lost it."""
         for sent in self._pending.values():
-            if sent.request.name in CHANGING:  # it may be executed unheard
-                self.sessions[sent.request.address].amplifier.forget()
+            if sent.name in CHANGING:  # it may be executed unheard
+                self.sessions[sent.address].amplifier.forget()
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
@@ -101,12 +103,12 @@ class WatchedWire:
         self._pending = {
             key: sent
             for key, sent in self._pending.items()
-            if self.sessions[sent.request.address] is not session
+            if self.sessions[sent.address] is not session
         }
 
     def is_pending(self, session: AmplifierSession) -> bool:
         """Whether an amplifier has not replied to a request yet."""
-        return any(self.sessions[one.request.address] is session for one in self._pending.values())
+        return any(self.sessions[one.address] is session for one in self._pending.values())
 
     def is_disturbed(self, time: float) -> bool:
         """Whether faults are injected at a time [s], or were shortly before."""
@@ -139,7 +141,7 @@ class WatchedWire:
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
-                since = started_at if message.started_at is None else message.started_at
+                since = min(started_at, message.started_at)
                 self._damaged(direction, time, message.text, since)
             elif direction == "amplifier" and message is not None:
                 self._sent(time, raw, message, started_at)
@@ -152,13 +154,14 @@ class WatchedWire:
         """Report replies that are overdue."""
         for key, sent in list(self._pending.items()):
             since = max(sent.since, self._started_at.get("host", -math.inf))
-            due = since + self._times.reply + self._times.slack + self._delays.since(since)
+            due = since + self._times.reply + self._times.slack
+            due += self._deadlines.delay_since(since)
             if now > due and not sent.is_overdue:
                 sent.is_overdue = True
-                session = self.sessions[sent.request.address]
+                session = self.sessions[sent.address]
                 session.overdue_at = now
                 if not (session.is_mute or self.is_disturbed(due)):
-                    what = f"no reply to {sent.request.name} of {sent.started_at:.4f} s"
+                    what = f"no reply to {sent.name} of {sent.started_at:.4f} s"
                     session.report_always("answer", now, f"{session.name}: {what}")
             if now > sent.started_at + _PENDING_TIMEOUT:
                 del self._pending[key]
@@ -168,7 +171,7 @@ class WatchedWire:
             self._damaged_at = time
         if not self.is_disturbed(started_at):
             sender = "host" if direction == "amplifier" else "amplifier"
-            self._report.add("garbage", self.name, time, f"{sender} sent {why}")
+            self._report.add(self.name, "garbage", time, f"{sender} sent {why}")
 
     def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
         """Process a frame of the host."""
@@ -178,10 +181,11 @@ class WatchedWire:
             self._noticed(time, message)
         if not isinstance(message, Request):
             return
-        if message.started_at is not None:
-            started_at = min(started_at, message.started_at)
         self._number += 1
-        sent = Sent(self._number, message, started_at, since=time, earliest=started_at)
+        started_at = min(started_at, message.started_at)
+        sent = replace(
+            message, number=self._number, started_at=started_at, since=time, earliest=started_at
+        )
         addressed = self.sessions.get(message.address)
         sessions = self.sessions.values() if message.address == 0 else (addressed,)
         for session in [each for each in sessions if each is not None]:
@@ -199,8 +203,7 @@ class WatchedWire:
             if message.key is None:
                 self._move(session, message)
 
-    def _check_request(self, session: AmplifierSession, time: float, sent: Sent) -> None:
-        request = sent.request
+    def _check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
         problem = request.problem
         if request.name == "Set" and not problem:
             problem = session.amplifier.sets.sent(request.values, time)
@@ -209,58 +212,58 @@ class WatchedWire:
         if request.problem:
             return
         if self._host.is_preempting(session, time, request):
-            self._preempted_by = sent.number
-        elif not self.is_disturbed(sent.started_at):
+            self._preempted_by = request.number
+        elif not self.is_disturbed(request.started_at):
             is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1
             pending = [
-                one
-                for one in self._pending.values()
-                if not (is_to_each and one.request.name in BROADCAST)
+                one for one in self._pending.values() if not (is_to_each and one.name in BROADCAST)
             ]
-            self._host.check_order(session, sent, pending, self._preempted_by)
+            self._host.check_order(session, request, pending, self._preempted_by)
         self._host.check_request(session, time, request)
 
     def _noticed(self, time: float, notice: Notice) -> None:
         """Process what is no request, and no reply."""
         sent = self._pending.get(notice.key)
         session = self.sessions.get(notice.address)
-        if notice.what == "carried out" and sent is not None:
-            sent.since, sent.end = math.inf, time
-        elif notice.what == "read on" and sent is not None:
-            sent.since = time
-            if sent.request.name in _PRESENT:
-                sent.earliest, sent.end = time, None
-        elif notice.what == "event" and session is not None:
-            session.amplifier.event_reported(notice.values, time)
-        elif notice.what == "other host" and session is not None and notice.text in FEEDING:
-            session.heard_other_host = time
-            session.amplifier.forget()
+        match notice.what:
+            case "carried out" if sent is not None:
+                sent.since, sent.end = math.inf, time
+            case "read on" if sent is not None:
+                sent.since = time
+                if sent.name in _PRESENT:
+                    sent.earliest, sent.end = time, None
+            case "event" if session is not None:
+                session.amplifier.event_reported(notice.values, time)
+            case "other host" if session is not None and notice.text in FEEDING:
+                session.heard_other_host = time
+                session.amplifier.forget()
 
     def _received(self, time: float, message: Message) -> None:
         """Process a frame of an amplifier."""
         session = self.sessions.get(message.address)
-        if isinstance(message, Reply) and session is not None:
-            self._process_reply(session, time, message)
-        elif isinstance(message, Notice) and message.what == "boot" and session is not None:
-            if session.amplifier.is_enabled:
-                session.report("state", time, f"{session.name} restarted while enabled")
-            session.forget_amplifier()
-            session.amplifier.restarted(time)
-            session.is_mute = True
-        elif isinstance(message, Notice):
-            self._noticed(time, message)
+        match message:
+            case Reply() if session is not None:
+                self._process_reply(session, time, message)
+            case Notice(what="boot") if session is not None:
+                if session.amplifier.is_enabled:
+                    session.report("state", time, f"{session.name} restarted while enabled")
+                session.forget_amplifier()
+                session.amplifier.restarted(time)
+                session.is_mute = True
+            case Notice():
+                self._noticed(time, message)
 
     def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
-        sent = self._pending.pop(reply.key, None)
-        if sent is None:
+        request = self._pending.pop(reply.key, None)
+        if request is None:
             self._check_unexpected(session, time, reply)
             return
         self._replied.append(reply.key)
-        request, amplifier = sent.request, session.amplifier
+        amplifier = session.amplifier
         if reply.problem:
             what = f"{session.name} replied to {request.name}: {reply.problem}"
             session.report("garbage", time, what)
-        amplifier.unanswered = [one for one in amplifier.unanswered if one is not sent]
+        amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
             amplifier.refused(request, time)
         elif request.problem or reply.problem:
@@ -269,10 +272,12 @@ class WatchedWire:
                 session.report_always("garbage", time, what)
             amplifier.forget()
         elif reply.values is not None:  # else not all of it was read
-            self._granted(session, time, sent, reply)
+            self._granted(session, time, request, reply)
 
-    def _granted(self, session: AmplifierSession, time: float, sent: Sent, reply: Reply) -> None:
-        request, amplifier, values = sent.request, session.amplifier, reply.values or {}
+    def _granted(
+        self, session: AmplifierSession, time: float, request: Request, reply: Reply
+    ) -> None:
+        amplifier, values = session.amplifier, reply.values or {}
         if request.name in _CONSTANT:
             session.check_constant(request.name, values, time)
         if request.name == "GetCaps":
@@ -282,9 +287,9 @@ class WatchedWire:
             amplifier.forget()
         self._host.status_heard(session, values)
         token = amplifier.token
-        amplifier.replied(sent, values, time if sent.end is None else sent.end)
+        amplifier.replied(request, values, time if request.end is None else request.end)
         if amplifier.token != token and not self.is_disturbed(time):
-            check_sums(session, sent.earliest)
+            check_sums(session, request.earliest)
         self._move(session, request)
 
     def _move(self, session: AmplifierSession, request: Request) -> None:

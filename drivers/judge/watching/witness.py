@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
-from drivers.judge.watching.amplifier_session import AmplifierSession, Delays, ExpectedSets
+from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, ExpectedSets
 from drivers.judge.watching.capture import Direction, Report, Violation, capture_line
 from drivers.judge.watching.config import WitnessConfig, parse_config
 from drivers.judge.watching.host_rules import HostRules
@@ -32,10 +33,10 @@ class Witness:
         self._record = record
         self._now = -math.inf
         self.frames = 0
-        self._delays = Delays()
         self._sessions = {name: self._session(name) for name in self._config.amplifiers}
         times = self._config.times_s
-        self._host = HostRules(self._sessions, times=times, delays=self._delays)
+        self._deadlines = Deadlines(times.touch)
+        self._host = HostRules(self._sessions, times=times, deadlines=self._deadlines)
         self._wires = {
             wire: WatchedWire(
                 wire,
@@ -47,17 +48,17 @@ class Witness:
                 },
                 host=self._host,
                 times=times,
-                delays=self._delays,
+                deadlines=self._deadlines,
                 report=self._report,
             )
             for wire, kind in self._config.wires.items()
         }
+        self.wires = tuple(self._wires)
+        """The names of the wires."""
 
     def _session(self, name: str) -> AmplifierSession:
         config = self._config.amplifiers[name]
-
-        def report_always(invariant: str, time: float, sentence: str) -> None:
-            self._report.add(invariant, config.wire, time, sentence)
+        report_always = partial(self._report.add, config.wire)
 
         def is_disturbed(time: float) -> bool:
             return self._wires[config.wire].is_disturbed(time)
@@ -70,11 +71,6 @@ class Witness:
         amplifier = WatchedAmplifier(name, slack=slack, report=report, report_always=report_always)
         return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
 
-    @property
-    def wires(self) -> tuple[str, ...]:
-        """The names of the wires."""
-        return tuple(self._wires)
-
     def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
@@ -86,7 +82,7 @@ class Witness:
 
         Deadlines of hosts and amplifiers are extended by it: what came in time was seen late.
         """
-        self._delays.note(until, duration)
+        self._deadlines.delayed(until, duration)
 
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""

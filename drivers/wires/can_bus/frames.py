@@ -69,6 +69,9 @@ class Assembler:
     of a newer number discards what is incomplete. Without numbers (is_numbered) frame 0 begins a
     message. Two frames of one place that differ are of two senders: the message is discarded.
     Whole messages that are discarded count as unexpected, by their frames 0.
+
+    began: when the first frame of the last message came [s]; given_up: number and begin of a
+    message that another one ended before it was whole, until that is taken.
     """
 
     def __init__(self, counters: WireCounters, *, is_numbered: bool = True) -> None:
@@ -77,7 +80,8 @@ class Assembler:
         self._number = 0
         self._frames: dict[int, bytes] = {}
         self._is_ended = True
-        self._heard = -math.inf
+        self._heard = self.began = -math.inf
+        self.given_up: tuple[int, float] | None = None
 
     def add(self, data: bytes, now: float) -> Message | None:
         """Take the data of a frame at a time [s]; returns the message that it completes."""
@@ -87,6 +91,8 @@ class Assembler:
             return None
         index = data[1]
         if self._begins(data, now):
+            self.given_up = None if self._is_ended else (self._number, self.began)
+            self.began = now
             self._number, self._frames, self._is_ended = data[0], {}, False
         elif self._is_ended or data[0] != self._number:
             self._counters.unexpected_frames += index == 0

@@ -1,7 +1,7 @@
 """A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,11 +136,9 @@ def open_desk(
     if frequencies is None:
         frequencies = default_frequencies(rig.limits.frequency_min, rig.limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
-    card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
-    try:
+    opened = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
+    with closing(opened) as card:
         yield desk, card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)
-    finally:
-        card.close()
 
 
 def measure(

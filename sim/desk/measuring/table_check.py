@@ -20,7 +20,6 @@ from model.table.promise_at_sensors import (
 )
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
-from model.vibration.excitation import Excitation
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels, is_whole
 from sim.desk.measuring.multisine import ramped
@@ -109,7 +108,15 @@ def _by_amplifier(
 ) -> FloatArray:
     """Record what an amplifier plays."""
     seconds = _SETTLING + _WINDOW
-    tones = tones_of(rig, promise.pattern.excitation)
+    tones = [
+        Tone(
+            rig.wiring[name].number,
+            tone.frequency,
+            tone.amplitude / rig.era(name).stroke,
+            float(np.degrees(tone.phase)),
+        )
+        for name, tone in promise.pattern.excitation.items()
+    ]
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
             playing = thread.submit(amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP)
@@ -147,16 +154,3 @@ def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> Flo
         f"blocks of sound were lost in {_TRIES} attempts, or no cable leads from output "
         f"{desk.output} to input {desk.input}; check it, and end other programs"
     )
-
-
-def tones_of(rig: Rig, excitation: Excitation) -> list[Tone]:
-    """Tones of the channels of a rig's one amplifier."""
-    return [
-        Tone(
-            rig.wiring[name].number,
-            tone.frequency,
-            tone.amplitude / rig.era(name).stroke,
-            float(np.degrees(tone.phase)),
-        )
-        for name, tone in excitation.items()
-    ]

@@ -83,7 +83,6 @@ class JackOutput:
         self._client.close()
 
 
-_CHANNELS, _RATE, _UNAVAILABLE = -9998, -9997, -9985  # errors of portaudio.h
 _WITH_PRIORITY, _WITHOUT = 128, 512  # frames of a block
 
 
@@ -204,14 +203,15 @@ class PortAudioOutput:
 
     def _refused(self, problem: Exception) -> Exception:
         text, number = str(problem.args[0]), problem.args[1] if len(problem.args) > 1 else 0
-        if number == _RATE:
-            return InputError(f"--rate: {self.name} does not offer {self.rate} Hz; try 48000")
-        if number == _CHANNELS:
-            return InputError(
-                f"--channels: {self.name} does not offer {self._settings.channels} channels"
-            )
-        if number == _UNAVAILABLE:
-            return LinkError(f"--device {self.name}: busy; end the program that plays on it")
+        match number:  # of portaudio.h
+            case -9997:  # paInvalidSampleRate
+                return InputError(f"--rate: {self.name} does not offer {self.rate} Hz; try 48000")
+            case -9998:  # paInvalidChannelCount
+                return InputError(
+                    f"--channels: {self.name} does not offer {self._settings.channels} channels"
+                )
+            case -9985:  # paDeviceUnavailable
+                return LinkError(f"--device {self.name}: busy; end the program that plays on it")
         return LinkError(f"--device {self.name}: cannot be opened: {text}")
 
     def start(self, engine: Engine) -> None:

@@ -83,7 +83,8 @@ class Supervisor:
             if self.counters.blocks != blocks or now - looked > _HELD_UP:
                 blocks, since = self.counters.blocks, now
             looked = now
-            if self.counters.is_streaming and now - since > self._stall():
+            stall = max(STALL, _BLOCKS * self.counters.block / (self._settings.rate or 48_000))
+            if self.counters.is_streaming and now - since > stall:
                 self._kill()
                 self._restart(f"no sound was made for {1e3 * (now - since):.0f} ms")
             elif (status := self._status()) is not None:
@@ -92,10 +93,6 @@ class Supervisor:
             self._report_underruns(now)
             if until is not None and _has_ended(until):
                 return
-
-    def _stall(self) -> float:
-        rate = self._settings.rate or 48_000
-        return max(STALL, _BLOCKS * self.counters.block / rate)
 
     def end(self) -> None:
         """Let it fall silent and end; kill it where it does not."""

@@ -28,12 +28,11 @@ class SlcanAdapter(FarEnd):
         self._send = send
         self._rest = b""
         self._is_open = self._may_send = False
-        self._listener = self._hear  # one object, by which the bus knows it
-        bus.join(self._listener)
+        bus.join(self._hear)
 
     def close(self) -> None:
         """Leave the bus."""
-        self._bus.leave(self._listener)
+        self._bus.leave(self._hear)
 
     def receive(self, data: bytes, now: float) -> None:
         """Process text from the host."""
@@ -62,7 +61,7 @@ class SlcanAdapter(FarEnd):
             if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
                 return (b"z" if line[:1] == b"r" else b"Z") + _CR  # no receiver for these
             if frame := SLCAN.decode(line):
-                self._bus.send(frame, sender=self._listener)
+                self._bus.send(frame, sender=self._hear)
                 return b"z" + _CR
         if not self._is_open and _SETTING.fullmatch(line):
             return _CR
@@ -85,12 +84,11 @@ class SocketcandClient(FarEnd):
         self._send = send
         self._rest = b""
         self._is_open = self._is_raw = False
-        self._listener = self._hear  # one object, by which the bus knows it
         send(b"< hi >")
 
     def close(self) -> None:
         """Leave the bus."""
-        self._bus.leave(self._listener)
+        self._bus.leave(self._hear)
 
     def receive(self, data: bytes, now: float) -> None:
         """Process complete elements; text between them is skipped."""
@@ -102,23 +100,24 @@ class SocketcandClient(FarEnd):
                 self._element(content.strip())
 
     def _element(self, element: bytes) -> None:
-        if not self._is_open:
-            self._is_open = element == f"open {BUS_NAME}".encode()
-            self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
-            if not self._is_open:
-                self._send(b"")
-        elif element == b"rawmode":
-            self._send(b"< ok >")
-            if not self._is_raw:
-                self._is_raw = True
-                self._bus.join(self._listener)
-        elif element == b"echo":
-            self._send(b"< echo >")
-        elif element.startswith(b"send "):
-            if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
-                self._bus.send(frame, sender=self._listener)
-        else:
-            self._send(b"< error unknown command >")
+        match element:
+            case _ if not self._is_open:
+                self._is_open = element == f"open {BUS_NAME}".encode()
+                self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
+                if not self._is_open:
+                    self._send(b"")
+            case b"rawmode":
+                self._send(b"< ok >")
+                if not self._is_raw:
+                    self._is_raw = True
+                    self._bus.join(self._hear)
+            case b"echo":
+                self._send(b"< echo >")
+            case _ if element.startswith(b"send "):
+                if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
+                    self._bus.send(frame, sender=self._hear)
+            case _:
+                self._send(b"< error unknown command >")
 
     def _hear(self, frame: CanFrame) -> None:
         stamp = f"{clock.now():.6f}"  # only differences are meaningful

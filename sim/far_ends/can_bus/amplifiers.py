@@ -40,6 +40,11 @@ _NMT: Mapping[str, int] = CANOPEN["nmt"]
 _NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]
 _OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
 _BOOT_UP, _PRE_OPERATIONAL = _NMT_STATES["BOOT_UP"], _NMT_STATES["PRE_OPERATIONAL"]
+_LEADS_TO = {
+    _NMT["stop"]: _STOPPED,
+    **dict.fromkeys((_NMT["pre_operational"], _NMT["reset_communication"]), _PRE_OPERATIONAL),
+}
+"""The state in which a node no longer takes requests, by the command that leads there."""
 _NMT_LENGTH = 2
 _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 
@@ -149,15 +154,11 @@ class _Node:
             return
         if command == _NMT["start"]:
             self._state = _OPERATIONAL
-        elif command == _NMT["stop"]:
-            self._leave(_STOPPED, now)
-        elif command == _NMT["pre_operational"]:
-            self._leave(_PRE_OPERATIONAL, now)
-        elif command == _NMT["reset_communication"]:
-            self._leave(_PRE_OPERATIONAL, now)
-            self.boot(now)
         elif command == _NMT["reset_node"]:
             self._amplifier.restart(now)
+        elif command in _LEADS_TO:
+            self._leave(_LEADS_TO[command], now)
+        if command in (_NMT["reset_node"], _NMT["reset_communication"]):
             self.boot(now)
 
     def read(self, data: bytes, now: float) -> None:

@@ -63,7 +63,7 @@ class CanBus:
 
     def _deliver(self, frame: CanFrame, sender: Listener) -> None:
         for member in tuple(self._members):
-            if member is not sender:
+            if member != sender:
                 member(frame)
 
 
@@ -76,13 +76,12 @@ class BusNodes:
 
     def __init__(self, bus: CanBus, devices: Sequence[AmplifierDevice]) -> None:
         self._bus = bus
-        self._listener = self._hear  # one object, which identifies the member
         self._nodes = [self._connect(device) for device in devices]
-        bus.join(self._listener)
+        bus.join(self._hear)
 
     def close(self) -> None:
         """Leave the bus and discard frames in flight."""
-        self._bus.leave(self._listener)
+        self._bus.leave(self._hear)
         for line, served in self._nodes:
             line.close()
             served.close()
@@ -94,7 +93,7 @@ class BusNodes:
 
     def _leave(self, data: bytes) -> None:
         for frame in unpack_frames(data):
-            self._bus.send(frame, sender=self._listener)
+            self._bus.send(frame, sender=self._hear)
 
     def _connect(self, device: AmplifierDevice) -> tuple[TwoWayLine, Served]:
         def send(frames: bytes) -> None:

@@ -8,7 +8,7 @@ others are refused, since nothing longer than four bytes can be written.
 import struct
 import zlib
 
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import MESSAGES, TEXTS
 from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from sim.transport.far_end import AmplifierPort
 
@@ -23,15 +23,11 @@ _EXPEDITED = 2
 
 
 class SdoAbort(Exception):
-    """Aborts a transfer with a code."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"{code:#010x}")
-        self.code = code
+    """Aborts a transfer with a code, its only argument."""
 
 
-_INDEX = CANOPEN["objects"]
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
+_NAMES = {index: name for name, index in CANOPEN["objects"].items()}
+"""Of objects by their index."""
 
 
 class ObjectServer:
@@ -69,7 +65,7 @@ class ObjectServer:
                 raise SdoAbort(UNKNOWN_COMMAND)
         except SdoAbort as abort:
             self._rest = None
-            return struct.pack("<BHBL", 0x80, *self._object, abort.code)
+            return struct.pack("<BHBL", 0x80, *self._object, *abort.args)
         self._rest = None
         return b""
 
@@ -102,7 +98,7 @@ class ObjectServer:
 
     def _write(self, index: int, subindex: int, data: bytes, now: float) -> None:
         self.read(index, subindex, now)
-        if index != _INDEX["heartbeat_producer"]:
+        if _NAMES[index] != "heartbeat_producer":
             raise SdoAbort(READ_ONLY)
         if len(data) != 2:
             raise SdoAbort(BAD_LENGTH)
@@ -110,25 +106,26 @@ class ObjectServer:
 
     def _entries(self, index: int, now: float) -> bytes | list[bytes]:
         """Return an object, or its subindices from 1 on."""
-        if index == _INDEX["device_type"]:
-            return _u32(CANOPEN["device_type"])
-        if index == _INDEX["error_register"]:
-            return bytes([CANOPEN["emergencies"][self._amplifier.fault]["error_register"]])
-        if index == _INDEX["emergency_cob_id"]:
-            return _u32(cob_id("emergency", self._node))
-        if index == _INDEX["heartbeat_producer"]:
-            return self.heartbeat.to_bytes(2, "little")
         identity = self._amplifier.identity
-        if index == _INDEX["identity"]:
-            numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
-            return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
-        if index == _INDEX["texts"]:
-            texts = [identity[name].encode() for name in _TEXTS]
-            return [*texts, identity["versions"].to_bytes(2, "little")]
-        if index == _INDEX["capabilities"]:
-            return self._words("GetCaps", now)
-        if index == _INDEX["status"]:
-            return self._words("GetStatus", now)
+        match _NAMES.get(index):
+            case "device_type":
+                return _u32(CANOPEN["device_type"])
+            case "error_register":
+                return bytes([CANOPEN["emergencies"][self._amplifier.fault]["error_register"]])
+            case "emergency_cob_id":
+                return _u32(cob_id("emergency", self._node))
+            case "heartbeat_producer":
+                return self.heartbeat.to_bytes(2, "little")
+            case "identity":
+                numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
+                return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
+            case "texts":
+                texts = [identity[field.name].encode() for field in TEXTS]
+                return [*texts, identity["versions"].to_bytes(2, "little")]
+            case "capabilities":
+                return self._words("GetCaps", now)
+            case "status":
+                return self._words("GetStatus", now)
         raise SdoAbort(NO_OBJECT)
 
     def _words(self, name: str, now: float) -> list[bytes]:

@@ -99,7 +99,7 @@ async def test_daemon_ends_when_terminated_over_dead_link(tmp_path: Path) -> Non
         await era.arm("test", lease_s=60)
         assert await until_state(era, ENABLED)
         async with holding(era, far=bench.far):
-            bench.far.device.inject_fault(FaultWindow("hang"))
+            bench.far.device.inject_fault(FaultWindow(fault="hang"))
             begin = clock.now()
             bench.daemon.shut_down("end of the test")
             await until(bench.running.done)

@@ -41,7 +41,7 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
             assert (await next_event(era, "state")).data["new"] == ENABLED
             await era.subscribe("link", "pattern", "silence")
             assert (await next_event(era, "pattern")).data["drive"]
-            bench.far.device.inject_fault(FaultWindow("hang"))
+            bench.far.device.inject_fault(FaultWindow(fault="hang"))
             await until_state(era, "COMM_LOST")
             status = await era.status()
             assert status.armed_by is None
@@ -89,7 +89,7 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
 
         await until_state(era, READY)
         assert await losses() == {"main": present, "side": present}
-        far.devices["side"].inject_fault(FaultWindow("hang"))
+        far.devices["side"].inject_fault(FaultWindow(fault="hang"))
         await until_losses(main=closed, side=lost)
         await era.subscribe("link")
         begun = lost_for = (await era.status()).lost_for_s or 0.0
@@ -104,7 +104,7 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
         main, side = (line for line in show_status(status).splitlines() if "serial://" in line)
         assert re.search(r"amplifier main .*\): closed ", main)
         assert re.search(r"amplifier side .*\): LOST, ", side)
-        far.devices["main"].inject_fault(FaultWindow("hang"))
+        far.devices["main"].inject_fault(FaultWindow(fault="hang"))
         await until_losses(main=lost, side=lost)
         far.devices["side"].recover()
         await until_losses(main=lost, side=closed)
@@ -117,7 +117,7 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
     async with ready_daemon(tmp_path, "dumps: {folder: dumps}\n") as (bench, era):
         await era.arm("me", lease_s=30)
         async with holding(era, far=bench.far):
-            bench.far.device.inject_fault(FaultWindow("over_voltage"))
+            bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
             await until_state(era, "FAULT")
         assert not any(bench.far.summary().levels)
         assert "OVER_VOLTAGE" in (await era.status()).cause
@@ -196,7 +196,7 @@ async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_
         assert bench.daemon._publisher.view.silence_event() is None
         identity = bench.far.device.identity
         before, identity["serial_number"] = identity["serial_number"], "A1"  # another one
-        bench.far.device.inject_fault(FaultWindow("hang"))
+        bench.far.device.inject_fault(FaultWindow(fault="hang"))
         await until_state(era, "COMM_LOST")
         assert "no reply" in (await era.status()).cause
         bench.far.device.recover()

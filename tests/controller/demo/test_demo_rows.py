@@ -248,7 +248,7 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
         arming = asyncio.create_task(run._keep_armed(bench.daemon, bench.socket, recorder))
         await recorder.start()
         await until_state(era, ENABLED)
-        bench.far.device.inject_fault(FaultWindow("over_voltage", lasts=0.05))
+        bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
         await until(lambda: recorder.fault is not None)
         await until(lambda: recorder.fault is None or arming.done())
         assert not arming.done()

@@ -142,7 +142,7 @@ async def test_node_that_has_restarted_is_mute_until_it_is_identified(
     """Its network state is lost with its supply, and heartbeats with it."""
     async with rig_on_wire(coarse_rig, WIRES[name]) as rig:
         main = rig.group.amplifiers["main"]
-        rig.devices["main"].inject_fault(FaultWindow("reboot", lasts=0.2))
+        rig.devices["main"].inject_fault(FaultWindow(fault="reboot", lasts=0.2))
         await asyncio.sleep(0.3)
         with pytest.raises(LinkError):
             await main.read_status()
@@ -177,7 +177,7 @@ def test_fault_silences_and_its_amplifier_is_found_again(
             await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
             await rig.beat_until(clock.now() + 0.2)
             assert rig.levels("main")[0] == 1.0
-            rig.devices["main"].inject_fault(FaultWindow(kind, lasts=1.0))
+            rig.devices["main"].inject_fault(FaultWindow(fault=kind, lasts=1.0))
             with pytest.raises((CommandRefused, LinkError)):
                 await rig.beat_until(clock.now() + 2.0)
             assert not rig.group.is_armed
@@ -208,7 +208,7 @@ async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
         await rig.group.arm()
         played = [layer((0, 110.0, 0.5))]
         await rig.group.apply({"east": played, "west": played})
-        rig.devices["east"].inject_fault(FaultWindow("hang"))
+        rig.devices["east"].inject_fault(FaultWindow(fault="hang"))
         begin = clock.now()
         stopping = asyncio.create_task(rig.group.stop())
         await asyncio.sleep(0.05)

@@ -31,7 +31,7 @@ def test_load_faults_reads_times_units_and_amplifiers(tmp_path: Path) -> None:
     )
     file = load_faults(path, amplifiers=["east", "west"])
     east = file.of("east", begin=100.0)
-    assert east.windows == [FaultWindow("drop", 2.0, 1.5, share=0.2, toward="host")]
+    assert east.windows == [FaultWindow(fault="drop", at=2.0, lasts=1.5, share=0.2, toward="host")]
     assert len(file.of("west", begin=100.0).windows) == 2
     assert [east.now("drop", time) for time in (101.9, 102.0, 103.4, 103.5)] == [
         *(False, True, True, False)
@@ -71,7 +71,7 @@ def test_load_faults_reports_every_error_with_its_line(tmp_path: Path) -> None:
 )
 def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
     """Each kind of fault has its effect, only within its window."""
-    faults = Faults([FaultWindow(kind, at=1.0, lasts=1.0)], begin=10.0, seed=3)
+    faults = Faults([FaultWindow(fault=kind, at=1.0, lasts=1.0)], begin=10.0, seed=3)
     assert is_so(faults.pass_on(FRAME, toward="amplifier", time=11.5))
     for time in (10.5, 12.0):
         assert faults.pass_on(FRAME, toward="amplifier", time=time) == [(0.0, FRAME)]
@@ -86,7 +86,7 @@ def test_fault_hits_a_share_of_one_direction() -> None:
     """A fifth of the frames to the host; the same seed hits the same ones."""
     runs = []
     for _ in range(2):
-        faults = Faults([FaultWindow("drop", share=0.2, toward="host")], seed=5)
+        faults = Faults([FaultWindow(fault="drop", share=0.2, toward="host")], seed=5)
         runs.append([bool(faults.pass_on(FRAME, toward="host", time=1.0)) for _ in range(2000)])
     assert runs[0] == runs[1]
     assert 0.17 < runs[0].count(False) / 2000 < 0.23
@@ -127,7 +127,7 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
 def test_faults_combine_on_one_frame() -> None:
     """A frame truncated to nothing does not arrive."""
     kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "incomplete_set")
-    faults = Faults([FaultWindow(kind) for kind in kinds])
+    faults = Faults([FaultWindow(fault=kind) for kind in kinds])
     arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
     assert {len(data) for frames in arrived for _, data in frames} <= {1}
     assert [] in arrived
@@ -137,6 +137,6 @@ def test_faults_combine_on_one_frame() -> None:
 def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
     """As TCP does; what is only late or double arrives."""
     for fault, expected in ((kind, []), ("duplicate", [(0.0, FRAME)] * 2)):
-        faults = Faults((FaultWindow(fault),))  # type: ignore[arg-type]
+        faults = Faults((FaultWindow(fault=fault),))  # type: ignore[arg-type]
         arrived = faults.pass_on(FRAME, toward="amplifier", time=1.0, finds_damage=True)
         assert arrived == expected

@@ -17,11 +17,10 @@ import pytest
 import era_haptics
 from drivers.errors import CommandError
 from drivers.judge.asking import CHECKS, Result, judge, of_kind
-from drivers.judge.asking.check import Check, CheckResult, Report, run_checks
-from drivers.judge.asking.client import Violation, When
+from drivers.judge.asking.check import Check, CheckResult, Report, in_words, run_checks
+from drivers.judge.asking.client import Late, Violation, When
 from drivers.judge.asking.judge import Judge
 from drivers.judge.asking.material import layer
-from drivers.judge.asking.sent import in_words
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
@@ -181,7 +180,10 @@ def test_mute_amplifier_fails() -> None:
     far = plain()
     far.is_answering = False
     result, *others = judged("serial", far=far)
-    assert (result.result, result.seen) == (Result.FAILED, "reply to message 1: none within 0.5 s")
+    assert (result.result, result.finding.seen) == (
+        Result.FAILED,
+        "reply to message 1: none within 0.5 s",
+    )
     assert {each.result for each in others} == {Result.NOT_RUN}
 
 
@@ -221,7 +223,8 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
         [(1, _tried([0.11] * 20)), (2, _tried([]))], line.client, level=0.2
     )
     line.close()
-    assert (late.result, late.has_verdict, good.result) == ("skipped", False, "passed")
+    assert (late.result, good.result) == ("skipped", "passed")
+    assert isinstance(late.finding, Late)
     assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
 
 
@@ -278,7 +281,7 @@ def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(
         far.capabilities.update(watchdog_min=100)
         found += judged("serial", ["watchdog_ranges"], far=far)
     assert [each.result for each in found] == ["passed", "failed"], found
-    assert "watchdog" in found[1].seen
+    assert "watchdog" in found[1].finding.seen
 
 
 def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +289,7 @@ def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> Non
     obey_late(monkeypatch, 0.025)
     read, obeyed = judged("serial", ["replies_in_time", "obeys_in_time"])
     assert (read.result, obeyed.result) == ("passed", "failed"), obeyed.reason
-    assert float(obeyed.seen.split(": ")[1]) == pytest.approx(25, abs=0.5)  # ms
+    assert float(obeyed.finding.seen.split(": ")[1]) == pytest.approx(25, abs=0.5)  # ms
 
 
 TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "phases", "voices"]
@@ -356,7 +359,7 @@ def test_report_says_the_worst() -> None:
     """One that failed makes all fail; a violation says what must be, and what was seen."""
     found = Violation("latch", expected=3, seen=4)
     assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
-    bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found.seen, found.expected)
+    bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
     good = CheckResult(CHECKS[1], 2, Result.PASSED)
     assert Report("x", 0.2, (bad, good), 0).overall == "failed"
     assert Report("x", 0.2, (good,), 1).overall == "incomplete"
@@ -474,7 +477,7 @@ def test_malformed_reply_fails_one_check_with_its_bytes(
     results = judged(kind, names)
     (failed,) = (each for each in results if each.result == "failed")
     shown = b"".join(each.data for each in unpack_frames(bad[0])) if kind == "can" else bad[0]
-    assert shown.hex(" ") in failed.came
+    assert shown.hex(" ") in failed.finding.came
     assert [each.result for each in results].count(Result.PASSED) == len(names) - 1, results
 
 
@@ -491,7 +494,9 @@ def test_failure_shows_the_set_that_was_sent() -> None:
         "DCD8 0028 0898 0258 34BC 0038 0898 0190 0802"
     )
     (result,) = judged("serial", ["stop"], far=_PlaysOn("loud", channels=2))
-    assert result.sent.startswith("set 2, staged; layer 0, ramp 0 ms, valid for 0 ms: channel 0 ")
+    assert result.finding.sent.startswith(
+        "set 2, staged; layer 0, ramp 0 ms, valid for 0 ms: channel 0 "
+    )
 
 
 def test_one_bad_capability_is_one_failure() -> None:
@@ -502,7 +507,7 @@ def test_one_bad_capability_is_one_failure() -> None:
     results = {each.check.name: each for each in judged("serial", names, far=far)}
     failed = [name for name, each in results.items() if each.result == "failed"]
     assert failed == ["capabilities"]
-    assert "900" in results["capabilities"].expected
+    assert "900" in results["capabilities"].finding.expected
     not_run = {name for name, each in results.items() if each.result == "not_run"}
     assert not_run == {"onsets", "endings", "voices"}
     assert all("envelope_step_max" in results[name].reason for name in not_run)
@@ -572,5 +577,5 @@ async def test_busy_machine_has_its_verdicts(names: list[str]) -> None:
     stalling.cancel()
     bad = [(each.check.name, each.reason) for each in results if each.result == "failed"]
     assert not bad
-    assert [each.check.name for each in results if not each.has_verdict] == []
+    assert [each.check.name for each in results if isinstance(each.finding, Late)] == []
     assert sum(each.seconds for each in results) < 2 * MINUTE

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import Message, Reply, Request
-from drivers.judge.watching.watched_wire import decoder_of
+from drivers.judge.watching.watched_wire import DECODERS
 from drivers.wires.modbus.crc import crc16
 
 
@@ -138,7 +138,7 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
 def test_decoders_read_what_no_page_shows(talk: str) -> None:
     """Refusals, late and damaged frames, other hosts; numbers are by the page on messages."""
     kind, pieces = TALKS[talk]
-    decoder = decoder_of(kind)
+    decoder = DECODERS[kind]()
     for arrow, data, what, values in pieces:
         direction: Direction = "amplifier" if arrow == ">" else "host"
         heard = [message for _, message in decoder.feed(direction, 0.001, data)]

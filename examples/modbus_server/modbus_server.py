@@ -170,7 +170,7 @@ async def serve(kind: str, port: str, parity: str = "E") -> None:
     known = [each.function_code for each in requests]  # others have exception 1
     server.decoder.pdu_table = {each: server.decoder.pdu_table[each] for each in known}
     await server.serve_forever(background=True)
-    if kind == "tcp":
+    if isinstance(server.transport, asyncio.Server):
         port = str(server.transport.sockets[0].getsockname()[1])
     url = f"modbus+rtu://{port}?baud={BAUD}#{UNIT}"
     print(f"modbus+tcp://127.0.0.1:{port}/{UNIT}" if kind == "tcp" else url, flush=True)

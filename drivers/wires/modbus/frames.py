@@ -220,7 +220,7 @@ class AduReader:
         found: list[Adu] = []
         start, rest = 0, -1  # where a frame is looked for, and where one may become whole
         while start < len(data):
-            size = self._size(data[start:])
+            size = self._size(data[start : start + _RTU_MAX])
             is_whole = 0 < size <= len(data) - start
             adu = _checked(data[start : start + size]) if is_whole else None
             is_behind = self._is_lost or start > 0

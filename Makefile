@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint pages format docs fuzz faults kill-test fault-test stop-test late-test desk-test qt-test estimate-test soak bench bench-latency \
 	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -44,7 +44,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test smoke-lowest
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults firmware-test fuzz stop-test late-test kill-test soak desk-test qt-test estimate-test smoke-lowest
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -70,6 +70,19 @@ test-busy: .venv/installed-test
 # processor, and what differs between their answers; four minutes. Others: make test-kernels KERNELS=--answers
 test-kernels: .venv/installed-test
 	$(BIN)/python tests/support/kernels.py $(KERNELS)
+
+# What reads and writes Modbus, with the lowest and the newest pymodbus that the bounds allow, each in
+# a folder of its own. Others: make test-pymodbus PYMODBUS=3.12.1
+PYMODBUS := 3.8.* 3.*
+MODBUS := tests/drivers/wires tests/drivers/judge tests/sim/far_ends tests/test_link_faults.py
+test-pymodbus: .venv/installed-test
+	@set -f; for version in $(PYMODBUS); do \
+		folder="$(CURDIR)/out/pymodbus-$$version"; rm -rf "$$folder"; export PYTHONPATH="$$folder"; \
+		$(BIN)/python -m pip --disable-pip-version-check install -qq --no-deps --target "$$folder" \
+			"pymodbus==$$version" && \
+		$(BIN)/python -c 'import pymodbus; print("pymodbus", pymodbus.__version__)' && \
+		$(BIN)/pytest -q -m 'not long' --numprocesses 2 -k 'modbus or rtu or tcp' $(MODBUS) || exit 1; \
+	done
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .

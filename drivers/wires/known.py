@@ -9,7 +9,7 @@ from collections.abc import Callable
 from drivers.errors import CommandError
 from drivers.wires.address import WireAddress
 from drivers.wires.can_bus.address import PythonCanAddress, SlcanAddress, SocketcandAddress
-from drivers.wires.modbus.address import ModbusAddress
+from drivers.wires.modbus.host import ModbusAddress
 from drivers.wires.serial_line.host import SerialAddress
 from registry.plugins import PluginRegistry
 

@@ -17,6 +17,7 @@ from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, STATES
 from firmware_programs import running_firmware
+from foreign_masters import MASTERS, drive
 from registry.limits import GuardLimits
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -54,6 +55,14 @@ async def opened(url: str) -> AsyncIterator[Amplifier]:
         yield amplifier
     finally:
         await lines.close()
+
+
+@pytest.mark.parametrize("name", MASTERS)
+def test_foreign_master_drives_it(name: str, firmware: Path) -> None:
+    """Reads by both functions, writes, a set, and an exception; none of the host takes part."""
+    line, make = MASTERS[name]
+    with running_firmware(firmware, *options(f"--modbus-{line}")) as (url, _):
+        assert drive(make, url) == "ERA haptics"
 
 
 @pytest.mark.parametrize("line", LINES)

@@ -1,8 +1,8 @@
 """Messages on Modbus, over TCP and RTU: each is written, then its reply is read.
 
-ADUs are found by docs/reference/modbus.md."""
+ADUs are found as docs/reference/modbus.md has it, and read by pymodbus.
+"""
 
-import struct
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
@@ -23,27 +23,24 @@ from drivers.judge.watching.decoded import (
 from drivers.protocol.records import Refusal
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, REFUSALS
 from drivers.wires.modbus.frames import (
-    EXCEPTION,
-    READS,
-    WRITE,
-    Adu,
-    request_size,
-    response_form,
-    response_size,
-    split_rtu,
-    split_tcp,
-)
-from drivers.wires.modbus.registers import (
     AREA,
     BOX,
+    EXCEPTION,
     EXCEPTIONS,
     HEAD,
     IDENTITY,
     IDENTITY_COUNT,
     PRESENT,
+    READS,
     REPLY,
+    WRITE,
+    Adu,
+    AduReader,
+    parse_request,
+    response_to,
     unpack_identity,
 )
+from drivers.wires.modbus.frames import Message as Pdu
 
 _PAUSE = 0.04  # s; a longer pause ends a partial frame on RTU
 
@@ -59,23 +56,11 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _Transaction:
-    """One whose response is missing; address, count: of registers read or written."""
+    """One whose response is missing; request: None where that is none."""
 
     adu: Adu
     key: Hashable
-    address: int = 0
-    count: int = 0
-
-    def problem_of(self, response: Adu) -> str:
-        """Describe why something is no response to it; "" if it is one."""
-        function, got = self.adu.pdu[0], response.pdu[0]
-        if got == function | EXCEPTION and len(response.pdu) == 2:
-            return ""
-        if got != function:
-            return f"function must be {function}, got {got}"
-        head, size = response_form(self.adu.pdu)
-        is_whole = len(response.pdu) == size and response.pdu.startswith(head)
-        return "" if is_whole else f"response must be {size} bytes from {head.hex()} on"
+    request: Pdu | None = None
 
 
 class ModbusDecoder(Decoder):
@@ -84,6 +69,10 @@ class ModbusDecoder(Decoder):
     def __init__(self, *, over_tcp: bool) -> None:
         super().__init__()
         self._over_tcp = over_tcp
+        self._readers: dict[Direction, AduReader] = {
+            direction: AduReader(is_rtu=not over_tcp, of_requests=direction == "amplifier")
+            for direction in self.rest
+        }
         self._last: dict[Direction, float] = {}  # times of the last bytes [s]
         self._open: dict[int, _Transaction] = {}  # by number; over RTU at most one
         self._written: dict[tuple[int, int], _Written] = {}  # by unit and number of the message
@@ -100,53 +89,44 @@ class ModbusDecoder(Decoder):
         return seen
 
     def _split(self, direction: Direction, time: float, data: bytes) -> list[Adu]:
-        before = self.rest[direction]
-        if self._over_tcp:
-            found, self.rest[direction] = split_tcp(before + data)
-            return found
-        is_late = before and time > self._last.get(direction, time) + _PAUSE
-        cut_off = [Adu(0, b"", raw=before)] if is_late else []
-        size_of = request_size if direction == "amplifier" else response_size
-        found, self.rest[direction] = split_rtu(data if is_late else before + data, size_of)
-        self._last[direction] = time
-        return [*cut_off, *found]
+        reader = self._readers[direction]
+        is_late = not self._over_tcp and time > self._last.get(direction, time) + _PAUSE
+        found = [*(reader.end() if is_late else ()), *reader.feed(data)]
+        self.rest[direction], self._last[direction] = reader.rest, time
+        return found
 
     def _request(self, adu: Adu) -> Message:
         self._requests += 1
         key = (adu.unit, self._requests) if adu.unit or self._over_tcp else None
-        function, body = adu.pdu[0], adu.pdu[1:]
-        try:
-            address, count = struct.unpack_from(">HH", body)
-            if function in READS and len(body) == 4:
-                return self._read(adu, key, address, count)
-            if function == WRITE and body[4:5] == bytes([2 * count]) != b"\0":
-                words = struct.unpack(f">{count}H", body[5:])
-                return self._write(adu, key, address, words)
-        except (struct.error, ValueError):
-            pass
-        self._remember(_Transaction(adu, key))
-        problem = f"function {function} is malformed or none"
-        return Request(A_READ, adu.unit, key, problem=problem)
+        request = parse_request(adu)
+        if request is None:
+            self._remember(_Transaction(adu, key))
+            problem = f"function {adu.pdu[0]} is malformed or none"
+            return Request(A_READ, adu.unit, key, problem=problem)
+        if adu.pdu[0] in READS:
+            return self._read(adu, key, request)
+        return self._write(adu, key, request)
 
-    def _write(self, adu: Adu, key: Hashable, address: int, words: Sequence[int]) -> Request:
-        self._remember(_Transaction(adu, key, address, len(words)))
-        number, offset = divmod(address, BOX)
+    def _write(self, adu: Adu, key: Hashable, request: Pdu) -> Request:
+        self._remember(_Transaction(adu, key, request))
+        words = request.registers
+        number, offset = divmod(request.address, BOX)
         if offset or number not in BY_NUMBER or len(words) > MAX_WORDS + 1 or not words[0]:
-            problem = f"write of {len(words)} registers to {address}, tag {words[0]}"
+            problem = f"write of {len(words)} registers to {request.address}, tag {words[0]}"
             return Request(A_READ, adu.unit, key, problem=problem)
         if adu.unit:
             self._written[adu.unit, number] = _Written(words[0], key)
         return request_of(number, words[1:], adu.unit, key)
 
-    def _read(self, adu: Adu, key: Hashable, address: int, count: int) -> Request | Notice:
-        number, offset = divmod(address, BOX)
+    def _read(self, adu: Adu, key: Hashable, request: Pdu) -> Request | Notice:
+        number, offset = divmod(request.address, BOX)
         written = self._written.get((adu.unit, number))
         is_reply = number in BY_NUMBER and offset == REPLY
         if is_reply and written is not None and not written.is_read:
-            self._remember(_Transaction(adu, written.key, address, count))
+            self._remember(_Transaction(adu, written.key, request))
             return Notice("read on", key=written.key)
-        self._remember(_Transaction(adu, key, address, count))
-        if address == IDENTITY:
+        self._remember(_Transaction(adu, key, request))
+        if request.address == IDENTITY:
             return Request(HELLO, adu.unit, key)
         is_present = is_reply and BY_NUMBER[number].name in PRESENT
         return Request(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
@@ -156,23 +136,27 @@ class ModbusDecoder(Decoder):
             self._open[transaction.adu.transaction] = transaction
 
     def _response(self, adu: Adu) -> Message | None:
-        request = self._open.get(adu.transaction)
-        if request is None or request.adu.unit != adu.unit:
+        transaction = self._open.get(adu.transaction)
+        if transaction is None or transaction.adu.unit != adu.unit:
             return Reply(adu.unit)
         del self._open[adu.transaction]
-        if problem := request.problem_of(adu):
+        key, request, function = transaction.key, transaction.request, transaction.adu.pdu[0]
+        if adu.pdu[0] == function | EXCEPTION and len(adu.pdu) == 2:
+            name = EXCEPTIONS.get(adu.pdu[1])  # what gateways refuse is no response
+            return None if name is None else Reply(adu.unit, key, refusal=REFUSALS[name])
+        response = response_to(request, adu)
+        if request is None or response is None:
+            problem = f"function must be {function}, got {adu.pdu[0]}"
+            if adu.pdu[0] == function:
+                problem = f"response must fit {transaction.adu.pdu[:5].hex()}, got {adu.pdu.hex()}"
             return Reply(adu.unit, problem=problem)
-        if adu.pdu[0] & EXCEPTION:  # what gateways refuse is no response
-            name = EXCEPTIONS.get(adu.pdu[1])
-            return None if name is None else Reply(adu.unit, request.key, refusal=REFUSALS[name])
-        if adu.pdu[0] == WRITE:
-            return Notice("carried out", key=request.key)
-        return self._reply(request, struct.unpack_from(f">{request.count}H", adu.pdu, 2))
+        if request.function_code == WRITE:
+            return Notice("carried out", key=key)
+        return self._reply(adu.unit, key, request.address, response.registers)
 
-    def _reply(self, request: _Transaction, words: Sequence[int]) -> Reply:
-        number, offset = divmod(request.address, BOX)
-        unit, key = request.adu.unit, request.key
-        if request.address == IDENTITY and request.count == IDENTITY_COUNT:
+    def _reply(self, unit: int, key: Hashable, address: int, words: Sequence[int]) -> Reply:
+        number, offset = divmod(address, BOX)
+        if address == IDENTITY and len(words) == IDENTITY_COUNT:
             try:
                 return Reply(unit, key, unpack_identity(words))
             except Refusal as refusal:

@@ -1,32 +1,79 @@
-"""Modbus ADUs of register requests, over TCP and RTU, for both ends; no I/O.
+"""Modbus for both ends, without I/O: pymodbus's frames and messages, and registers of messages.
 
-A response is credited to a request alone that it answers; what is late, of others or damaged is
-counted.
+pymodbus makes and reads ADUs, checksums, requests and responses, and says how long they are. Where
+a frame begins and which response answers what is decided here. Its readers of streams are not used,
+and what it raises for damaged bytes, or logs, stays here: such bytes are no frame.
+
+Message n is written from register 256 n on (tag, words), its reply read from 256 n + 128 on (tag,
+result, words).
 """
 
+import logging
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
-from drivers.counters import WireCounters
-from drivers.wires.modbus.crc import crc16
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadHoldingRegistersResponse,
+    ReadInputRegistersRequest,
+    ReadInputRegistersResponse,
+    WriteMultipleRegistersRequest,
+    WriteMultipleRegistersResponse,
+)
+
+from drivers.protocol.records import TEXT_MAX, Values
+from drivers.protocol.table import MAX_WORDS, TEXTS
+
+# It calls exceptions errors of the program; pymodbus_apply_logging_config still shows its log.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
 
 READS, READ, WRITE = (3, 4), 4, 16
 """Functions that read registers, the one of a host, and the one that writes them."""
 EXCEPTION = 0x80
 """Bit of the function in a response that is an exception."""
-RTU_MAX = 256
-"""Longest frame on a serial line [bytes]."""
+WRITE_SIZE, ECHO_SIZE, READ_SIZE, RESPONSE_SIZE = 9, 8, 8, 5
+"""Bytes on RTU of a write and its response, of a read and its response; registers not counted."""
+
+BOX, REPLY, HEAD = 256, 128, 2
+"""Registers of a message, offset of its reply, registers of that before its words."""
+AREA = HEAD + MAX_WORDS
+"""Registers of a reply, with zeros behind it."""
+IDENTITY, IDENTITY_COUNT = 1065, 2 + len(TEXTS) * TEXT_MAX // 2
+"""First register of the identity (tag 0, versions, texts padded with zeros), and their number."""
+PRESENT = ("GetCaps", "GetStatus", "GetFaults")
+"""Messages whose replies are of the moment at which they are read, written before or not."""
+EXCEPTIONS: Mapping[int, str] = {
+    **dict.fromkeys((1, 2), "UNKNOWN_TYPE"),
+    3: "BAD_LENGTH",
+    **dict.fromkeys((5, 6), "BUSY"),
+}
+"""Refusals that exceptions stand for."""
+
+_RTU_MIN, _RTU_MAX = 4, 256  # bytes; unit, function and CRC at least
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
-_RTU_MIN = 4  # unit, function, CRC
-_WITH_TWO_WORDS, _TWO_WORDS_SIZE = range(1, 7), 8  # functions, and the size of their requests
-_WRITE_SIZE, _COUNT_AT = 9, 6  # without the registers that the byte there counts
-_RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
-_TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
-_COUNTED, _ECHOING = (3, 4, 23), (5, 6, 15, 16)  # functions by the form of their responses
+_COUNT_MAX = {3: 125, 4: 125, WRITE: 123}  # registers by function
+_REQUESTS, _RESPONSES = DecodePDU(is_server=True), DecodePDU(is_server=False)
+_REQUEST_KINDS: Mapping[int, type[ModbusPDU]] = {
+    3: ReadHoldingRegistersRequest,
+    READ: ReadInputRegistersRequest,
+    WRITE: WriteMultipleRegistersRequest,
+}
+_RESPONSE_KINDS: Mapping[int, type[ModbusPDU]] = {
+    3: ReadHoldingRegistersResponse,
+    READ: ReadInputRegistersResponse,
+    WRITE: WriteMultipleRegistersResponse,
+}
+
+RTU, TCP = FramerRTU(_RESPONSES), FramerSocket(_RESPONSES)
+"""pymodbus's framers, which make frames."""
+Message: TypeAlias = ModbusPDU
+"""A request or a response: function_code, dev_id, transaction_id, address, count, registers."""
+Read, Write = ReadInputRegistersRequest, WriteMultipleRegistersRequest
+"""Requests of a host."""
 
 
 class Adu(NamedTuple):
@@ -41,222 +88,193 @@ class Adu(NamedTuple):
     raw: bytes = b""
 
 
+class Response(NamedTuple):
+    """The response to a request: registers read, or the code of an exception."""
+
+    registers: Sequence[int] = ()
+    exception: int = 0
+
+
 def framed(unit: int, pdu: bytes, transaction: int = 0, *, is_rtu: bool) -> bytes:
     """Return the frame of a PDU."""
-    if not is_rtu:
-        return _MBAP.pack(transaction, 0, len(pdu) + 1, unit) + pdu
-    body = bytes([unit]) + pdu
-    return body + crc16(body)
+    return (RTU if is_rtu else TCP).encode(pdu, unit, transaction)
+
+
+def pdu_of(message: Message) -> bytes:
+    """Return the PDU of a message."""
+    return bytes([message.function_code]) + message.encode()
 
 
 def read_pdu(address: int, count: int, *, function: int = READ) -> bytes:
-    """Return the PDU that reads registers."""
-    return struct.pack(">BHH", function, address, count)
+    """Return the PDU that reads registers, of which there are 1 to 125."""
+    return pdu_of(_REQUEST_KINDS[function](address=address, count=count))
 
 
 def write_pdu(address: int, registers: Sequence[int]) -> bytes:
     """Return the PDU that writes registers."""
-    count = len(registers)
-    return struct.pack(f">BHHB{count}H", WRITE, address, count, 2 * count % 256, *registers)
+    return pdu_of(Write(address=address, registers=[*registers]))
 
 
-def split_tcp(data: bytes) -> tuple[list[Adu], bytes]:
-    """Split bytes by the lengths in headers; returns what is left, too."""
-    found: list[Adu] = []
-    while len(data) >= _MBAP.size:
-        transaction, protocol, length, unit = _MBAP.unpack_from(data)
-        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-            return [*found, Adu(unit, b"", raw=data)], b""  # the next frame cannot be found
-        raw, rest = data[: _MBAP.size - 1 + length], data[_MBAP.size - 1 + length :]
-        if len(raw) < _MBAP.size - 1 + length:
-            break
-        found.append(Adu(unit, raw[_MBAP.size :], transaction, raw))
-        data = rest
-    return found, data
+def answer(request: Message, registers: Sequence[int] = ()) -> bytes:
+    """Return the PDU of the response to a request; registers: that were read."""
+    if request.function_code == WRITE:
+        return pdu_of(WriteMultipleRegistersResponse(address=request.address, count=request.count))
+    return pdu_of(_RESPONSE_KINDS[request.function_code](registers=[*registers]))
 
 
-def checked(data: bytes, start: int = 0, size: int | None = None) -> Adu | None:
-    """Return what an RTU frame of a size holds if it is whole and its CRC valid, else None."""
-    size = len(data) - start if size is None else size
-    frame = data[start : start + size]
-    if not _RTU_MIN <= size == len(frame) or crc16(frame[:-2]) != frame[-2:]:
+def exception_to(function: int, code: int) -> bytes:
+    """Return the PDU of an exception to a request of a function."""
+    return pdu_of(ExceptionResponse(function, code))
+
+
+def parse_request(adu: Adu) -> Message | None:
+    """Return the request of an ADU that reads or writes registers; None for any other."""
+    pdu = adu.pdu
+    if pdu[0] not in _REQUEST_KINDS:
+        return None
+    request = _REQUEST_KINDS[pdu[0]](dev_id=adu.unit, transaction_id=adu.transaction)
+    try:
+        is_whole = request.calculateRtuFrameSize(b"\0" + pdu) == len(pdu) + 3
+        request.decode(pdu[1:])
+    except Exception:  # whatever a library raises for bytes that were damaged
+        return None
+    fits = pdu[0] != WRITE or len(pdu) == WRITE_SIZE - 3 + 2 * request.count
+    return request if is_whole and fits and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
+
+
+def response_to(request: Message | None, adu: Adu) -> Response | None:
+    """Read an ADU as the response to a request; None if it is not.
+
+    It has the unit, the transaction and the function of the request, and as many registers, or
+    echoes address and count.
+    """
+    unit, pdu, transaction, _ = adu
+    if request is None or (unit, transaction) != (request.dev_id, request.transaction_id):
+        return None
+    function, count = request.function_code, request.count
+    if pdu[0] == function | EXCEPTION:
+        return Response(exception=pdu[1]) if len(pdu) == 2 and pdu[1] else None
+    size = ECHO_SIZE if function == WRITE else RESPONSE_SIZE + 2 * count
+    if pdu[0] != function or len(pdu) + 3 != size:
+        return None
+    response = _RESPONSE_KINDS[function]()
+    try:
+        response.decode(pdu[1:])
+    except Exception:  # whatever a library raises for bytes that were damaged
+        return None
+    if function == WRITE:
+        is_own = (response.address, response.count) == (request.address, count)
+    else:
+        is_own = len(response.registers) == count
+    return Response(response.registers) if is_own else None
+
+
+class AduReader:
+    """Splits a stream of requests, or of responses, into ADUs; bytes that are none have no PDU.
+
+    Over TCP each header says where the next begins. Over RTU a frame begins where the length that
+    is in it has a valid CRC. Damaged bytes may look like one: an amplifier (waits) looks for no
+    other within a frame that may become whole, or that is of an unknown function, which ends with a
+    pause; a host (is_host) takes none behind them but the response that it waits for. rest: what
+    may become a frame.
+    """
+
+    def __init__(
+        self, *, is_rtu: bool, of_requests: bool, waits: bool = False, is_host: bool = False
+    ) -> None:
+        self.rest = b""
+        self._is_rtu = is_rtu
+        self._decoder = _REQUESTS if of_requests else _RESPONSES
+        self._waits, self._is_host = waits, is_host
+        self._is_lost = False  # behind damaged bytes
+
+    def feed(self, data: bytes, request: Message | None = None) -> list[Adu]:
+        """Return the ADUs that these bytes complete, in order; request: whose response is due."""
+        data = self.rest + data
+        if self._is_rtu:
+            return self._split_rtu(data, request, waits=self._waits)
+        found: list[Adu] = []
+        while len(data) >= _MBAP.size:
+            transaction, protocol, length, unit = _MBAP.unpack_from(data)
+            if protocol or not 2 <= length <= _LENGTH_MAX:  # the next frame cannot be found
+                self.rest = b""
+                return [*found, Adu(unit, b"", raw=data)]
+            if len(data) < (size := _MBAP.size - 1 + length):
+                break
+            found.append(Adu(unit, data[_MBAP.size : size], transaction, data[:size]))
+            data = data[size:]
+        self.rest = data
+        return found
+
+    def end(self) -> list[Adu]:
+        """Return what the rest is, which a pause has ended."""
+        data, found = self.rest, list[Adu]()
+        if self._is_rtu and data:
+            whole = _checked(data)
+            found = [whole] if whole else self._split_rtu(data, None, waits=False)
+            data = b"" if whole else self.rest
+        self.rest, self._is_lost = b"", False
+        return [*found, Adu(0, b"", raw=data)] if data else found
+
+    def _split_rtu(self, data: bytes, request: Message | None, *, waits: bool) -> list[Adu]:
+        found: list[Adu] = []
+        start, rest = 0, -1  # where a frame is looked for, and where one may become whole
+        while start < len(data):
+            size = self._size(data[start : start + _RTU_MAX])
+            is_whole = 0 < size <= len(data) - start
+            adu = _checked(data[start : start + size]) if is_whole else None
+            is_behind = self._is_lost or start > 0
+            if adu and not (is_behind and self._is_host and response_to(request, adu) is None):
+                if start:
+                    found.append(Adu(0, b"", raw=data[:start]))
+                found.append(adu)
+                data, start, rest, self._is_lost = data[start + size :], 0, -1, False
+                continue
+            may_end = size == 0 and waits and not is_behind  # by a pause
+            if rest < 0 and (size > len(data) - start or may_end):
+                rest = start
+            if rest == start and waits and not is_behind and len(data) <= _RTU_MAX:
+                break
+            start += 1
+        rest = len(data) if rest < 0 else rest
+        if rest:
+            found.append(Adu(0, b"", raw=data[:rest]))
+            self._is_lost = True
+        self.rest = data[rest:]
+        return found
+
+    def _size(self, data: bytes) -> int:
+        """Return the size of the RTU frame that begins here; 0 where none can, the most if open."""
+        if len(data) < _RTU_MIN:
+            return _RTU_MAX
+        try:
+            kind = self._decoder.lookupPduClass(data)
+            size = 0 if kind is None else kind.calculateRtuFrameSize(data) or _RTU_MAX
+        except Exception:  # whatever a library raises for bytes that were damaged
+            return 0
+        return size if size <= _RTU_MAX else 0
+
+
+def _checked(frame: bytes) -> Adu | None:
+    """Return what an RTU frame holds if its CRC is valid, else None."""
+    if len(frame) < _RTU_MIN:
+        return None
+    if not FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
         return None
     return Adu(frame[0], frame[1:-2], raw=frame)
 
 
-def request_size(data: bytes) -> int:
-    """Return the size of the RTU request that begins here, at least; 0 where none can."""
-    function = data[1] if len(data) > 1 else 0
-    if function == WRITE:
-        size = _WRITE_SIZE + sum(data[_COUNT_AT : _COUNT_AT + 1])
-        return size if size <= RTU_MAX else 0
-    return _TWO_WORDS_SIZE if function in _WITH_TWO_WORDS else 0
+def pack_identity(identity: Values) -> Sequence[int]:
+    """Return the registers of an identity."""
+    texts = b"".join(field.encoded(identity).ljust(TEXT_MAX, b"\0") for field in TEXTS)
+    return (0, identity["versions"], *struct.unpack(f">{len(texts) // 2}H", texts))
 
 
-def response_size(data: bytes) -> int:
-    """Return the size of the RTU response that begins here, at least; 0 where none can."""
-    function = data[1] if len(data) > 1 else 0
-    if function & EXCEPTION:
-        return 5
-    if function in _COUNTED:
-        return 5 + sum(data[2:3])
-    return 8 if function in _ECHOING else 0
-
-
-def split_rtu(data: bytes, size_of: Callable[[bytes], int]) -> tuple[list[Adu], bytes]:
-    """Split bytes that were heard by CRCs and lengths; returns what is left, too.
-
-    size_of: `request_size` or `response_size`.
-    """
-    found: list[Adu] = []
-    start = 0
-    while start + _RTU_MIN <= len(data):
-        adu = checked(data, start, size_of(data[start:]))
-        if adu is None:
-            start += 1
-            continue
-        if start:
-            found.append(Adu(0, b"", raw=data[:start]))
-        found.append(adu)
-        start, data = 0, data[start + len(adu.raw) :]
-    if len(data) >= max(_RTU_MIN, size_of(data)):  # it cannot become an ADU
-        return [*found, Adu(0, b"", raw=data)], b""
-    return found, data
-
-
-def response_form(pdu: bytes) -> tuple[bytes, int]:
-    """Return the first bytes of the response to a PDU that reads or writes registers; its size."""
-    if pdu[0] == WRITE:
-        return pdu[:5], 5
-    count = int.from_bytes(pdu[3:5], "big")
-    return bytes([pdu[0], 2 * count % 256]), 2 + 2 * count
-
-
-@dataclass(frozen=True)
-class RequestAdu:
-    """A request to one unit: its frame, and what identifies its response.
-
-    transaction: of a TCP frame, 0 for RTU; head: the first bytes of the PDU of the response; size
-    of that PDU [bytes].
-    """
-
-    unit: int
-    transaction: int
-    frame: bytes
-    head: bytes
-    size: int
-
-
-@dataclass(frozen=True)
-class ModbusResponse:
-    """A response: registers read, or the code of an exception."""
-
-    registers: tuple[int, ...] = ()
-    exception: int = 0
-
-
-def build_adu(
-    unit: int, transaction: int, address: int, transfer: int | Sequence[int], *, is_rtu: bool
-) -> RequestAdu:
-    """Build the request of registers from an address on: how many to read, or those to write."""
-    pdu = read_pdu(address, transfer) if isinstance(transfer, int) else write_pdu(address, transfer)
-    frame = framed(unit, pdu, transaction, is_rtu=is_rtu)
-    return RequestAdu(unit, transaction, frame, *response_form(pdu))
-
-
-class ResponseReader:
-    """Finds the response to a request in the received bytes, and counts everything else.
-
-    A response has the unit, function and length of the request, over TCP its transaction number,
-    over RTU a valid CRC, and echoes address and count of a write. unawaited: transactions whose
-    responses are passed over.
-    """
-
-    def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
-        self._is_rtu = is_rtu
-        self._counters = counters
-        self._buffer = self._request = b""
-        self.unawaited: set[int] = set()
-
-    def clear(self) -> None:
-        """Discard partial data."""
-        if self._buffer:
-            self._count_invalid(self._buffer)
-        self._buffer = b""
-
-    def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
-        """Return the responses to a request in these bytes; to: None without a request."""
-        self._buffer += data
-        self._request = b"" if to is None else to.frame
-        responses = []
-        for adu in self._split(to):
-            if not adu.pdu:
-                self._count_invalid(adu.raw)
-                continue
-            self._counters.frames_in += 1
-            if adu.transaction in self.unawaited:
-                self.unawaited.remove(adu.transaction)
-                continue
-            response = None
-            if to is not None and (adu.transaction, adu.unit) == (to.transaction, to.unit):
-                response = _response(adu.pdu, to)
-            if response is None:
-                self._counters.unexpected_frames += 1
-                number = "" if self._is_rtu else f"transaction {adu.transaction}, "
-                self._counters.remark = (
-                    f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
-                    "not of this request: check the unit, that a gateway repeats unit and "
-                    "transaction, and that nothing delays responses"
-                )
-            else:
-                responses.append(response)
-        return responses
-
-    def _split(self, to: RequestAdu | None) -> list[Adu]:
-        if self._is_rtu:
-            return [*iter(partial(self._next_rtu, to), None)]
-        found, self._buffer = split_tcp(self._buffer)
-        return found
-
-    def _next_rtu(self, to: RequestAdu | None) -> Adu | None:
-        for start in range(len(self._buffer) - 4):
-            adu = checked(self._buffer, start, self._rtu_size(start, to))
-            if adu is not None:
-                if start:
-                    self._count_invalid(self._buffer[:start])
-                self._buffer = self._buffer[start + len(adu.raw) :]
-                return adu
-        if len(self._buffer) > 2 * RTU_MAX:
-            self.clear()
-        return None
-
-    def _count_invalid(self, data: bytes) -> None:
-        self._counters.invalid_frames += 1
-        what = f"{len(data)} bytes that are no valid frame came ({data[:8].hex(' ')})"
-        if data == self._request:
-            what = "the request itself came back, and nothing else"
-        self._counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
-
-    def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
-        """Return the length of a frame that begins here; 0 if none can.
-
-        After invalid bytes only the response itself is accepted, since any bytes may look like the
-        frame of another unit.
-        """
-        size = response_size(self._buffer[start:])
-        if not start:
-            return size
-        unit, function = self._buffer[start : start + 2]
-        if to is None or unit != to.unit or function & ~EXCEPTION != to.head[0]:
-            return 0
-        return size if function not in _COUNTED or size == to.size + 3 else 0
-
-
-def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
-    """Decode a PDU as the response to a request; None if it is not."""
-    if len(pdu) == 2 and pdu[0] == to.head[0] | EXCEPTION and pdu[1]:
-        return ModbusResponse(exception=pdu[1])
-    if len(pdu) != to.size or not pdu.startswith(to.head):
-        return None
-    values = pdu[len(to.head) :]
-    return ModbusResponse(struct.unpack(f">{len(values) // 2}H", values))
+def unpack_identity(registers: Sequence[int]) -> Values:
+    """Read the registers of an identity; raises Refusal."""
+    raw = struct.pack(f">{len(registers)}H", *registers)
+    identity: Values = {"versions": registers[1]}
+    for number, field in enumerate(TEXTS):
+        text = raw[4 + number * TEXT_MAX :][:TEXT_MAX].rstrip(b"\0")
+        field.read(text, len(text), identity)
+    return identity

@@ -1,30 +1,47 @@
 """The host's side of Modbus, RTU and TCP: a message is written, then its reply is read.
 
-Message n is written from register 256 n on (tag, words), its reply read from 256 n + 128 on (tag,
-result, words). Responses are matched by the transaction number over TCP, by unit, function and
-length over RTU, and by the tag.
+modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT. Responses are matched by
+the transaction number over TCP, by unit, function and length over RTU, and by the tag. RTU goes
+over a port that keeps the line silent before each frame.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import asyncio
+import contextlib
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import final
 
 from drivers.counters import WireCounters
+from drivers.errors import LinkError
+from drivers.ports.port import Port
+from drivers.ports.serial_port import open_port
+from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
+from drivers.protocol.timing import BOOT_TIME
+from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
+from drivers.wires.address import PortAbove, WireAddress
 from drivers.wires.modbus.frames import (
-    WRITE,
-    ModbusResponse,
-    RequestAdu,
-    ResponseReader,
-    build_adu,
-)
-from drivers.wires.modbus.registers import (
     BOX,
+    ECHO_SIZE,
     EXCEPTIONS,
     HEAD,
     IDENTITY,
     IDENTITY_COUNT,
+    READ_SIZE,
     REPLY,
+    RESPONSE_SIZE,
+    RTU,
+    TCP,
+    WRITE,
+    WRITE_SIZE,
+    AduReader,
+    Message,
+    Read,
+    Response,
+    Write,
+    response_to,
     unpack_identity,
 )
 from drivers.wires.wire import (
@@ -40,24 +57,24 @@ from drivers.wires.wire import (
     reply_words,
 )
 
-_WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
-_FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
-_HEADER_SIZE = 7  # bytes on TCP of a frame beside its PDU
-_ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
 _SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
+_FRAME_MAX = 256  # bytes
 _NO_SUCH_REGISTERS = (1, 2, 3, 4)
 _GATEWAY = {10: "path to", 11: "response of"}
+_RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
+_TCP_CHECKS = "that the server speaks Modbus TCP; of RTU the URL is modbus+rtu://HOST:PORT#UNIT"
 
 
 @dataclass(slots=True)
 class _Request:
-    """A request and its transaction on the wire; tag: 0 for one that only reads."""
+    """A request of a name and its transaction on the wire; tag: 0 for one that only reads."""
 
     name: str
     tag: int
-    adu: RequestAdu
+    message: Message
+    frame: bytes
 
 
 class ModbusWire(Wire):
@@ -74,8 +91,11 @@ class ModbusWire(Wire):
         self._is_rtu = is_rtu
         self._number = number
         self._request: _Request | None = None
-        self._replied: tuple[RequestAdu, ModbusResponse] | None = None  # the last reply
-        self._reader = ResponseReader(is_rtu=is_rtu, counters=self.counters)
+        self._last: _Request | None = None  # that was replied to, and how
+        self._replied = Response()
+        self._reader = AduReader(is_rtu=is_rtu, of_requests=False, is_host=True)
+        self._damaged = b""  # behind the last valid frame
+        self._unawaited: set[int] = set()  # transactions whose responses are passed over
         self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
 
     def request(self, address: int, name: str, values: Values) -> bytes:
@@ -83,84 +103,121 @@ class ModbusWire(Wire):
 
         Over TCP a request of all is a frame to each unit that was sent something before.
         """
-        self._request = self._replied = None
+        self._request = self._last = None
         if address == BROADCAST:
             if self._is_rtu:
-                return self._written(BROADCAST, name, values).adu.frame
-            adus = [self._written(unit, name, values).adu for unit in self._sizes]
-            self._reader.unawaited = {adu.transaction for adu in adus}
-            if self._baud and adus:  # a gateway sends a write once the one before was replied to
-                echo = self._time(adus[0].size + _FRAME_SIZE) + self.silence + REACTION
-                self.takes += (len(adus) - 1) * (self.takes + echo)
-            return b"".join(adu.frame for adu in adus)
+                return self._written(BROADCAST, name, values).frame
+            sent = [self._written(unit, name, values) for unit in self._sizes]
+            self._unawaited = {each.message.transaction_id for each in sent}
+            if self._baud and sent:  # a gateway sends a write once the one before was replied to
+                echo = self._time(ECHO_SIZE) + self.silence + REACTION
+                self.takes += (len(sent) - 1) * (self.takes + echo)
+            return b"".join(each.frame for each in sent)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
-            self._request = _Request(name, 0, self._adu(address, IDENTITY, IDENTITY_COUNT))
+            message = Read(dev_id=address, address=IDENTITY, count=IDENTITY_COUNT)
+            self._request = self._sent(name, 0, message)
         else:
             self._request = self._written(address, name, values)
-        return self._request.adu.frame
+        return self._request.frame
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""
-        adu = None
-        if self._request is not None:
-            adu = self._request.adu
-        elif self._replied is not None:
-            adu = self._replied[0]
+        request = self._request or self._last
+        sent = None if request is None else request.message
         arrivals: list[Arrival] = []
-        for response in self._reader.feed(data, adu):
-            if self._request is None or self._request.adu is not adu:  # a second response
+        for adu in self._reader.feed(data, sent):
+            if not adu.pdu:
+                self._count_damaged(adu.raw)
+                continue
+            self._damaged = b""
+            self.counters.frames_in += 1
+            if adu.transaction in self._unawaited:
+                self._unawaited.remove(adu.transaction)
+                continue
+            response = response_to(sent, adu)
+            if request is None or response is None:
                 self.counters.unexpected_frames += 1
-                if self._replied is not None and self._replied != (adu, response):
-                    arrivals.append(Several(self._replied[0].unit))
-            elif (arrival := self._arrival(self._request, response)) is not None:
+                number = "" if self._is_rtu else f"transaction {adu.transaction}, "
+                self.counters.remark = (
+                    f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
+                    "not of this request: check the unit, that a gateway repeats unit and "
+                    "transaction, and that nothing delays responses"
+                )
+            elif self._request is not request:  # a second response
+                self.counters.unexpected_frames += 1
+                if self._last is request and self._replied != response:
+                    arrivals.append(Several(adu.unit))
+            elif request.message.function_code == WRITE and not response.exception:
+                first = MESSAGES[request.name].number * BOX + REPLY
+                count = HEAD + reply_words(request.name, *self._sizes[adu.unit])
+                read = Read(dev_id=adu.unit, address=first, count=count)
+                self._request = self._sent(request.name, request.tag, read)
+                arrivals.append(More(self._request.frame))
+            elif (arrival := self._arrival(request, response)) is not None:
                 arrivals.append(arrival)
         return arrivals
 
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
-        self._request = None
-        self._reader.clear()  # a damaged length would take the next responses
+        for adu in self._reader.end():  # a damaged length would take the next responses
+            self._count_damaged(adu.raw)
+        self._request, self._damaged = None, b""
 
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]: its write."""
-        return self._time(_WRITE_SIZE + 2 * (1 + words)) + self.silence
+        return self._time(WRITE_SIZE + 2 * (1 + words)) + self.silence
 
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and a reply of so many words take [s]; 0 over a network.
 
         Two transactions, with the silences before all four frames.
         """
-        rest = self._time(_ANSWERS_SIZE + 2 * (HEAD + reply))
+        rest = self._time(ECHO_SIZE + READ_SIZE + RESPONSE_SIZE + 2 * (HEAD + reply))
         return self.transit(words) + rest + 3 * self.silence
 
     def _time(self, characters: int) -> float:
         return _BITS * characters / self._baud if self._baud else 0.0
 
-    def _adu(self, unit: int, address: int, transfer: int | Sequence[int]) -> RequestAdu:
+    def _sent(self, name: str, tag: int, message: Message) -> _Request:
+        """Return a request with its frame, under the next transaction number."""
         self._number = self._number % 0xFFFF + 1
-        self._reader.unawaited.discard(self._number)
+        self._unawaited.discard(self._number)
         self.counters.frames_out += 1
-        transaction = 0 if self._is_rtu else self._number
-        adu = build_adu(unit, transaction, address, transfer, is_rtu=self._is_rtu)
-        size = len(adu.frame) - (0 if self._is_rtu else _HEADER_SIZE - _FRAME_SIZE)
-        self.takes = self._time(size) + self.silence
+        is_write = message.function_code == WRITE
+        if self._baud:
+            size = WRITE_SIZE + 2 * message.count if is_write else READ_SIZE
+            self.takes = self._time(size) + self.silence
         if self._is_rtu:
-            self.busy = self.takes + self._time(adu.size + _FRAME_SIZE) + self.silence
-        return adu
+            size = ECHO_SIZE if is_write else RESPONSE_SIZE + 2 * message.count
+            self.busy = self.takes + self._time(size) + self.silence
+            return _Request(name, tag, message, RTU.buildFrame(message))
+        message.transaction_id = self._number
+        return _Request(name, tag, message, TCP.buildFrame(message))
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request whose write goes first."""
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
-        registers = (tag, *message.request.append([], values))
-        return _Request(name, tag, self._adu(unit, message.number * BOX, registers))
+        registers = message.request.append([tag], values)
+        write = Write(dev_id=unit, address=message.number * BOX, registers=registers)
+        return self._sent(name, tag, write)
 
-    def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
+    def _count_damaged(self, data: bytes) -> None:
+        """Count bytes that are no frame, once between two frames."""
+        self.counters.invalid_frames += not self._damaged
+        self._damaged += data
+        what = f"{len(self._damaged)} bytes that are no valid frame came "
+        what += f"({self._damaged[:8].hex(' ')})"
+        if self._request is not None and self._damaged == self._request.frame:
+            what = "the request itself came back, and nothing else"
+        self.counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
+
+    def _arrival(self, request: _Request, response: Response) -> Arrival | None:
         """Return what a response to the transaction on the wire means."""
         if response.exception in _GATEWAY:  # as no response
             self.counters.remark = (
-                f"the gateway has no {_GATEWAY[response.exception]} unit {request.adu.unit} "
+                f"the gateway has no {_GATEWAY[response.exception]} unit {request.message.dev_id} "
                 f"(exception {response.exception}): check the unit, its supply and its line"
             )
             return None
@@ -168,25 +225,19 @@ class ModbusWire(Wire):
             self._request = None
             if request.name == "Hello" and response.exception in _NO_SUCH_REGISTERS:
                 return Broken(
-                    f"unit {request.adu.unit} is no amplifier of this protocol: its identity "
+                    f"unit {request.message.dev_id} is no amplifier of this protocol: its identity "
                     f"cannot be read (Modbus exception {response.exception}); check address and "
                     "unit"
                 )
             if (refusal := EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
-        unit = request.adu.unit
-        if request.adu.head[0] == WRITE:
-            first = MESSAGES[request.name].number * BOX + REPLY
-            count = HEAD + reply_words(request.name, *self._sizes[unit])
-            request.adu = self._adu(unit, first, count)
-            return More(request.adu.frame)
         tag, result, *words = response.registers
         if request.name != "Hello" and tag != request.tag:
             self.counters.unexpected_frames += 1
             self.counters.remark = "a reply to another master came: end that one"
             return None
-        self._request, self._replied = None, (request.adu, response)
+        self._request, self._last, self._replied = None, request, response
         try:
             if request.name == "Hello":
                 return Reply(unpack_identity(response.registers))
@@ -196,5 +247,119 @@ class ModbusWire(Wire):
         except Refusal as error:
             return Broken(str(error))
         if request.name == "GetCaps":
-            self._sizes[unit] = values["channels"], values["layers"]
+            self._sizes[request.message.dev_id] = values["channels"], values["layers"]
         return Reply(values)
+
+
+_TO_ALL = b"\0"
+
+
+@final
+class SilentPort(PortAbove):
+    """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
+
+    byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
+    other one, so that noise does not keep a stop waiting, but always for one of its own.
+    Of those that wait a newer one replaces the older: its request was given up. Broadcasts stay,
+    which have no reply to wait for.
+    """
+
+    def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
+        self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
+        self._loop = asyncio.get_running_loop()
+        self._free_from = self._loop.time() + silence
+        self._sent_until = 0.0  # s; the end of the last frame of its own, and silence
+        self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
+        self._timer: asyncio.TimerHandle | None = None
+
+    def write(self, data: bytes) -> None:
+        """Send a frame as soon as the line was silent; raises LinkError."""
+        latest = self._loop.time() + _FRAME_MAX * self._byte_time + self._silence
+        kept = [each for each in self._waiting if each[1].startswith(_TO_ALL)]
+        self._waiting = [*kept, (latest, data)]
+        self._send()
+
+    def close(self) -> None:
+        """Close it; what waits is not sent."""
+        self._waiting.clear()
+        super().close()
+
+    def received(self, data: bytes) -> None:
+        """Take what was received, and count it as noise on the line."""
+        self._free_from = max(self._free_from, self._loop.time() + self._silence)
+        self._on_data(data)
+
+    def _send(self) -> None:
+        """Send what may go now; the timer sends the rest."""
+        while self._waiting:
+            latest, frame = self._waiting[0]
+            due = max(self._sent_until, min(self._free_from, latest))
+            now = self._loop.time()
+            if now < due:
+                if self._timer is None:
+                    self._timer = self._loop.call_at(due, self._due)
+                return
+            del self._waiting[0]
+            self._sent_until = now + len(frame) * self._byte_time + self._silence
+            self._free_from = max(self._free_from, self._sent_until)
+            self.below.write(frame)
+
+    def _due(self) -> None:
+        self._timer = None
+        with contextlib.suppress(LinkError):  # the loss of the port is reported by itself
+            self._send()
+
+
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, that of its line)"
+_RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"
+_TCP_PORT = 502
+_PARITIES = {"even": "E", "odd": "O", "none": "N"}
+
+
+class ModbusAddress(WireAddress):
+    """A unit over TCP, on a serial port of this machine, or behind a serial server."""
+
+    def __init__(self, url: str) -> None:
+        self._is_rtu = url.lower().startswith("modbus+rtu")
+        if self._is_rtu:
+            parsed = AmplifierUrl(url, _RTU_FORM, known=("baud", "parity", "stop"))
+            number = "unit must be given as #{}"
+            place = parsed.server(number=number) if parsed.place else parsed.device(RTU_BAUD)
+            unit = parsed.number
+        else:
+            parsed = AmplifierUrl(url, _TCP_FORM, known=("baud",))
+            parsed.require(
+                not parsed.number, f"unit must be given as /{parsed.number} behind the host"
+            )
+            place, unit = parsed.server(port=_TCP_PORT), parsed.path.strip("/")
+        parity = parsed.options.get("parity", "even")
+        parsed.require(
+            parity in _PARITIES, f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}"
+        )
+        stop = parsed.whole_option("stop", 1, 2)
+        self.place = replace(place, parity=_PARITIES[parity], stop=stop)
+        self.number = parsed.whole(unit, "unit", ADDRESS_MAX) if unit else ADDRESS
+        self.line = self.place.name
+        self.boot_time = BOOT_TIME if self._is_rtu else 0.0
+        self.settings = {
+            "protocol": "Modbus RTU" if self._is_rtu else "Modbus TCP",
+            "baud": self.place.baud,
+            "parity": self.place.parity,
+            "stop": self.place.stop,
+        }
+
+    def make_wire(self) -> ModbusWire:
+        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        delay = 0.0 if self.place.device else NETWORK_DELAY
+        number = random.getrandbits(16)
+        return ModbusWire(self.place.baud, is_rtu=self._is_rtu, number=number, delay=delay)
+
+    async def open_port(
+        self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> Port:
+        """Open the port; raises LinkError."""
+        if not self.place.device:
+            return await open_port(self.place, on_data, on_loss)
+        port = SilentPort(self.make_wire().silence, self.place.byte_time, on_data)
+        port.below = await open_port(self.place, port.received, on_loss)
+        return port

@@ -8,7 +8,7 @@ import pytest
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import Message, Reply, Request
 from drivers.judge.watching.watched_wire import DECODERS
-from drivers.wires.modbus.crc import crc16
+from drivers.wires.modbus.frames import framed
 
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:
@@ -36,7 +36,8 @@ def tcp(number: int, pdu: str) -> bytes:
 
 def rtu(adu: str) -> bytes:
     """Return an ADU of RTU with its checksum."""
-    return bytes.fromhex(adu) + crc16(bytes.fromhex(adu))
+    unit, *pdu = bytes.fromhex(adu)
+    return framed(unit, bytes(pdu), is_rtu=True)
 
 
 Heard = tuple[str, bytes, str, dict[str, Any]]

@@ -1,54 +1,43 @@
-"""The amplifiers' side of Modbus in protocol 3: registers, exceptions, and masters not ours."""
+"""The amplifiers' side of Modbus in protocol 3, driven by masters that are not ours."""
 
 import asyncio
-import os
-import tty
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing
 
-import minimalmodbus
 import pytest
 
-from drivers.protocol.table import STATES
+from foreign_masters import MASTERS, drive
+from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-
-STATUS = 256 * 9 + 128
-
-
-def drive(master: minimalmodbus.Instrument) -> None:
-    """Identity, status, arm, a set of one tone, a refusal, stop; every function it has."""
-    assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
-    assert master.read_register(STATUS + 2, functioncode=3) == STATES["SWITCH_ON_DISABLED"]
-    assert master.read_register(STATUS + 7, 1, functioncode=4, signed=True) == 25.0
-    master.write_registers(0x300, [1, 9, 2000])
-    master.write_registers(0x500, [2, 9, 7, 3, 1, 0, 0, 0x30, 2200, 2000, 0])
-    assert master.read_registers(0x580, 5) == [2, 0, 7, 5, 0]
-    levels = STATUS + 2 + 9
-    assert master.read_registers(levels, 4, functioncode=4) == [0, 0, 0, 2000]
-    assert master.read_register(STATUS + 2 + 7) == 7
-    with pytest.raises(minimalmodbus.IllegalRequestError):
-        master.write_register(0x900, 1, functioncode=6)
-    master.write_registers(0x800, [3, 0])
-    assert master.read_registers(levels, 4) == [0, 0, 0, 0]
+from sim.transport.pseudo_terminal import make_terminal
 
 
-async def test_minimalmodbus_drives_it_over_a_serial_line() -> None:
-    """A master that is not ours, through a pseudo-terminal."""
-    loop = asyncio.get_running_loop()
-    ours, theirs = os.openpty()
-    try:
-        tty.setraw(theirs)
-        end = ModbusAmplifiers(
-            {1: Amplifier("a", channels=4)}, lambda data: os.write(ours, data) and None, is_rtu=True
-        )
-        loop.add_reader(ours, lambda: end.receive(os.read(ours, 4096), loop.time()))
-        master = minimalmodbus.Instrument(os.ttyname(theirs), 1)
-        assert master.serial is not None
-        master.serial.timeout = 0.5  # s; it waits so long for the rest of what is an exception
-        try:
-            await asyncio.to_thread(drive, master)
-        finally:
-            master.serial.close()
-    finally:
-        loop.remove_reader(ours)
-        os.close(ours)
-        os.close(theirs)
+@asynccontextmanager
+async def served(line: str) -> AsyncIterator[str]:
+    """An amplifier of four channels as unit 1 on a pseudo-terminal or a TCP port; its URL."""
+    amplifiers = {1: Amplifier("a", channels=4)}
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
+        while data := await reader.read(4096):
+            end.receive(data, clock.now())
+        writer.close()
+
+    if line == "tcp":
+        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+            yield f"modbus+tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}/1"
+        return
+    terminal = make_terminal(lambda data: end.receive(data, clock.now()))
+    end = ModbusAmplifiers(amplifiers, terminal.write, is_rtu=True)
+    with closing(terminal):
+        terminal.listen()
+        yield f"modbus+rtu://{terminal.port}#1"
+
+
+@pytest.mark.parametrize("name", MASTERS)
+async def test_foreign_master_drives_it(name: str) -> None:
+    """Reads by both functions, writes, a set, and an exception, over a real line."""
+    line, make = MASTERS[name]
+    async with served(line) as url:
+        assert await asyncio.to_thread(drive, make, url) == "era-haptics"

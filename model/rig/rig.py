@@ -1,12 +1,13 @@
-"""A rig: a plate, its ERAs, and the amplifier channel of each ERA."""
+"""A rig: a plate, its ERAs, the amplifier channel of each ERA; and what else must be the same."""
 
 import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Real
+from typing import Any
 
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -94,52 +95,97 @@ class Rig:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of all that decides what is felt; see `physics_fingerprint`."""
-        return physics_fingerprint(
-            self.plate, self.eras, self.masses, self.uncertainty, self.fingertip, self.threshold
-        )
+        """Fingerprint of all that decides what is felt; see `fingerprint_of`."""
+        return fingerprint_of(self)
 
 
-def physics_fingerprint(
-    plate: Plate,
-    eras: Sequence[Era],
-    masses: Sequence[PointLoad],
-    uncertainty: Uncertainty,
-    fingertip: Fingertip | None,
-    threshold: str,
-) -> str:
-    """SHA-256 over all that decides what fingers feel; not mesh or wiring.
+MAY_DIFFER = {
+    "Rig.mesh": "the discretisation error of its own mesh is part of a table",
+    "Rig.wiring": "where levels go, not what they do",
+    "Rig.amplifiers": "where levels go, not what they do",
+    "Rig.limits": "patterns are held to those of the rig in service, whenever they are played",
+    "Rig.outputs": "an amplifier that says otherwise is refused when it is opened",
+    "Rig.supports": "which of the masses have a name, not what they weigh",
+    "Rig.laminate": "all that is solved of it is in the plate",
+    "Material.name": "displayed only",
+}
+"""What a table's rig may have otherwise, by class and field, each with the reason.
 
-    Over plate, ERAs, masses, their uncertainty, and load, contact and thresholds of a finger. Rigs
-    with the same fingerprint share localization tables, also with other names of materials.
+Everything else, and so every new field, must be the same.
+"""
+
+
+PHYSICS = tuple(each.name for each in fields(Rig) if f"Rig.{each.name}" not in MAY_DIFFER)
+"""Fields of a rig that a table has, too."""
+
+
+def physics_of(of: object) -> dict[str, Any]:
+    """What must be the same of a rig and of a table for the same answers, as plain data.
+
+    of: a rig, or what has its PHYSICS. Fields by name, without those that are as empty as they are
+    by default: what was solved before there was such a field stays valid.
     """
-    numbers = asdict(plate)
-    del numbers["material"]["name"]
+    found = {name: _plain(getattr(of, name)) for name in PHYSICS}
     # A laminate is its layers; what it is like depends on the frequency.
-    if numbers["laminate"] is not None:
-        del numbers["material"], numbers["thickness"]
-    # Plates without layers or air, and as their theory has them, keep the fingerprint of a rig that
-    # has no such keys.
-    for key in ("laminate", "air_gap", "loss_exponent", "mode_deviations"):
-        if not numbers[key]:
-            del numbers[key]
-    for layer in numbers.get("laminate", {}).get("layers", ()):
-        del layer["material"]["name"]
-    # ERAs without gains have the fingerprint of a rig that has no such key.
-    held = [
-        {key: value for key, value in asdict(era).items() if key != "gains" or value}
-        for era in eras
+    if "laminate" in found["plate"]:
+        del found["plate"]["material"], found["plate"]["thickness"]
+    found["masses"].sort(key=canonical_json)
+    return found | {"fingertip_radius": FINGERTIP_RADIUS}
+
+
+def fingerprint_of(of: object) -> str:
+    """SHA-256 over all that decides what fingers feel, `physics_of` a rig or a table."""
+    return hashlib.sha256(canonical_json(physics_of(of)).encode()).hexdigest()
+
+
+def differences(of: object, rig: Rig) -> list[str]:
+    """Keys whose values, of a table, must be those of a rig and are not, but for rounding."""
+    own, rigs = (dict(_leaves(physics_of(each))) for each in (of, rig))
+    return [
+        f"{key} must be {_shown(rigs.get(key, 'left out'))}, got {_shown(own.get(key, 'none'))}"
+        for key in dict.fromkeys((*rigs, *own))
+        if not _is_same(rigs.get(key), own.get(key))
     ]
-    physics = {
-        "plate": numbers,
-        "eras": held,
-        "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
-        "uncertainty": asdict(uncertainty),
-        "fingertip": None if fingertip is None else asdict(fingertip),
-        "fingertip_radius": FINGERTIP_RADIUS,
-        "threshold": threshold,
+
+
+def _plain(value: object) -> Any:
+    """A value in mappings, lists, numbers and text, without what may differ and empty defaults."""
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    if not is_dataclass(value):
+        return value
+    own = {
+        each: getattr(value, each.name)
+        for each in fields(value)
+        if f"{type(value).__name__}.{each.name}" not in MAY_DIFFER
     }
-    return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
+    return {key.name: _plain(each) for key, each in own.items() if each or each != key.default}
+
+
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, object]]:
+    """Numbers and text within plain data by their keys; names of a list's entries, too."""
+    match value:
+        case dict():
+            for name, each in value.items():
+                yield from _leaves(each, f"{key}.{name}" if key else name)
+        case [{"name": _}, *_]:
+            yield key, ", ".join(each["name"] for each in value)
+            yield from _leaves({each["name"]: each for each in value}, key)
+        case list():
+            for number, each in enumerate(value):
+                yield from _leaves(each, f"{key}[{number}]")
+        case _:
+            yield key, value
+
+
+def _shown(value: object) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else f"{value}"
+
+
+def _is_same(one: object, other: object) -> bool:
+    if isinstance(one, Real) and isinstance(other, Real):
+        return math.isclose(one, other)
+    return one == other
 
 
 def canonical_json(value: object) -> str:

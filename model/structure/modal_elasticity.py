@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.errors import InputError
 from model.structure.plate import LOSS_FREQUENCY, Plate
 
 
@@ -113,6 +114,20 @@ class ModalElasticity:
         if self.dispersion is None:
             return np.asarray(1j * self.losses, dtype=complex)
         return np.asarray(1j * self.losses + self.dispersion.at(omega))
+
+
+def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
+    """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
+
+    What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
+    whose mass or stiffness does not go with them (`model.structure.plate.SCALED`).
+    """
+    if plate.unscaled and any(np.any(np.asarray(factor) != 1) for factor in factors):
+        raise InputError(
+            f"plate.{plate.unscaled[0]}: thickness and modulus must be those that were solved, "
+            "since this part does not scale with them; set uncertainty.thickness to 0, or solve "
+            "the plate for each thickness"
+        )
 
 
 def modal_receptance(

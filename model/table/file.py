@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from model.arguments import expect, expect_path, shown
+from model.arguments import expect, expect_path
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
@@ -23,6 +23,7 @@ from model.files.replacing import begins_with
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.rig.meshes import mesh_from_dict
+from model.rig.rig import Rig, differences
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Plate
@@ -33,7 +34,9 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
+
+_MAX_SHOWN = 3  # keys in which a table is of another rig
 
 # A table of the paper's plate has 0.3 MB.
 MAX_BYTES = 2 << 30
@@ -106,7 +109,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "mode": table.drive_mode,
         "plate": asdict(table.plate),
         "eras": [asdict(era) for era in table.eras],
-        "masses": [mass.numbers for mass in table.masses],
+        "masses": [asdict(mass) for mass in table.masses],
         "uncertainty": asdict(table.uncertainty),
         "fingertip": None if table.fingertip is None else asdict(table.fingertip),
         "threshold": table.threshold,
@@ -122,17 +125,15 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
     write_arrays(place, {"header": encoded, **arrays})
 
 
-def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
+def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable:
     """Read a table.
 
-    fingerprint: of the rig, if the table must be of its plate. Raises InputError for a missing,
-    damaged or foreign file.
+    rig: that it must be of, but for what may differ (`model.rig.rig.MAY_DIFFER`). Raises InputError
+    for a missing, damaged or foreign file, with the keys in which it is of another rig.
     """
     path = expect_path(path, what="path")
-    if fingerprint is not None and not isinstance(fingerprint, str):
-        raise InputError(
-            f"fingerprint must be text, got {shown(fingerprint)}; give rig.fingerprint"
-        )
+    if rig is not None:
+        expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     rebuild = f"build it again, with the options it had: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
@@ -169,11 +170,12 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         raise InputError(f"{path}: {error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
         raise InputError(f"{path}: fingerprint does not match the plate of the file; {rebuild}")
-    if fingerprint is not None and fingerprint != table.fingerprint:
+    if rig is not None and (different := differences(table, rig)):
+        more = len(different) - _MAX_SHOWN
         raise InputError(
-            f"{path}: fingerprint must be the rig's, {fingerprint[:12]}, got "
-            f"{table.fingerprint[:12]}, of another plate, uncertainty or fingertip; build it "
-            f"again: era table build RIG -o {path} {_options(table)}"
+            f"{path}: must be a table of this rig: {'; '.join(different[:_MAX_SHOWN])}"
+            f"{f'; and {more} more' if more > 0 else ''}; build it again: era table build RIG "
+            f"-o {path} {_options(table)}"
         )
     return table
 

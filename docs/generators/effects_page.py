@@ -13,7 +13,8 @@ from textwrap import dedent
 from typing import Any, Literal, get_args, get_origin
 
 from controller.effects.effect import Effect, effect_kind, effect_kinds
-from model.config.sections import Quantity, quantities
+from key_tables import bounds_in_words, quantities
+from model.config.sections import Quantity
 from model.config.units import COMMON_FACTORS
 
 
@@ -57,7 +58,7 @@ def _rows(kind: type[Effect]) -> Iterator[str]:
             f"`{kind.kind}.{name}`",
             quantity.dimension.unit if quantity else "",
             _default(field.default, quantity),
-            _bounds(quantity) if quantity else _choices(field.annotation),
+            bounds_in_words(quantity) if quantity else _choices(field.annotation),
             said[name],
         )
         yield f"| {' | '.join(cells)} |".replace("|  |", "| |")
@@ -91,15 +92,6 @@ def _default(value: Any, quantity: Quantity | None) -> str:
     units = COMMON_FACTORS[quantity.dimension.unit] if quantity.dimension.unit else {}
     forms = [f"{value:.7g}", *(f"{value / float(by):.7g} {unit}" for unit, by in units.items())]
     return min(forms, key=lambda form: (len(form.split()[0]), len(form)))
-
-
-def _bounds(quantity: Quantity) -> str:
-    """Every finite bound, in the words of the error."""
-    words = ("above", "at least", "at most", "below")
-    bounds = (quantity.above, quantity.at_least, quantity.at_most, quantity.below)
-    return ", ".join(
-        f"{word} {each:g}" for word, each in zip(words, bounds, strict=True) if abs(each) < 1e300
-    )
 
 
 def _choices(annotation: Any) -> str:

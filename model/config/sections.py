@@ -8,7 +8,6 @@ from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from model.config.document import MAX_PROBLEMS, ConfigError, Document, KeyPath, Problem, Value
@@ -68,18 +67,6 @@ class Quantity:
         unit = self.dimension.unit or "no unit"
         description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
         return {"type": ["number", "string"], "description": description}
-
-
-def quantities(field: FieldInfo) -> list[Quantity]:
-    """Every quantity within the type of a section's field, however deep."""
-
-    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
-        found = [part for part in metadata if isinstance(part, Quantity)]
-        for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
-            found += [part] if isinstance(part, Quantity) else within(part)
-        return found
-
-    return within(field.annotation, field.metadata)
 
 
 class Validation(Generic[SectionT]):

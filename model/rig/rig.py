@@ -22,6 +22,8 @@ from registry.suggestions import did_you_mean
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
 
+_MAX_SHOWN = 60  # characters of a value that differs
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -130,6 +132,8 @@ def physics_of(of: object) -> dict[str, Any]:
     if "laminate" in found["plate"]:
         del found["plate"]["material"], found["plate"]["thickness"]
     found["masses"].sort(key=canonical_json)
+    found["names of eras"] = [era["name"] for era in found["eras"]]
+    found["eras"] = {era["name"]: era for era in found["eras"]}
     return found | {"fingertip_radius": FINGERTIP_RADIUS}
 
 
@@ -140,12 +144,7 @@ def fingerprint_of(of: object) -> str:
 
 def differences(of: object, rig: Rig) -> list[str]:
     """Keys whose values, of a table, must be those of a rig and are not, but for rounding."""
-    own, rigs = (dict(_leaves(physics_of(each))) for each in (of, rig))
-    return [
-        f"{key} must be {_shown(rigs.get(key, 'left out'))}, got {_shown(own.get(key, 'none'))}"
-        for key in dict.fromkeys((*rigs, *own))
-        if not _is_same(rigs.get(key), own.get(key))
-    ]
+    return [*_differing("", physics_of(of), physics_of(rig))]
 
 
 def _plain(value: object) -> Any:
@@ -162,30 +161,20 @@ def _plain(value: object) -> Any:
     return {key.name: _plain(each) for key, each in own.items() if each or each != key.default}
 
 
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, object]]:
-    """Numbers and text within plain data by their keys; names of a list's entries, too."""
-    match value:
-        case dict():
-            for name, each in value.items():
-                yield from _leaves(each, f"{key}.{name}" if key else name)
-        case [{"name": _}, *_]:
-            yield key, ", ".join(each["name"] for each in value)
-            yield from _leaves({each["name"]: each for each in value}, key)
-        case list():
-            for number, each in enumerate(value):
-                yield from _leaves(each, f"{key}[{number}]")
-        case _:
-            yield key, value
-
-
-def _shown(value: object) -> str:
-    return f"{value:.10g}" if isinstance(value, float) else f"{value}"
-
-
-def _is_same(one: object, other: object) -> bool:
-    if isinstance(one, Real) and isinstance(other, Real):
-        return math.isclose(one, other)
-    return one == other
+def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
+    """Differences of plain data below a key; a list of another length differs as a whole."""
+    if isinstance(own, dict) and isinstance(rigs, dict):
+        for name in rigs | own:
+            yield from _differing(f"{key}.{name}".lstrip("."), own.get(name), rigs.get(name))
+    elif isinstance(own, list) and isinstance(rigs, list) and len(own) == len(rigs):
+        for number, pair in enumerate(zip(own, rigs, strict=True)):
+            yield from _differing(f"{key}[{number}]", *pair)
+    elif isinstance(own, float) and isinstance(rigs, float):
+        if not math.isclose(own, rigs):
+            yield f"{key} must be {rigs:.10g}, got {own:.10g}"
+    elif own != rigs:
+        wanted, got = (str(each)[:_MAX_SHOWN] for each in (rigs, own))
+        yield f"{key} must be {wanted}, got {got}"
 
 
 def canonical_json(value: object) -> str:

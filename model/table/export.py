@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import Complex64Array
-from model.config.sections import quantities
+from model.config.sections import Quantity
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
@@ -135,7 +135,8 @@ def _physics(table: LocalizationTable) -> dict[str, Any]:
         key: f"{key}_{unit.lower().replace(' ', '').replace('/', '_').replace('^', '')}"
         for section in (*_SECTIONS, FingertipSection)
         for key, field in section.model_fields.items()
-        for unit in {each.dimension.unit for each in quantities(field)} - {""}
+        for unit in (each.dimension.unit for each in field.metadata if isinstance(each, Quantity))
+        if unit
     } | _NAMES
     return {
         name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)

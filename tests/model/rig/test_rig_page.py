@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 import model
-from key_tables import bounds_in_words, key_rows
-from model.config.sections import quantities
+from key_tables import bounds_in_words, key_rows, quantities
 from model.config.units import quantity
 from model.rig.file import load_rig
 from model.rig.sections import (

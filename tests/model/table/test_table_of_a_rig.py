@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from pydantic.fields import FieldInfo
 
-from model.config.sections import Section, quantities
+from key_tables import quantities
+from model.config.sections import Section
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.rig import sections

@@ -13,7 +13,7 @@ from controller.effects.layout_check import raster
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, TouchSimulator
-from controller.loop.choice import Requested
+from controller.loop.chooser import Requested
 from controller.loop.content import Selection
 from controller.loop.intent import Target
 from controller.loop.table_query import fingers_of, requests_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.loop.choice import Chooser
+from controller.loop.chooser import Chooser
 from controller.loop.intent import Target
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser
+from controller.loop.chooser import Chooser
 from controller.loop.content import Selection, no_layer_free
 from controller.loop.intent import FADED_AFTER, IntentSource, Pulse
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder

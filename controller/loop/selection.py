@@ -11,7 +11,7 @@ from functools import partial
 
 from controller.loop.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
+from controller.loop.chooser import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
 from controller.loop.content import (
     BEING_CHOSEN,
     Prediction,

@@ -158,9 +158,7 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
     from model.finger.perception import FELT_DB_SL
-    from model.table.weak_cells import WANTED_CONTRAST_DB
-
-    wanted = f"{WANTED_CONTRAST_DB:g} dB"
+    from model.table.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -194,11 +192,12 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
         ("cells", f"{summary['cells']} ({summary['grid']})"),
         (
             "feasible cells",
-            f"{percent('feasible_share')} of {mapped} ({wanted} or more to the median finger)",
+            f"{percent('feasible_share')} of {mapped} ({WANTED_DB:g} dB or more to the median "
+            "finger)",
         ),
         (
             "weak cells",
-            f"{percent('weak_share')} of {mapped} (below {wanted} to one finger in ten)",
+            f"{percent('weak_share')} of {mapped} (below {WANTED_DB:g} dB to one finger in ten)",
         ),
         ("dead zones", f"{percent('dead_zone_share')} (below {FELT_DB_SL:g} dB SL at full stroke)"),
         ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),

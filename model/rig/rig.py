@@ -5,7 +5,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any
 
@@ -147,18 +147,20 @@ def differences(of: object, rig: Rig) -> list[str]:
     return [*_differing("", physics_of(of), physics_of(rig))]
 
 
-def _plain(value: object) -> Any:
-    """A value in mappings, lists, numbers and text, without what may differ and empty defaults."""
-    if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
-    if not is_dataclass(value):
-        return value
-    own = {
-        each: getattr(value, each.name)
-        for each in fields(value)
-        if f"{type(value).__name__}.{each.name}" not in MAY_DIFFER
-    }
-    return {key.name: _plain(each) for key, each in own.items() if each or each != key.default}
+def _plain(value: Any) -> Any:
+    """A value in mappings, lists, floats and text, without what may differ and empty defaults."""
+    match value:
+        case bool() | str() | None:
+            return value
+        case Real():
+            return float(value) + 0.0
+        case Mapping():
+            return {key: _plain(each) for key, each in value.items()}
+        case Iterable():
+            return [_plain(each) for each in value]
+    kept = [f for f in fields(value) if f"{type(value).__name__}.{f.name}" not in MAY_DIFFER]
+    own = [(each, getattr(value, each.name)) for each in kept]
+    return {each.name: _plain(held) for each, held in own if held or held != each.default}
 
 
 def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
@@ -179,18 +181,4 @@ def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
 
 def canonical_json(value: object) -> str:
     """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
-    return json.dumps(_with_floats(value), sort_keys=True, separators=(",", ":"))
-
-
-def _with_floats(value: object) -> object:
-    match value:
-        case bool() | str() | None:
-            return value
-        case Real():
-            return float(value) + 0.0
-        case Mapping():
-            return {key: _with_floats(each) for key, each in value.items()}
-        case Iterable():
-            return [_with_floats(each) for each in value]
-        case _:
-            raise TypeError(f"no plain data: {type(value).__name__}")
+    return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))

@@ -8,7 +8,7 @@ varies as a power of the frequency. Shapes stay those of the theory, and so do a
 Adhesives and air change the complex eigenvalues of modes with frequency: their dispersion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.plate import LOSS_FREQUENCY, SCALED, Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +122,16 @@ def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
     What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
     whose mass or stiffness does not go with them (`model.structure.plate.SCALED`).
     """
-    if plate.unscaled and any(np.any(np.asarray(factor) != 1) for factor in factors):
+    stays = [
+        each.name
+        for each in fields(plate)
+        if each.name not in SCALED and getattr(plate, each.name) != each.default
+    ]
+    if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(
-            f"plate.{plate.unscaled[0]}: thickness and modulus must be those that were solved, "
-            "since this part does not scale with them; set uncertainty.thickness to 0, or solve "
-            "the plate for each thickness"
+            f"plate.{stays[0]}: thickness and modulus must be those that were solved, since this "
+            "part does not scale with them; set uncertainty.thickness to 0, or solve the plate "
+            "for each thickness"
         )
 
 

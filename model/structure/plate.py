@@ -32,7 +32,7 @@ b = 1, and it is adiabatic. Holds while the gap is narrow compared with waves an
 import cmath
 import math
 from bisect import bisect_left
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from model.arguments import expect_between, expect_values
@@ -291,15 +291,6 @@ class Plate(Sheet):
             material=replace(self.material, E=modulus * self.material.E),
             thickness=thickness * self.thickness,
             laminate=laminate and laminate.scaled(modulus=modulus, thickness=thickness),
-        )
-
-    @property
-    def unscaled(self) -> tuple[str, ...]:
-        """Fields by which mass or stiffness do not go with thickness and modulus as SCALED says."""
-        return tuple(
-            each.name
-            for each in fields(self)
-            if each.name not in SCALED and getattr(self, each.name) != each.default
         )
 
     @property

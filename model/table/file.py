@@ -8,12 +8,13 @@ the content, so that a damaged or foreign file is refused before any of it is us
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+from pydantic_core import to_jsonable_python
 
 from model.arguments import expect, expect_path
 from model.drive_modes import DRIVE_MODES
@@ -23,10 +24,7 @@ from model.files.replacing import begins_with
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.rig.meshes import mesh_from_dict
-from model.rig.rig import Rig, differences
-from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import Era, Fingertip, PointLoad
-from model.structure.plate import Plate
+from model.rig.rig import PHYSICS, Rig, differences
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
 
@@ -82,18 +80,17 @@ class _Header(BaseModel):
     fingerprint: str
     sha256: str
     mode: str
-    plate: Plate
-    eras: tuple[Era, ...]
-    masses: tuple[PointLoad, ...]
-    uncertainty: Uncertainty
-    fingertip: Fingertip | None
-    threshold: str
     mesh: _Mesh
     reference_mesh: _Mesh
     discretisation_error: list[float]
     frequencies_hz: list[float]
     raster: Raster
     grid: Grid
+
+
+_OF_TABLE = get_type_hints(LocalizationTable)
+_PHYSICS: dict[str, Any] = {name: (_OF_TABLE[name], ...) for name in PHYSICS}
+_WholeHeader = create_model("_WholeHeader", __base__=_Header, **_PHYSICS)
 
 
 def save_table(table: LocalizationTable, path: Path | str) -> None:
@@ -107,12 +104,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
         "mode": table.drive_mode,
-        "plate": asdict(table.plate),
-        "eras": [asdict(era) for era in table.eras],
-        "masses": [asdict(mass) for mass in table.masses],
-        "uncertainty": asdict(table.uncertainty),
-        "fingertip": None if table.fingertip is None else asdict(table.fingertip),
-        "threshold": table.threshold,
+        **{name: to_jsonable_python(getattr(table, name)) for name in PHYSICS},
         "mesh": table.mesh.to_dict(),
         "reference_mesh": table.reference_mesh.to_dict(),
         "discretisation_error": table.discretisation_error.tolist(),
@@ -153,7 +145,7 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
         ) from error
     try:
         text = content.pop("header").tobytes()
-        header = _Header.model_validate_json(text)
+        header = _WholeHeader.model_validate_json(text)
     except ValidationError as error:
         where, said = first_problem(error)
         raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
@@ -203,15 +195,10 @@ def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     return digest_of(json.dumps(hashed, sort_keys=True), arrays)
 
 
-def _assemble(header: _Header, arrays: dict[str, NDArray[Any]]) -> LocalizationTable:
+def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
     """Build a table from checked entries; sizes must match and all numbers be finite."""
     table = LocalizationTable(
-        plate=header.plate,
-        eras=header.eras,
-        masses=header.masses,
-        uncertainty=header.uncertainty,
-        fingertip=header.fingertip,
-        threshold=header.threshold,
+        **{name: getattr(header, name) for name in PHYSICS},
         mesh=mesh_from_dict(header.mesh.model_dump()),
         reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
         discretisation_error=np.array(header.discretisation_error, dtype=float),

@@ -17,7 +17,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_together import Together, check_together, close_pairs, matrix_of
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.loop.choice import Chooser
+from controller.loop.chooser import Chooser
 from controller.loop.content import Prediction
 from controller.loop.intent import HapticIntent
 from controller.loop.selection import Selector

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Chooser
+from controller.loop.chooser import Chooser
 from controller.loop.content import Selection
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.joint_answer import query_jointly, unshaped

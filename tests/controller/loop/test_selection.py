@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.loop.choice import Chooser
+from controller.loop.chooser import Chooser
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.selection import Selector
 from controller.loop.table_query import strongest

@@ -85,8 +85,8 @@ class TableProblem:
             "format": FORMAT_VERSION,
             "numerics": NUMERICS_VERSION,
             "plate": self.rig.fingerprint,
-            "mesh": self.rig.mesh.to_dict(),
-            "reference_mesh": self.reference_mesh.to_dict(),  # follows from the rig's limits
+            "mesh": str(self.rig.mesh),
+            "reference_mesh": str(self.reference_mesh),  # follows from the rig's limits
             "grid": [self.grid.nx, self.grid.ny],
             "frequencies": self.frequencies.tolist(),
         }

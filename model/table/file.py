@@ -23,7 +23,7 @@ from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arr
 from model.files.replacing import begins_with
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
-from model.rig.meshes import mesh_from_dict
+from model.rig.meshes import parse_mesh
 from model.rig.rig import PHYSICS, Rig, differences
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
@@ -56,19 +56,6 @@ _DTYPES = {
 MAX_VALUE = 1e9
 
 
-class _Mesh(BaseModel):
-    """Header entry of a mesh."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    nx: int
-    ny: int
-    length: float
-    width: float
-    element: str
-    strip: float = 0.0
-
-
 class _Header(BaseModel):
     """JSON header."""
 
@@ -80,8 +67,8 @@ class _Header(BaseModel):
     fingerprint: str
     sha256: str
     mode: str
-    mesh: _Mesh
-    reference_mesh: _Mesh
+    mesh: str
+    reference_mesh: str
     discretisation_error: list[float]
     frequencies_hz: list[float]
     raster: Raster
@@ -105,8 +92,8 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "fingerprint": table.fingerprint,
         "mode": table.drive_mode,
         **{name: to_jsonable_python(getattr(table, name)) for name in PHYSICS},
-        "mesh": table.mesh.to_dict(),
-        "reference_mesh": table.reference_mesh.to_dict(),
+        "mesh": str(table.mesh),
+        "reference_mesh": str(table.reference_mesh),
         "discretisation_error": table.discretisation_error.tolist(),
         "frequencies_hz": table.frequencies.tolist(),
         "raster": asdict(table.raster),
@@ -197,10 +184,11 @@ def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
 
 def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
     """Build a table from checked entries; sizes must match and all numbers be finite."""
+    physics: dict[str, Any] = {name: getattr(header, name) for name in PHYSICS}
     table = LocalizationTable(
-        **{name: getattr(header, name) for name in PHYSICS},
-        mesh=mesh_from_dict(header.mesh.model_dump()),
-        reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
+        **physics,
+        mesh=parse_mesh(header.mesh, physics["plate"]),
+        reference_mesh=parse_mesh(header.reference_mesh, physics["plate"]),
         discretisation_error=np.array(header.discretisation_error, dtype=float),
         raster=header.raster,
         grid=header.grid,

@@ -19,7 +19,8 @@ def _identifier(text: str) -> str:
     return text
 
 
-def _url(text: str) -> str:
+def check_url(text: str) -> str:
+    """The URL of an amplifier; raises ValueError for other text."""
     if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[!-~]{0,250}", text):
         raise ValueError(
             "must be a URL, for example sim:// or serial:///dev/ttyUSB0?baud=921600, got "
@@ -28,7 +29,8 @@ def _url(text: str) -> str:
     return text
 
 
-def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+def check_ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    """The lower and the higher frequency [Hz]; raises ValueError for others."""
     low, high = bounds
     if low >= high:
         raise ValueError(f"must be the lower and the higher frequency, got {low:g} and {high:g} Hz")
@@ -54,7 +56,8 @@ def _rows(
     return AfterValidator(checked)
 
 
-def _threshold(name: str) -> str:
+def check_threshold(name: str) -> str:
+    """The name of a set of thresholds; raises ValueError for an unknown one."""
     if name not in THRESHOLDS:
         raise ValueError(
             f"unknown set of thresholds {name}; {did_you_mean(name, THRESHOLDS)}known are "
@@ -86,8 +89,3 @@ Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list
 Foot = Annotated[float, Quantity(LENGTH, at_least=0, at_most=0.2)]
 Thickness = Annotated[float, Quantity(LENGTH, at_least=1e-6, at_most=1)]
 Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
-Frequencies = Annotated[
-    tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(_ascending)
-]
-Url = Annotated[str, AfterValidator(_url)]
-Threshold = Annotated[str, AfterValidator(_threshold)]

@@ -8,11 +8,8 @@ from model.rig.sections import (
     FingertipSection,
     LimitsSection,
     MassSection,
-    MaterialSection,
     PlateSection,
-    UncertaintySection,
 )
-from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
@@ -37,7 +34,9 @@ def plate_of(section: PlateSection, *, frequency_max: float) -> Plate:
         return replace(plate, **stated)
     assert section.thickness is not None  # noqa: S101  see model.rig.checks
     assert section.material is not None  # noqa: S101
-    return Plate(thickness=section.thickness, material=_material(section.material), **stated)
+    return Plate(
+        thickness=section.thickness, material=Material(**section.material.model_dump()), **stated
+    )
 
 
 def laminate_of(section: PlateSection) -> Laminate | None:
@@ -46,7 +45,7 @@ def laminate_of(section: PlateSection) -> Laminate | None:
         return None
     layers = (
         Layer(
-            _material(layer.material),
+            Material(**layer.material.model_dump()),
             layer.thickness,
             loss_factor=layer.loss_factor or 0.0,
             by_frequency=tuple(layer.by_frequency or ()),
@@ -90,18 +89,9 @@ def limits_of(section: LimitsSection) -> GuardLimits:
     return GuardLimits(frequency_min=low, frequency_max=high, **given)
 
 
-def uncertainty_of(section: UncertaintySection) -> Uncertainty:
-    """The standard deviations of the rig's parameters."""
-    return Uncertainty(**section.model_dump())
-
-
 def fingertip_of(section: FingertipSection | str) -> Fingertip | None:
     """The load of a fingertip; None for weightless ones."""
     return None if isinstance(section, str) else Fingertip(**section.model_dump())
-
-
-def _material(section: MaterialSection) -> Material:
-    return Material(**section.model_dump())
 
 
 def _onto(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:

@@ -22,8 +22,6 @@ from registry.suggestions import did_you_mean
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
 
-_MAX_SHOWN = 60  # characters of a value that differs
-
 
 @dataclass(frozen=True)
 class Channel:
@@ -171,12 +169,8 @@ def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
     elif isinstance(own, list) and isinstance(rigs, list) and len(own) == len(rigs):
         for number, pair in enumerate(zip(own, rigs, strict=True)):
             yield from _differing(f"{key}[{number}]", *pair)
-    elif isinstance(own, float) and isinstance(rigs, float):
-        if not math.isclose(own, rigs):
-            yield f"{key} must be {rigs:.10g}, got {own:.10g}"
-    elif own != rigs:
-        wanted, got = (str(each)[:_MAX_SHOWN] for each in (rigs, own))
-        yield f"{key} must be {wanted}, got {got}"
+    elif own != rigs and not (type(own) is type(rigs) is float and math.isclose(own, rigs)):
+        yield f"{key} must be {rigs!s:.60}, got {own!s:.60}"
 
 
 def canonical_json(value: object) -> str:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -35,15 +36,16 @@ from model.rig.key_types import (
     MODES,
     MODULI,
     Foot,
-    Frequencies,
+    Frequency,
     GainRow,
     Identifier,
     ModeRow,
     Place,
     Side,
     Thickness,
-    Threshold,
-    Url,
+    check_ascending,
+    check_threshold,
+    check_url,
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.materials import material, material_names
@@ -263,7 +265,7 @@ class MassSection(Section):
 class AmplifierSection(Section):
     """An amplifier: its URL, and what its full level is."""
 
-    url: Url
+    url: Annotated[str, AfterValidator(check_url)]
     """How to reach it: `sim://`, `serial:///dev/ttyUSB0?baud=921600`.
 
     Limits: [`SCHEME://...`](urls.md)
@@ -345,7 +347,9 @@ class LimitsSection(Section):
     The default frequencies are those that skin feels well.
     """
 
-    frequency: Frequencies = (40.0, 500.0)
+    frequency: Annotated[
+        tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(check_ascending)
+    ] = (40.0, 500.0)
     """Lowest and highest mechanical frequency that may be driven."""
 
     level: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 1.0
@@ -422,7 +426,7 @@ class RigSection(Section):
     Limits: a mapping, or `none`
     """
 
-    threshold: Threshold = DEFAULT_THRESHOLD
+    threshold: Annotated[str, AfterValidator(check_threshold)] = DEFAULT_THRESHOLD
     """Set of detection thresholds to which levels in dB SL refer, see
     [people](../concepts/people.md#detection-thresholds).
 

@@ -75,8 +75,9 @@ class _Header(BaseModel):
     grid: Grid
 
 
-_OF_TABLE = get_type_hints(LocalizationTable)
-_PHYSICS: dict[str, Any] = {name: (_OF_TABLE[name], ...) for name in PHYSICS}
+_PHYSICS: dict[str, Any] = {
+    name: (kind, ...) for name, kind in get_type_hints(LocalizationTable).items() if name in PHYSICS
+}
 _WholeHeader = create_model("_WholeHeader", __base__=_Header, **_PHYSICS)
 
 

@@ -170,7 +170,8 @@ def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
         for number, pair in enumerate(zip(own, rigs, strict=True)):
             yield from _differing(f"{key}[{number}]", *pair)
     elif own != rigs and not (type(own) is type(rigs) is float and math.isclose(own, rigs)):
-        yield f"{key} must be {rigs!s:.60}, got {own!s:.60}"
+        wanted, got = (f"{each:.9g}" if type(each) is float else each for each in (rigs, own))
+        yield f"{key} must be {wanted!s:.60}, got {got!s:.60}"
 
 
 def canonical_json(value: object) -> str:

@@ -32,7 +32,7 @@ POINTS = np.array([[0.08, 0.06], [0.2, 0.15]])
 class Framed(Plate):
     """A plate with a mass [kg] along its edges, on the nodes of a mesh there."""
 
-    edge_mass: float = 0.0
+    frame_mass: float = 0.0
 
 
 def assemble_framed(plate: Plate, mesh: Mesh) -> PlateMatrices:
@@ -43,7 +43,7 @@ def assemble_framed(plate: Plate, mesh: Mesh) -> PlateMatrices:
     at_edge = np.isclose(mesh.nodes, 0) | np.isclose(mesh.nodes, [plate.length, plate.width])
     nodes = np.flatnonzero(at_edge.any(axis=1))
     frame = np.zeros(mesh.dof)
-    frame[3 * nodes] = plate.edge_mass / len(nodes)
+    frame[3 * nodes] = plate.frame_mass / len(nodes)
     return replace(found, mass=sparse.csc_array(found.mass + sparse.diags_array(frame)))
 
 
@@ -53,7 +53,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
     monkeypatch.setattr(finite_element_modes, "assemble", assemble_framed)
     plain = make_paper_rig(24, 18)
     own = {each.name: getattr(plain.plate, each.name) for each in fields(plain.plate)}
-    return replace(plain, plate=Framed(**own, edge_mass=FRAME))
+    return replace(plain, plate=Framed(**own, frame_mass=FRAME))
 
 
 def receptance(free: FreePlate, rig: Rig, thickness: float = 1.0) -> FloatArray:
@@ -69,7 +69,7 @@ def test_scaling_is_wrong_with_a_frame_alone(
     rig: Rig, frame: float, least: float, most: float
 ) -> None:
     """Against the plate solved anew 2 % thicker: the law that is refused is off by per cents."""
-    plate = replace(rig.plate, edge_mass=frame)
+    plate = replace(rig.plate, frame_mass=frame)
     solved = solve_free_plate(plate, rig.mesh)
     rigid_mode = solved.modes.shapes_at(POINTS)[:, 0]
     assert rigid_mode == pytest.approx((plate.mass + frame) ** -0.5)
@@ -78,26 +78,26 @@ def test_scaling_is_wrong_with_a_frame_alone(
     error = np.linalg.norm(scaled - exact) / np.linalg.norm(exact)
     assert least <= error <= most
     if frame:
-        with pytest.raises(InputError, match=r"plate\.edge_mass"):
+        with pytest.raises(InputError, match=r"plate\.frame_mass"):
             receptance(solved, rig, 1.02)
     np.testing.assert_allclose(receptance(solved, rig), receptance(solved, rig, 1.0))
 
 
 def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
     """Tables of an uncertain thickness, those that follow another, identification, calibration."""
-    with pytest.raises(InputError, match=r"plate\.edge_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass"):
         TableProblem(rig, FREQUENCIES, Grid(2, 2))
     known = replace(rig, uncertainty=Uncertainty.none())
     table = build_table(known, frequencies=FREQUENCIES[:2])
     assert table_following(table, known).plate == known.plate
-    with pytest.raises(InputError, match=r"plate\.edge_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass"):
         _ = replace(table, uncertainty=rig.uncertainty).attached
     for other in (
         rig.plate.scaled(thickness=1.001),
         rig.plate.scaled(modulus=1.001),
-        replace(rig.plate, edge_mass=2 * FRAME),
+        replace(rig.plate, frame_mass=2 * FRAME),
     ):
-        with pytest.raises(InputError, match=r"plate\.edge_mass"):
+        with pytest.raises(InputError, match=r"plate\.frame_mass"):
             table_following(table, replace(known, plate=other))
     free = solve_free_plate(rig.plate, rig.mesh)
     sensors = [Sensor("SW", era="SW")]
@@ -106,5 +106,5 @@ def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
     x = np.zeros(space.size)
     forward.at(x)
     x[space.index("thickness")] = 1.0
-    with pytest.raises(InputError, match=r"plate\.edge_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass"):
         forward.at(x)

@@ -11,17 +11,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from controller.loop.capabilities import PlaybackCapabilities, amplitudes_of
-from controller.loop.content import Content, Prediction, Selection, Targets, not_served
-from controller.loop.intent import Target
-from controller.loop.joint_answer import (
+from controller.play.capabilities import PlaybackCapabilities, amplitudes_of
+from controller.play.content import Content, Prediction, Selection, Targets, not_served
+from controller.play.intent import Target
+from controller.play.joint_answer import (
     LIMITS_LEAVE_NOTHING,
     Shape,
     query_jointly,
     unshaped,
 )
-from controller.loop.table_query import TableAnswer, query_table
-from controller.sources.contacts import Contact, ContactKey
+from controller.play.table_query import TableAnswer, query_table
+from controller.touch.contacts import Contact, ContactKey
 from model.choice import NEARLY
 from model.errors import InputError
 from model.finger.perception import decibels

@@ -18,7 +18,7 @@ from pydantic_core import to_jsonable_python
 
 from model.arguments import expect, expect_path
 from model.drive_modes import DRIVE_MODES
-from model.errors import InputError, first_problem
+from model.errors import InputError
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.files.replacing import begins_with
 from model.finger.grid import Grid
@@ -27,6 +27,7 @@ from model.rig.meshes import parse_mesh
 from model.rig.rig import PHYSICS, Rig, differences
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
+from registry.wording import first_problem
 
 FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"

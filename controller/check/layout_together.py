@@ -13,7 +13,7 @@ from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, TouchSimulator
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.play.choice import Requested
+from controller.play.chooser import Requested
 from controller.play.content import Selection
 from controller.play.intent import Target
 from controller.play.table_query import fingers_of, requests_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.choice import Chooser
+from controller.play.chooser import Chooser
 from controller.play.intent import Target
 from controller.play.table_query import TableAnswer, query_table
 from controller.touch.contacts import Contact, ContactKey

@@ -111,11 +111,14 @@ def _lines(each: "CheckedEffect") -> list[str]:
 
 def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
     """Format what fingers in every two regions are promised."""
+    from model.table.request import MIN_CONTRAST_DB, OWN_CONTRAST_DB
+
     width = max(map(len, names)) + 4
     lines = [
         "promised contrast of the worst finger in dB: below the diagonal in two regions at once, "
         "above it in three, with the worst third",
-        "(from 12 own, from 6 mixed, below shared or held back)",
+        f"(from {OWN_CONTRAST_DB:g} own, from {MIN_CONTRAST_DB:g} mixed, below shared or held "
+        "back)",
         f"{'':{width}}" + "".join(f"{number:6d}" for number in range(1, len(names) + 1)),
     ]
     for number, (name, row) in enumerate(zip(names, promised.tolist(), strict=True), start=1):

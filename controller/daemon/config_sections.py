@@ -9,7 +9,7 @@ from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO
 from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
-from model.rig.sections import Identifier
+from model.rig.key_types import Identifier
 
 _LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
 _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file

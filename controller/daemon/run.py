@@ -157,7 +157,7 @@ def _run(config: DaemonConfig, lock: SocketLock, *, log: LogThread, dashboard: s
 def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
     """Load the table named in the file; raises ConfigError with the line that names it."""
     try:
-        return load_table(file, fingerprint=config.rig.fingerprint)
+        return load_table(file, rig=config.rig)
     except InputError as error:
         document = read_document(config.source)
         problem = document.problem(("table",), str(error))

@@ -17,7 +17,7 @@ from model.config.units import TIME
 
 
 class Buzz(Effect):
-    """A steady vibration, as long as the finger stays or for a duration."""
+    """As long as the finger stays, or for a duration."""
 
     kind: ClassVar[str] = "buzz"
     is_for_motion: ClassVar[bool] = False
@@ -25,7 +25,10 @@ class Buzz(Effect):
     duration: (
         Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None
     ) = None
+    """None: as long as the finger stays."""
+
     modulation: Modulation = None
+    """How often a second it comes and goes; none: steady."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a steady vibration."""

@@ -52,7 +52,7 @@ class Notches:
 
 
 class Detents(Effect):
-    """A click at each of the detents that lie `spacing` apart along x or y of the plate.
+    """A click at each detent that the finger passes along x or y.
 
     The finger comes down halfway between two of them.
     """
@@ -61,8 +61,13 @@ class Detents(Effect):
     is_for_motion: ClassVar[bool] = True
 
     spacing: Annotated[float, Quantity(LENGTH, at_least=0.002, at_most=0.2)] = 0.010
+    """Distance between detents."""
+
     along: Literal["x", "y"] = "x"
+    """Direction in which they are spaced."""
+
     duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    """Of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start halfway between two detents."""

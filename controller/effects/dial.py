@@ -18,7 +18,7 @@ _CENTRE_RADIUS = 0.006
 
 
 class Dial(Effect):
-    """A click at each of the detents that lie `spacing` apart in angle about a region's centre.
+    """A click at each detent that the finger passes in angle about the centre of its region.
 
     The finger comes down halfway between two of them. Near the centre it turns nothing.
     """
@@ -28,7 +28,10 @@ class Dial(Effect):
     needs_region: ClassVar[bool] = True
 
     spacing: Annotated[float, Quantity(ANGLE, at_least=0.05, at_most=3.2)] = _DEGREES_15
+    """Angle between detents."""
+
     duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    """Of each click."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start outside of all regions: nothing is felt."""

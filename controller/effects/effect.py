@@ -121,15 +121,11 @@ class SteadyRun(EffectRun):
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
         """Return the level until the end of the pulse."""
-        if self.pulse is None:
-            return Sensation(self.level_db_sl, modulation_hz=self.modulation_hz)
-        if now >= self.pulse.end:
+        end = None if self.pulse is None else self.pulse.end
+        if end is not None and now >= end:
             return None
         return Sensation(
-            self.level_db_sl,
-            until=self.pulse.end,
-            pulse=self.pulse,
-            modulation_hz=self.modulation_hz,
+            self.level_db_sl, until=end, pulse=self.pulse, modulation_hz=self.modulation_hz
         )
 
 

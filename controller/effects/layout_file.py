@@ -16,7 +16,7 @@ from model.config.sections import Section, Validation
 from model.config.shapes import ShapedSection
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
-from model.rig.sections import Identifier
+from model.rig.key_types import Identifier
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 

@@ -24,14 +24,19 @@ RAMP_STEP_DB = 2.0
 
 
 class Ramp(Effect):
-    """A level that rises or falls to another, then ends, or is held while the finger stays."""
+    """From one level to another in steps of 2 dB; then over, or held at the last."""
 
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False
 
     start_level: Annotated[float, Quantity(RATIO, at_least=MIN_DB_SL, at_most=MAX_DB_SL)] = 6.0
+    """First level, in dB SL; the last is `level`."""
+
     duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0
+    """From the first level to the last."""
+
     hold: bool = False
+    """Whether it holds the last level."""
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start at the first level, in steps of 2 dB, or larger ones where these are too short."""

@@ -33,18 +33,25 @@ _NOISE = 0.0002
 
 
 class Texture(Effect):
-    """A vibration that grows with the speed of the finger; none at rest.
+    """The faster the finger, the stronger, proportional to the logarithm of the speed.
 
-    level is reached at the speed `fast`; at `slow` it is `range` dB lower, below `slow` nothing.
+    Nothing is felt at rest.
     """
 
     kind: ClassVar[str] = "texture"
     is_for_motion: ClassVar[bool] = True
 
     slow: Annotated[float, Quantity(SPEED, above=0, at_most=1)] = 0.01
+    """Nothing is felt below it."""
+
     fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
+    """`level` is reached at it; above `slow`."""
+
     range: Annotated[float, Quantity(RATIO, at_least=0, at_most=40)] = 14.0
+    """How many dB below `level` at `slow`."""
+
     modulation: Modulation = None
+    """As of `buzz`."""
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:

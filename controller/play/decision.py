@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.choice import Chooser
+from controller.play.chooser import Chooser
 from controller.play.content import Selection, no_layer_free
 from controller.play.intent import FADED_AFTER, IntentSource, Pulse
 from controller.play.playing import PlayedContent, Playing, all_left

@@ -11,7 +11,7 @@ from functools import partial
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
+from controller.play.chooser import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
 from controller.play.content import (
     BEING_CHOSEN,
     Prediction,

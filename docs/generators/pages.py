@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 import changed_tests
+import effects_page
 import error_cases
+import rig_page
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from api_page import api_reference
@@ -75,6 +77,8 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/metrics.md": [part("docs/generators/metrics_page.py", metrics)],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
+    "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),
+    "docs/reference/effects.md": _parts("effects_page.py", effects_page.PARTS),
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
 """The writers of each file, by its path from the root."""

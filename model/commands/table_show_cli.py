@@ -129,7 +129,7 @@ def _verify_by_solving(
     from model.table.verify import verify_table
 
     rig = load_rig(rig_file)
-    table = load_table(table_file, fingerprint=rig.fingerprint)
+    table = load_table(table_file, rig=rig)
     started = time.perf_counter()
     with progress_bar("answers") as progress:
         found = verify_table(table, rig, samples=samples, seed=seed, progress=progress)
@@ -157,6 +157,8 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
 
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
+    from model.finger.perception import FELT_DB_SL
+    from model.table.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -190,10 +192,14 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
         ("cells", f"{summary['cells']} ({summary['grid']})"),
         (
             "feasible cells",
-            f"{percent('feasible_share')} of {mapped} (12 dB or more to the median finger)",
+            f"{percent('feasible_share')} of {mapped} ({WANTED_DB:g} dB or more to the median "
+            "finger)",
         ),
-        ("weak cells", f"{percent('weak_share')} of {mapped} (below 12 dB to one finger in ten)"),
-        ("dead zones", f"{percent('dead_zone_share')} (below 12 dB SL at full stroke)"),
+        (
+            "weak cells",
+            f"{percent('weak_share')} of {mapped} (below {WANTED_DB:g} dB to one finger in ten)",
+        ),
+        ("dead zones", f"{percent('dead_zone_share')} (below {FELT_DB_SL:g} dB SL at full stroke)"),
         ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
         *contrast,
         (
@@ -282,7 +288,7 @@ def _verify_by_measuring(
         rig = plain_rig(table, level=settings.level)
     else:
         rig = load_rig(rig_file)
-        table = load_table(table_file, fingerprint=rig.fingerprint)
+        table = load_table(table_file, rig=rig)
     started = time.perf_counter()
     with progress_bar("patterns") as progress:
         found = check_by_measuring(table, rig, settings, progress=progress)

@@ -16,7 +16,7 @@ from model.config.document import read_document
 from model.config.sections import Section, Validation
 from model.config.shapes import Polygon, PolygonSection
 from model.errors import InputError
-from model.rig.sections import Identifier
+from model.rig.key_types import Identifier
 from model.structure.plate import Plate
 
 EDGE, ANYWHERE = "edge", "anywhere"

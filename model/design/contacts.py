@@ -24,7 +24,7 @@ from model.config.shapes import (
 from model.config.units import LENGTH
 from model.errors import InputError
 from model.finger import MAX_CONTACTS, MAX_CONTENTS
-from model.rig.sections import Identifier
+from model.rig.key_types import Identifier
 from model.structure.plate import Plate
 
 DEFAULT_APART = 0.05

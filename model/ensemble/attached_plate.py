@@ -23,7 +23,12 @@ from model.structure.attachments import (
     attached_stiffness,
     drive_forces,
 )
-from model.structure.modal_elasticity import Dispersion, ModalElasticity, modal_receptance
+from model.structure.modal_elasticity import (
+    Dispersion,
+    ModalElasticity,
+    check_scales,
+    modal_receptance,
+)
 from model.structure.plate import Plate
 
 LEAST_THICKNESS = 0.1
@@ -135,8 +140,10 @@ def attach(
     """Attach ERAs and masses to a reduced free plate.
 
     omega (r,) [rad/s], losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
-    frequencies (f,) [Hz]; dispersion: how omega² changes with them.
+    frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
+    that is not known by one thickness, and does not scale with it.
     """
+    check_scales(plate, 1 + uncertainty.thickness)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     return AttachedPlate(

@@ -11,9 +11,9 @@ Eng. 30 (1990) 981-1011).
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -177,17 +177,12 @@ class Mesh(Discretisation):
             strip = 0.0
         return cls(nx, ny, plate.length, plate.width, Q5, strip)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Its fields for a file, the element by its name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return values | {"element": self.element.name}
-
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"
         if self.element != MITC4:
             text += f" {self.element.name}"
         if self.strip:
-            text += f" with strips of {1000 * self.strip:.3g} mm"
+            text += f" with strips of {1000 * self.strip:g} mm"
         return text
 
     @property

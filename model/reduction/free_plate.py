@@ -31,7 +31,7 @@ from model.structure.attachments import (
     unit_accelerations,
 )
 from model.structure.footprint import as_footprints
-from model.structure.modal_elasticity import ModalElasticity, loss_factors
+from model.structure.modal_elasticity import ModalElasticity, check_scales, loss_factors
 from model.structure.plate import Plate
 
 FREQUENCY_MARGIN = 2.0
@@ -135,8 +135,9 @@ class FreePlate:
         """Functions of frequency of plates so many times as thick (...), and of another modulus.
 
         stiffness (f, r): of modes [rad²/s²] at omega (f,) at that modulus, losses included;
-        loss_factor (f,): of truncated ones.
+        loss_factor (f,): of truncated ones. Raises InputError for a plate that does not scale so.
         """
+        check_scales(self.plate, thickness, modulus)
         square = np.asarray(thickness)[..., None] ** 2
         q = np.asarray((1 + 1j * loss_factor) * modulus * square, dtype=complex)
         return FreeReceptance(

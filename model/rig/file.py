@@ -16,10 +16,10 @@ from model.rig.parts import (
     limits_of,
     mass_of,
     plate_of,
-    uncertainty_of,
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
+from model.rig.uncertainty import Uncertainty
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
@@ -76,7 +76,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         ),
         supports=tuple(supports),
         laminate=laminate_of(section.plate),
-        uncertainty=uncertainty_of(section.uncertainty),
+        uncertainty=Uncertainty(**section.uncertainty.model_dump()),
         fingertip=fingertip_of(section.fingertip),
         threshold=section.threshold,
         outputs=frozenset(

@@ -1,8 +1,6 @@
-"""The text of a rig's mesh, and a mesh in a table's file."""
+"""The text of a mesh, in a rig's and in a table's file."""
 
 import re
-from collections.abc import Mapping
-from typing import Any
 
 from model.config.units import LENGTH, quantity
 from model.errors import InputError
@@ -28,7 +26,14 @@ def mesh_of(
     """
     words = text.split()
     if words[:1] != ["auto"]:
-        return parse_mesh(text, plate)
+        mesh = parse_mesh(text, plate)
+        if isinstance(mesh, Mesh) and max(mesh.nx, mesh.ny) > _MAX_ELEMENTS_PER_SIDE:
+            raise InputError(
+                f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {mesh}"
+            )
+        if isinstance(mesh, Mesh) and mesh.node_count > _MAX_NODES:
+            raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")
+        return mesh
     accuracy = _accuracy(" ".join(words[1:])) if words[1:] else _DEFAULT_ACCURACY
     polynomials = SpectralMesh.accurate(
         plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness, foot=foot
@@ -58,7 +63,7 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
     """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate; with Legendre the numbers are degrees.
 
     Elements may be `with strips of` a length, as a mesh is printed. Raises InputError for other
-    text, an unknown element, and too many elements.
+    text, an unknown element, and no elements.
     """
     match = re.fullmatch(
         rf"\s*(\d{{1,6}})\s*[xX×]\s*(\d{{1,6}})(?:\s+(\S{{1,40}}))?(?:{_STRIPS}(.{{1,40}}))?\s*",
@@ -76,19 +81,5 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
         if strip:
             raise InputError(f"mesh of polynomials must be without strips, got {text[:40]!r}")
         return SpectralMesh(nx, ny, plate.length, plate.width)
-    if not 1 <= min(nx, ny) <= max(nx, ny) <= _MAX_ELEMENTS_PER_SIDE:
-        raise InputError(
-            f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
-        )
     element = element_of(match[3]) if match[3] else MITC4
-    mesh = Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
-    if mesh.node_count > _MAX_NODES:
-        raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")
-    return mesh
-
-
-def mesh_from_dict(values: Mapping[str, Any]) -> PlateMesh:
-    """Make the mesh of its `to_dict`; raises InputError for an unknown element."""
-    if values["element"] == POLYNOMIALS:
-        return SpectralMesh(*(values[key] for key in ("nx", "ny", "length", "width")))
-    return Mesh(**{**values, "element": element_of(values["element"])})
+    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)

@@ -1,55 +1,41 @@
 """Conversion of the sections of a rig file to values of the model."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from model.rig.sections import (
     EraSection,
     FingertipSection,
     LimitsSection,
     MassSection,
-    MaterialSection,
     PlateSection,
-    UncertaintySection,
 )
-from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from registry.limits import GuardLimits
 
+_OF_PLATE = {each.name for each in fields(Plate)} - {"thickness", "material", "air_gap"}
+_OF_ERA = {each.name for each in fields(Era)} - {"damping", "gains"}
+"""Fields that have the values of the keys of their names."""
+
 
 def plate_of(section: PlateSection, *, frequency_max: float) -> Plate:
     """The plate; what is like a homogeneous one of a laminate is so at the highest frequency."""
-    gap = section.air_gap
-    air_gap = None if gap is None else AirGap(gap.depth, closed=gap.closed)
-    deviations = tuple((2 * math.log(f), math.log(loss)) for f, loss in section.modes)
-    laminate = laminate_of(section)
+    gap, laminate = section.air_gap, laminate_of(section)
+    stated = section.model_dump(include=_OF_PLATE) | {
+        "mode_deviations": tuple((2 * math.log(f), math.log(loss)) for f, loss in section.modes),
+        "air_gap": None if gap is None else AirGap(**gap.model_dump()),
+    }
     if laminate is not None:
         plate = equivalent_plate(
-            laminate,
-            length=section.length,
-            width=section.width,
-            frequency=frequency_max,
-            loss_factor=section.loss_factor,
+            laminate, length=section.length, width=section.width, frequency=frequency_max
         )
-        return replace(
-            plate,
-            loss_exponent=section.loss_exponent,
-            mode_deviations=deviations,
-            air_gap=air_gap,
-        )
+        return replace(plate, **stated)
     assert section.thickness is not None  # noqa: S101  see model.rig.checks
     assert section.material is not None  # noqa: S101
     return Plate(
-        length=section.length,
-        width=section.width,
-        thickness=section.thickness,
-        material=_material(section.material),
-        loss_factor=section.loss_factor,
-        loss_exponent=section.loss_exponent,
-        mode_deviations=deviations,
-        air_gap=air_gap,
+        thickness=section.thickness, material=Material(**section.material.model_dump()), **stated
     )
 
 
@@ -59,7 +45,7 @@ def laminate_of(section: PlateSection) -> Laminate | None:
         return None
     layers = (
         Layer(
-            _material(layer.material),
+            Material(**layer.material.model_dump()),
             layer.thickness,
             loss_factor=layer.loss_factor or 0.0,
             by_frequency=tuple(layer.by_frequency or ()),
@@ -84,19 +70,16 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
         name=name,
         x=x,
         y=y,
-        stiffness=section.stiffness,
         damping=damping,
-        bolt_mass=section.bolt_mass,
-        stroke=section.stroke,
-        foot=section.foot,
         gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
+        **section.model_dump(include=_OF_ERA),
     )
 
 
 def mass_of(section: MassSection, plate: Plate) -> PointLoad:
     """A mass on the plate."""
     x, y = _onto(plate, section.at)
-    return PointLoad(x, y, mass=section.mass, foot=section.foot)
+    return PointLoad(x, y, **section.model_dump(exclude={"at"}))
 
 
 def limits_of(section: LimitsSection) -> GuardLimits:
@@ -106,18 +89,9 @@ def limits_of(section: LimitsSection) -> GuardLimits:
     return GuardLimits(frequency_min=low, frequency_max=high, **given)
 
 
-def uncertainty_of(section: UncertaintySection) -> Uncertainty:
-    """The standard deviations of the rig's parameters."""
-    return Uncertainty(**section.model_dump())
-
-
 def fingertip_of(section: FingertipSection | str) -> Fingertip | None:
     """The load of a fingertip; None for weightless ones."""
     return None if isinstance(section, str) else Fingertip(**section.model_dump())
-
-
-def _material(section: MaterialSection) -> Material:
-    return Material(section.name, E=section.E, rho=section.rho, nu=section.nu)
 
 
 def _onto(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:

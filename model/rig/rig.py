@@ -1,12 +1,13 @@
-"""A rig: a plate, its ERAs, and the amplifier channel of each ERA."""
+"""A rig: a plate, its ERAs, the amplifier channel of each ERA; and what else must be the same."""
 
 import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from numbers import Real
+from typing import Any
 
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -94,68 +95,85 @@ class Rig:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of all that decides what is felt; see `physics_fingerprint`."""
-        return physics_fingerprint(
-            self.plate, self.eras, self.masses, self.uncertainty, self.fingertip, self.threshold
-        )
+        """Fingerprint of all that decides what is felt; see `fingerprint_of`."""
+        return fingerprint_of(self)
 
 
-def physics_fingerprint(
-    plate: Plate,
-    eras: Sequence[Era],
-    masses: Sequence[PointLoad],
-    uncertainty: Uncertainty,
-    fingertip: Fingertip | None,
-    threshold: str,
-) -> str:
-    """SHA-256 over all that decides what fingers feel; not mesh or wiring.
+MAY_DIFFER = {
+    "Rig.mesh": "the discretisation error of its own mesh is part of a table",
+    "Rig.wiring": "where levels go, not what they do",
+    "Rig.amplifiers": "where levels go, not what they do",
+    "Rig.limits": "patterns are held to those of the rig in service, whenever they are played",
+    "Rig.outputs": "an amplifier that says otherwise is refused when it is opened",
+    "Rig.supports": "which of the masses have a name, not what they weigh",
+    "Rig.laminate": "all that is solved of it is in the plate",
+    "Material.name": "displayed only",
+}
+"""What a table's rig may have otherwise, by class and field, each with the reason.
 
-    Over plate, ERAs, masses, their uncertainty, and load, contact and thresholds of a finger. Rigs
-    with the same fingerprint share localization tables, also with other names of materials.
+Everything else, and so every new field, must be the same.
+"""
+
+
+PHYSICS = tuple(each.name for each in fields(Rig) if f"Rig.{each.name}" not in MAY_DIFFER)
+"""Fields of a rig that a table has, too."""
+
+
+def physics_of(of: object) -> dict[str, Any]:
+    """What must be the same of a rig and of a table for the same answers, as plain data.
+
+    of: a rig, or what has its PHYSICS. Fields by name, without those that are as empty as they are
+    by default: what was solved before there was such a field stays valid.
     """
-    numbers = asdict(plate)
-    del numbers["material"]["name"]
+    found = {name: _plain(getattr(of, name)) for name in PHYSICS}
     # A laminate is its layers; what it is like depends on the frequency.
-    if numbers["laminate"] is not None:
-        del numbers["material"], numbers["thickness"]
-    # Plates without layers or air, and as their theory has them, keep the fingerprint of a rig that
-    # has no such keys.
-    for key in ("laminate", "air_gap", "loss_exponent", "mode_deviations"):
-        if not numbers[key]:
-            del numbers[key]
-    for layer in numbers.get("laminate", {}).get("layers", ()):
-        del layer["material"]["name"]
-    # ERAs without gains have the fingerprint of a rig that has no such key.
-    held = [
-        {key: value for key, value in asdict(era).items() if key != "gains" or value}
-        for era in eras
-    ]
-    physics = {
-        "plate": numbers,
-        "eras": held,
-        "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
-        "uncertainty": asdict(uncertainty),
-        "fingertip": None if fingertip is None else asdict(fingertip),
-        "fingertip_radius": FINGERTIP_RADIUS,
-        "threshold": threshold,
-    }
-    return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
+    if "laminate" in found["plate"]:
+        del found["plate"]["material"], found["plate"]["thickness"]
+    found["masses"].sort(key=canonical_json)
+    found["names of eras"] = [era["name"] for era in found["eras"]]
+    found["eras"] = {era["name"]: era for era in found["eras"]}
+    return found | {"fingertip_radius": FINGERTIP_RADIUS}
 
 
-def canonical_json(value: object) -> str:
-    """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
-    return json.dumps(_with_floats(value), sort_keys=True, separators=(",", ":"))
+def fingerprint_of(of: object) -> str:
+    """SHA-256 over all that decides what fingers feel, `physics_of` a rig or a table."""
+    return hashlib.sha256(canonical_json(physics_of(of)).encode()).hexdigest()
 
 
-def _with_floats(value: object) -> object:
+def differences(of: object, rig: Rig) -> list[str]:
+    """Keys whose values, of a table, must be those of a rig and are not, but for rounding."""
+    return [*_differing("", physics_of(of), physics_of(rig))]
+
+
+def _plain(value: Any) -> Any:
+    """A value in mappings, lists, floats and text, without what may differ and empty defaults."""
     match value:
         case bool() | str() | None:
             return value
         case Real():
             return float(value) + 0.0
         case Mapping():
-            return {key: _with_floats(each) for key, each in value.items()}
+            return {key: _plain(each) for key, each in value.items()}
         case Iterable():
-            return [_with_floats(each) for each in value]
-        case _:
-            raise TypeError(f"no plain data: {type(value).__name__}")
+            return [_plain(each) for each in value]
+    kept = [f for f in fields(value) if f"{type(value).__name__}.{f.name}" not in MAY_DIFFER]
+    own = [(each, getattr(value, each.name)) for each in kept]
+    return {each.name: _plain(held) for each, held in own if held or held != each.default}
+
+
+def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
+    """Differences of plain data below a key; a list of another length differs as a whole."""
+    if isinstance(own, dict) and isinstance(rigs, dict):
+        for name in rigs | own:
+            yield from _differing(f"{key}.{name}".lstrip("."), own.get(name), rigs.get(name))
+    elif isinstance(own, list) and isinstance(rigs, list) and len(own) == len(rigs):
+        for number, pair in enumerate(zip(own, rigs, strict=True)):
+            yield from _differing(f"{key}[{number}]", *pair)
+    elif own != rigs and not (type(own) is type(rigs) is float and math.isclose(own, rigs)):
+        wanted, got = (f"{each:.9g}" if type(each) is float else each for each in (rigs, own))
+        yield f"{key} must be {wanted!s:.60}, got {got!s:.60}"
+
+
+def canonical_json(value: object) -> str:
+    """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
+    return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))

@@ -3,10 +3,7 @@
 Bounds are wide: they catch values in the wrong unit.
 """
 
-import re
-from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -24,7 +21,6 @@ from model.config.sections import Quantity, Section
 from model.config.units import (
     DAMPING,
     DENSITY,
-    FREQUENCY,
     LENGTH,
     MASS,
     MODULUS,
@@ -34,11 +30,26 @@ from model.config.units import (
     STIFFNESS,
     TIME,
 )
-from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
+from model.finger.perception import DEFAULT_THRESHOLD
+from model.rig.key_types import (
+    GAINS,
+    MODES,
+    MODULI,
+    Foot,
+    Frequency,
+    GainRow,
+    Identifier,
+    ModeRow,
+    Place,
+    Side,
+    Thickness,
+    check_ascending,
+    check_threshold,
+    check_url,
+)
 from model.rig.uncertainty import Uncertainty
 from model.structure.materials import material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
-from registry.suggestions import did_you_mean
 
 
 class _MaterialByName:
@@ -62,88 +73,23 @@ class _MaterialByName:
         return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
 
 
-def _identifier(text: str) -> str:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,31}", text):
-        raise ValueError("must be a letter followed by at most 31 letters, digits, - and _")
-    return text
-
-
-def _url(text: str) -> str:
-    if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[!-~]{0,250}", text):
-        raise ValueError(
-            "must be a URL, for example sim:// or serial:///dev/ttyUSB0?baud=921600, got "
-            f"{text[:40]!r}"
-        )
-    return text
-
-
-def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
-    low, high = bounds
-    if low >= high:
-        raise ValueError(f"must be the lower and the higher frequency, got {low:g} and {high:g} Hz")
-    return bounds
-
-
-def _rows(
-    columns: str, lowest: Sequence[float], highest: Sequence[float], *, ascending: bool = True
-) -> AfterValidator:
-    """Check of rows of numbers between bounds, by default sorted by the first of them."""
-
-    def checked(rows: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        for row in rows:
-            if not all(
-                low <= each <= high for low, each, high in zip(lowest, row, highest, strict=True)
-            ):
-                got = ", ".join(f"{each:g}" for each in row)
-                raise ValueError(f"must be rows of [{columns}], got [{got}]")
-        if ascending and any(low[0] >= high[0] for low, high in pairwise(rows)):
-            raise ValueError("frequencies must ascend; sort the rows by the first number")
-        return rows
-
-    return AfterValidator(checked)
-
-
-def _threshold(name: str) -> str:
-    if name not in THRESHOLDS:
-        raise ValueError(
-            f"unknown set of thresholds {name}; {did_you_mean(name, THRESHOLDS)}known are "
-            f"{', '.join(THRESHOLDS)}"
-        )
-    return name
-
-
-_GAINS = _rows(
-    "frequency in Hz, magnitude 0.001 to 1000, phase -360 to 360 degrees",
-    (1e-6, 1e-3, -360),
-    (1e5, 1e3, 360),
-)
-_MODULI = _rows(
-    "frequency in Hz, factor of E 0.001 to 1000, loss factor 0 to 2", (1e-6, 1e-3, 0), (1e5, 1e3, 2)
-)
-_MODES = _rows(
-    "natural frequency 0.8 to 1.25, loss factor 0.01 to 100, relative to the plate's theory",
-    (0.8, 0.01),
-    (1.25, 100),
-    ascending=False,
-)
-GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
-ModeRow = Annotated[tuple[float, float], Strict(strict=False)]
-Identifier = Annotated[str, AfterValidator(_identifier)]
-Side = Annotated[float, Quantity(LENGTH, above=0, at_most=100)]
-Coordinate = Annotated[float, Quantity(LENGTH, at_least=-100, at_most=100)]
-Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
-Foot = Annotated[float, Quantity(LENGTH, at_least=0, at_most=0.2)]
-Thickness = Annotated[float, Quantity(LENGTH, at_least=1e-6, at_most=1)]
-Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
-
-
 class MaterialSection(Section):
     """A material by its numbers."""
 
     name: Identifier = "custom"
+    """Displayed only.
+
+    Limits: a name
+    """
+
     E: Annotated[float, Quantity(MODULUS, at_least=1e3, at_most=1e13)]
+    """Young's modulus."""
+
     rho: Annotated[float, Quantity(DENSITY, at_least=1, at_most=1e5)]
+    """Density."""
+
     nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)]
+    """Poisson's ratio."""
 
 
 MaterialOrName = Annotated[MaterialSection, _MaterialByName()]
@@ -153,18 +99,37 @@ class LayerSection(Section):
     """One layer of a laminate."""
 
     material: MaterialOrName
+    """A name, or numbers."""
+
     thickness: Thickness
+    """Of this layer."""
+
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
-    by_frequency: Annotated[list[GainRow], Field(min_length=2, max_length=200), _MODULI] | None = (
+    """Eta of the layer itself, E (1 + i eta), beside the `loss_factor` of the plate."""
+
+    by_frequency: Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI] | None = (
         None
     )
+    """`[[frequency in Hz, factor of E, loss factor], ...]`: linear in the logarithms of frequency
+    and factor, constant outside; in place of `loss_factor`.
+
+    Limits: 2 rows or more, by ascending frequency
+    """
 
 
 class AirGapSection(Section):
     """Air between the plate and a rigid wall behind it."""
 
     depth: Annotated[float, Quantity(LENGTH, at_least=1e-5, at_most=0.1)]
+    """Of the gap; the wall behind it does not move."""
+
     closed: bool = False
+    """`true` for a gap sealed along all edges; otherwise it is open along all of them.
+
+    Default: none
+
+    Limits: `true`, `false`
+    """
 
 
 class PlateSection(Section):
@@ -182,17 +147,50 @@ class PlateSection(Section):
     )
 
     length: Side
+    """Along x."""
+
     width: Side
+    """Along y."""
+
     thickness: Thickness | None = None
+    """At most the shorter side.
+
+    Default: required, or `layers`
+    """
+
     material: MaterialOrName | None = None
+    """A name, or numbers, see [material](#material).
+
+    Default: required, or `layers`
+    """
+
     layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
+    """A laminate instead of `thickness` and `material`, see [layers](#layers)."""
+
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
+    """Whether the layers hold together, see [laminates](#laminates)."""
+
     air_gap: AirGapSection | None = None
+    """Air between the plate and a rigid wall behind it, see [air_gap](#air_gap).
+
+    Limits: see there
+    """
+
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
+    """Structural damping eta of a hysteretic stiffness (1 + i eta) K, of the mounted plate."""
+
     loss_exponent: Annotated[
         float, Quantity(RATIO, at_least=-MAX_LOSS_EXPONENT, at_most=MAX_LOSS_EXPONENT)
     ] = 0.0
-    modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), _MODES]
+    """`loss_factor` is that at 150 Hz and varies as this power of the frequency."""
+
+    modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), MODES]
+    """Natural frequency and loss factor of the lowest elastic modes of the free plate, ascending,
+    relative to those of its theory, as an identification finds them; shapes and higher modes
+    stay.
+
+    Limits: rows of [0.8 to 1.25, 0.01 to 100]
+    """
 
 
 class EraSection(Section):
@@ -208,30 +206,73 @@ class EraSection(Section):
     )
 
     at: Place
+    """`[x, y]` where it supports the plate; on the plate, at most one ERA per position."""
+
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
+    """Of its spring, k_b."""
+
     damping_ratio: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] = 0.05
+    """Zeta of its damper: c = 2 zeta sqrt(k_b m / n), m the bare plate's mass, n the number of
+    ERAs.
+    """
+
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
+    """C itself, instead of `damping_ratio`."""
+
     bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
+    """Mass that moves with the plate, m_b."""
+
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
+    """Amplitude of its base at level 1, where its gain is 1."""
+
     foot: Foot = 0.0
-    gains: Annotated[list[GainRow], Field(max_length=2000), _GAINS] | None = None
+    """Radius of the disc on which it presses, 0 for a point as in the paper; only the part on the
+    plate counts. Required from a stiffness of 1 MN/m: [points and
+    feet](../concepts/plate-model.md#points-and-feet).
+    """
+
+    gains: Annotated[list[GainRow], Field(max_length=2000), GAINS] | None = None
+    """`[[frequency in Hz, magnitude, phase in degrees], ...]`: motion of its base by a level, in
+    strokes, measured by `era calibrate` ([calibration](../how-to/calibration.md)); linear in
+    between, constant outside, 1 without rows.
+
+    Limits: rows by ascending frequency
+    """
+
     amplifier: Identifier | None = None
+    """The amplifier that drives it; none for an ERA that only supports the plate.
+
+    Limits: a name under `amplifiers`
+    """
+
     channel: Annotated[int, Field(ge=0, le=255)] | None = None
+    """Its channel; unique per ERA, none without an amplifier."""
 
 
 class MassSection(Section):
     """A mass on the plate, at a point or on a disc."""
 
     at: Place
+    """`[x, y]`, on the plate."""
+
     mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)]
+    """Its mass."""
+
     foot: Foot = 0.0
+    """Radius of the disc on which it sits, 0 for a point."""
 
 
 class AmplifierSection(Section):
     """An amplifier: its URL, and what its full level is."""
 
-    url: Annotated[str, AfterValidator(_url)]
+    url: Annotated[str, AfterValidator(check_url)]
+    """How to reach it: `sim://`, `serial:///dev/ttyUSB0?baud=921600`.
+
+    Limits: [`SCHEME://...`](urls.md)
+    """
+
     full_level: Literal["motion", "output"] = "motion"
+    """What it plays at level 1."""
 
 
 class UncertaintySection(Section):
@@ -243,13 +284,30 @@ class UncertaintySection(Section):
         return cls(**asdict(Uncertainty()))
 
     gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    """Gain of each channel, relative."""
+
     phase_deg: Annotated[float, Quantity(RATIO, at_least=0, at_most=60)] = 0.0
+    """Phase of each channel, in degrees."""
+
     thickness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.03)] = 0.0
+    """Of the plate, relative."""
+
     stiffness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    """Of each ERA, relative."""
+
     damping: Annotated[float, Quantity(RATIO, at_least=1, at_most=4)] = 1.0
+    """A factor, of the ERAs' damping and, independently, of the plate's loss factor."""
+
     fingertip: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 0.0
+    """Of the natural logarithm of each finger's load."""
+
     common_gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    """Gain of all channels together, relative: of levels only."""
+
     field: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    """Of the acceleration at a finger by each ERA, relative to its root mean square over the plate:
+    what no other key says of the plate.
+    """
 
 
 def _mapping(value: object) -> object:
@@ -265,11 +323,22 @@ class FingertipSection(Section):
     """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 1000.0
+    """Of the pulp."""
+
     damping: Annotated[float, Quantity(DAMPING, above=0, at_most=1e4)] = 2.0
+    """Of the pulp."""
+
     contact_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] = 0.0002
+    """Mass that moves with the plate."""
+
     phalanx_mass: Annotated[float, Quantity(MASS, at_least=1e-5, at_most=1)] = 0.005
+    """Of the bone behind the pulp."""
+
     joint_stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 500.0
+    """Of the joint that holds it."""
+
     joint_damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e4)] = 2.0
+    """Of the joint."""
 
 
 class LimitsSection(Section):
@@ -279,14 +348,37 @@ class LimitsSection(Section):
     """
 
     frequency: Annotated[
-        tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(_ascending)
+        tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(check_ascending)
     ] = (40.0, 500.0)
+    """Lowest and highest mechanical frequency that may be driven."""
+
     level: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 1.0
+    """Share of an ERA's stroke."""
+
     slew: Annotated[float, Quantity(SLEW, above=0, at_most=1e6)] | None = None
+    """Maximum rise of a level; `2 %/ms` is from rest to full stroke in 50 ms. Ramps are lengthened
+    accordingly, an envelope that rises faster is refused. It counts from the lowest level that
+    may be playing, along the whole ramp: a raised cosine is 1.6 times as steep at its middle.
+    """
+
     power: Annotated[float, Quantity(RATIO, above=0, at_most=256)] | None = None
+    """Sum of the squared levels of the channels of one amplifier; 1 is one channel at full stroke,
+    or four at half of it.
+    """
+
     on_time: Annotated[float, Quantity(TIME, above=0, at_most=86_400)] | None = None
+    """How long one amplifier may vibrate without a pause, ramps included; it ends by itself by
+    then.
+    """
+
     duty: Annotated[float, Quantity(RATIO, above=0, at_most=1)] | None = None
+    """Share of any ten seconds during which one amplifier may vibrate, ramps included."""
+
     rate: Annotated[float, Quantity(RATE, at_least=1, at_most=2000)] | None = None
+    """Command sets per second, other than silence, that one amplifier is sent, counted over 1.1 s,
+    so that none of its seconds has more although some are delayed on their way; a set refused
+    for it is played as soon as it is allowed.
+    """
 
 
 class RigSection(Section):
@@ -297,13 +389,46 @@ class RigSection(Section):
     """
 
     plate: PlateSection
+    """The plate, see [plate](#plate)."""
+
     mesh: str = "auto"
+    """`auto A %` uses polynomials over the plate for an error of the response of A % up to the
+    upper `limits.frequency`, `auto` for 1 %, or elements where there would be too many; see [the
+    plate model](../concepts/plate-model.md). Else elements along x and y, of MITC4 Q3, Q4 or Q5,
+    with a narrow row of them along every edge if strips are given; or the degrees of polynomials
+    with `Legendre` in place of an element. A mesh with fewer than six elements per bending
+    wavelength there is refused.
+
+    Limits: `auto`, `auto A %` with A from 0.05 to 10, `NXxNY` with 1 to 1000 a side, `NXxNY
+    ELEMENT`, or `NXxNY ELEMENT with strips of W`
+    """
+
     eras: Annotated[dict[Identifier, EraSection], Field(min_length=1, max_length=64)]
+    """ERAs by name, see [eras](#eras)."""
+
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
+    """Point masses by name, see [masses](#masses)."""
+
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
+    """Amplifiers by name, see [amplifiers](#amplifiers)."""
+
     limits: LimitsSection = LimitsSection()
+    """Limits of commands, see [limits](#limits)."""
+
     uncertainty: Annotated[UncertaintySection, BeforeValidator(_mapping)] = (
         UncertaintySection.not_measured()
     )
+    """How well the rig is known, see [uncertainty](#uncertainty)."""
+
     fingertip: FingertipSection | Literal["none"] = FingertipSection()
-    threshold: Annotated[str, AfterValidator(_threshold)] = DEFAULT_THRESHOLD
+    """Load of each finger on the plate, see [fingertip](#fingertip); `none` for weightless ones.
+
+    Limits: a mapping, or `none`
+    """
+
+    threshold: Annotated[str, AfterValidator(check_threshold)] = DEFAULT_THRESHOLD
+    """Set of detection thresholds to which levels in dB SL refer, see
+    [people](../concepts/people.md#detection-thresholds).
+
+    Limits: `vibrotactile-probe`, `pressing-fingertip`
+    """

@@ -89,7 +89,7 @@ class AtOneFrequency(SpectralPlate):
             + 1j * self._stiffness(of, [each.imag for each in moduli])
         )
         D[m:, m:] -= omega**2 * along_mass(of, self._mass, np.eye(of.size - m))
-        D[:m, :m] -= omega**2 * self._density * np.eye(m)
+        D[:m, :m] -= omega**2 * self._inertia(of)
         result = D[:m, :m] - D[:m, m:] @ np.linalg.solve(D[m:, m:], D[m:, :m])
         gap = self._plate.air_gap
         if gap is not None:

@@ -1,8 +1,8 @@
 """Degrees of the polynomials over the plate, chosen for a frequency."""
 
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 
@@ -99,10 +99,6 @@ class SpectralMesh(Discretisation):
         if math.prod(degree + 1 for degree in degrees) > MAX_POLYNOMIALS:
             return None
         return cls(degrees[0], degrees[1], plate.length, plate.width)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Its fields for a file, with the element's name."""
-        return asdict(self) | {"element": POLYNOMIALS}
 
     def __str__(self) -> str:
         return f"{self.nx}x{self.ny} {POLYNOMIALS}"

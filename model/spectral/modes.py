@@ -101,7 +101,6 @@ class SpectralPlate:
         self._corrections = shear_corrections(self._layers)
         self._opposite = opposite_motions(self._layers)
         self._mass = self._opposite.T @ interface_mass(self._layers) @ self._opposite
-        self._density = sum(layer.surface_density for layer in self._layers)
         moduli = [layer.modulus(middle) for layer in self._layers]
         decays = edge_decays(section_of(self._layers, moduli, self._corrections))
         nx, ny = degrees
@@ -141,6 +140,10 @@ class SpectralPlate:
                 shapes[:, number] = shape
         return SpectralClass(kept, losses, dispersion, eigenvalues[count:], shapes)
 
+    def _inertia(self, of: ClassFunctions) -> FloatArray:
+        """Mass between the polynomials of the deflection, (m, m)."""
+        return sum(layer.surface_density for layer in self._layers) * np.eye(of.deflections)
+
     def _stiffness(self, of: ClassFunctions, moduli: Sequence[float]) -> FloatArray:
         section = section_of(self._layers, moduli, self._corrections)
         return class_stiffness(of, section.in_motions(self._opposite))
@@ -159,7 +162,7 @@ class SpectralPlate:
         follows = follow(of, K, self._mass, shift)
         rotary = follows.T @ along_mass(of, self._mass, follows)
         stiffness = K[:m, :m] + K[:m, m:] @ follows - shift * rotary
-        mass = self._density * np.eye(m) + rotary
+        mass = self._inertia(of) + rotary
         gap = self._plate.air_gap
         if air is not None and gap is not None:
             own, mass_of_w = stiffness, mass
@@ -199,7 +202,7 @@ class _Space:
             flows.append(q[m:])
         w, u, a = (np.hstack(each) for each in (deflections, alongs, flows))
         along = np.vstack([w, u])
-        heavy = plate._density * w.T @ w + u.T @ along_mass(of, plate._mass, u)
+        heavy = w.T @ plate._inertia(of) @ w + u.T @ along_mass(of, plate._mass, u)
         if air is not None and self._gap is not None:
             moving = np.vstack([w, a])
             self._air_mass = moving.T @ (air.inertia[:, None] * moving)

@@ -244,13 +244,6 @@ class PointLoad:
         """Refuse values that are not finite, and loads that add energy."""
         expect_values(self, "point load", at_least="stiffness damping mass foot", finite="x y")
 
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Its values by name, without stiffness and damping where both are zero."""
-        mass = {"x": self.x, "y": self.y, "mass": self.mass, "foot": self.foot}
-        mount = {"stiffness": self.stiffness, "damping": self.damping}
-        return mass | mount if any(mount.values()) else mass
-
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""
         return np.asarray(self.stiffness + 1j * omega * self.damping - omega**2 * self.mass)

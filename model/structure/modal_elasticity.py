@@ -8,14 +8,15 @@ varies as a power of the frequency. Shapes stay those of the theory, and so do a
 Adhesives and air change the complex eigenvalues of modes with frequency: their dispersion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.errors import InputError
+from model.structure.plate import LOSS_FREQUENCY, SCALED, Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +114,25 @@ class ModalElasticity:
         if self.dispersion is None:
             return np.asarray(1j * self.losses, dtype=complex)
         return np.asarray(1j * self.losses + self.dispersion.at(omega))
+
+
+def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
+    """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
+
+    What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
+    whose mass or stiffness does not go with them (`model.structure.plate.SCALED`).
+    """
+    stays = [
+        each.name
+        for each in fields(plate)
+        if each.name not in SCALED and getattr(plate, each.name) != each.default
+    ]
+    if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
+        raise InputError(
+            f"plate.{stays[0]}: thickness and modulus must be those that were solved, since this "
+            "part does not scale with them; set uncertainty.thickness to 0, or solve the plate "
+            "for each thickness"
+        )
 
 
 def modal_receptance(

@@ -66,7 +66,7 @@ def answer(
     expect_between(apart_hz, 0.0, what="apart_hz")
     check_requests(requests, fingers, table.plate)
     answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
-    found = with_modulation(table, answering.answer(min_contrast_db), playable=playable)
+    found = with_modulation(table, answering.solve(min_contrast_db), playable=playable)
     played = [each for each in found.layers if each.excitation]
     changed = [
         f"content of {_at(each.request)} is steady"
@@ -108,7 +108,7 @@ class _Answering:
     apart_hz: float
     bands_may_swap: bool
 
-    def answer(self, min_contrast_db: float) -> Answer:
+    def solve(self, min_contrast_db: float) -> Answer:
         """Change the plan until the worst finger has the contrast, else take the best tried."""
         count = len(self.requests)
         quiet = range(count, count + len(self.fingers))

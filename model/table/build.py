@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.drive_modes import DRIVE_MODES
@@ -19,10 +18,10 @@ from model.finger.perception import check_has_threshold
 from model.processes import on_processes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
-from model.rig.rig import Rig, canonical_json
+from model.rig.rig import PHYSICS, Rig, canonical_json
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import footprints_of
-from model.structure.modal_elasticity import Dispersion
+from model.structure.modal_elasticity import Dispersion, check_scales
 from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster
@@ -48,6 +47,7 @@ class TableProblem:
         _check_frequencies(self.frequencies, self.rig)
         check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
         plate = self.rig.plate
+        check_scales(plate, 1 + self.rig.uncertainty.thickness)
         wavelength = plate.bending_wavelength(2 * float(self.frequencies[-1]))
         modes = math.pi * plate.length * plate.width / wavelength**2
         size = 4 * self.raster.point_count * modes
@@ -85,8 +85,8 @@ class TableProblem:
             "format": FORMAT_VERSION,
             "numerics": NUMERICS_VERSION,
             "plate": self.rig.fingerprint,
-            "mesh": self.rig.mesh.to_dict(),
-            "reference_mesh": self.reference_mesh.to_dict(),  # follows from the rig's limits
+            "mesh": str(self.rig.mesh),
+            "reference_mesh": str(self.reference_mesh),  # follows from the rig's limits
             "grid": [self.grid.nx, self.grid.ny],
             "frequencies": self.frequencies.tolist(),
         }
@@ -124,21 +124,14 @@ def solve_table(
     if drive_mode not in DRIVE_MODES:
         raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
     parts = dict(enumerate((_discretisation, _modes)))
-    solved: dict[str, NDArray[Any]] = {}
+    solved: dict[str, Any] = {name: getattr(problem.rig, name) for name in PHYSICS}
     # A copy without cached properties, which cannot all be sent to a process.
     found = on_processes(workers, _solve, replace(problem), parts)
     for done, (_, arrays) in enumerate(found, start=1):
         solved |= arrays
         progress(done, len(parts))
-    rig = problem.rig
     return LocalizationTable(
-        plate=rig.plate,
-        eras=rig.eras,
-        masses=rig.masses,
-        uncertainty=rig.uncertainty,
-        fingertip=rig.fingertip,
-        threshold=rig.threshold,
-        mesh=rig.mesh,
+        mesh=problem.rig.mesh,
         raster=problem.raster,
         grid=problem.grid,
         drive_mode=drive_mode,

@@ -21,7 +21,7 @@ from model.structure.attachments import (
     coupled_forces,
     fingertip_loads,
 )
-from model.structure.modal_elasticity import modal_receptance
+from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -161,6 +161,7 @@ def accelerations_on(
     At rows (m,) of the table's frequencies and points of shapes discs (k, p, r), each finger at the
     first point of its disc; without the deviation of the field.
     """
+    check_scales(table.plate, plates.thickness)
     w, eras = table.attached.omega[rows], table.eras
     k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
     damping = plates.damping[:, None, None] * c

@@ -3,8 +3,8 @@
 `docs/reference/table-file.md` lists every name with its shape and unit.
 """
 
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,20 @@ from typing import Any
 import numpy as np
 
 from model.arrays import Complex64Array
+from model.config.sections import Quantity
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
+from model.rig.rig import PHYSICS
+from model.rig.sections import (
+    AirGapSection,
+    EraSection,
+    FingertipSection,
+    LayerSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+)
 from model.table.file import FORMAT_VERSION
 from model.table.table import LocalizationTable
 from model.table.weak_cells import pair_questions
@@ -41,9 +52,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
         "mode": table.drive_mode,
-        "plate": _plate(table),
-        "eras": _structs([asdict(era) for era in table.eras]),
-        "masses": _structs([mass.numbers for mass in table.masses]),
+        **_physics(table),
         "mesh": str(table.mesh),
         "reference_mesh": str(table.reference_mesh),
         "discretisation_error": table.discretisation_error,
@@ -116,43 +125,42 @@ def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
     return [str(value) for value in values]
 
 
-def _plate(table: LocalizationTable) -> dict[str, Any]:
-    plate, material = table.plate, table.plate.material
+_SECTIONS = (PlateSection, LayerSection, MaterialSection, AirGapSection, EraSection, MassSection)
+_NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad"}
+
+
+def _physics(table: LocalizationTable) -> dict[str, Any]:
+    """All that a table must have of its rig, numbers with the units of the rig's file."""
+    by_unit = {
+        key: f"{key}_{unit.lower().replace(' ', '').replace('/', '_').replace('^', '')}"
+        for section in (*_SECTIONS, FingertipSection)
+        for key, field in section.model_fields.items()
+        for unit in (each.dimension.unit for each in field.metadata if isinstance(each, Quantity))
+        if unit
+    } | _NAMES
     return {
-        "length_m": plate.length,
-        "width_m": plate.width,
-        "thickness_m": plate.thickness,
-        "loss_factor": plate.loss_factor,
-        "loss_exponent": plate.loss_exponent,
-        "mode_deviations": [list(each) for each in plate.mode_deviations],
-        "material": material.name,
-        "E_pa": material.E,
-        "rho_kg_m3": material.rho,
-        "nu": material.nu,
+        name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)
+        for name in PHYSICS
     }
 
 
-_UNITS = {
-    "x": "x_m",
-    "y": "y_m",
-    "stiffness": "stiffness_n_m",
-    "damping": "damping_ns_m",
-    "bolt_mass": "bolt_mass_kg",
-    "mass": "mass_kg",
-    "stroke": "stroke_m",
-    "gains": "gain_hz_ratio_rad",
-    "foot": "foot_m",
-}
+def _exported(value: Any, names: Mapping[str, str]) -> Any:
+    """A value as .mat files have it; names: with units, by those of fields."""
+    if is_dataclass(value):
+        each = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {names.get(key, key): _exported(own, names) for key, own in each.items()}
+    if value is None:
+        return np.zeros((0, 0))
+    if not isinstance(value, tuple):
+        return value
+    rows = [_exported(each, names) for each in value]
+    return _structs(rows) if rows and isinstance(rows[0], dict) else np.array(rows, dtype=float)
 
 
 def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
-    """A struct array (n, 1), names with units; without fields where there are no rows."""
-    if not rows:
-        return np.zeros((0, 0))
-    names = {key: _UNITS.get(key, key) for key in rows[0]}
-    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names.values()])
+    """A struct array (n, 1) of rows of the same names."""
+    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in rows[0]])
     for number, row in enumerate(rows):
-        for key, name in names.items():
-            value = row[key]
-            structs[name][number, 0] = np.reshape(value, (-1, 3)) if key == "gains" else value
+        for name, value in row.items():
+            structs[name][number, 0] = value
     return structs

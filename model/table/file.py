@@ -8,24 +8,23 @@ the content, so that a damaged or foreign file is refused before any of it is us
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+from pydantic_core import to_jsonable_python
 
-from model.arguments import expect, expect_path, shown
+from model.arguments import expect, expect_path
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.files.replacing import begins_with
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
-from model.rig.meshes import mesh_from_dict
-from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import Era, Fingertip, PointLoad
-from model.structure.plate import Plate
+from model.rig.meshes import parse_mesh
+from model.rig.rig import PHYSICS, Rig, differences
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
 from registry.wording import first_problem
@@ -34,7 +33,9 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
+
+_MAX_SHOWN = 3  # keys in which a table is of another rig
 
 # A table of the paper's plate has 0.3 MB.
 MAX_BYTES = 2 << 30
@@ -56,19 +57,6 @@ _DTYPES = {
 MAX_VALUE = 1e9
 
 
-class _Mesh(BaseModel):
-    """Header entry of a mesh."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    nx: int
-    ny: int
-    length: float
-    width: float
-    element: str
-    strip: float = 0.0
-
-
 class _Header(BaseModel):
     """JSON header."""
 
@@ -80,18 +68,18 @@ class _Header(BaseModel):
     fingerprint: str
     sha256: str
     mode: str
-    plate: Plate
-    eras: tuple[Era, ...]
-    masses: tuple[PointLoad, ...]
-    uncertainty: Uncertainty
-    fingertip: Fingertip | None
-    threshold: str
-    mesh: _Mesh
-    reference_mesh: _Mesh
+    mesh: str
+    reference_mesh: str
     discretisation_error: list[float]
     frequencies_hz: list[float]
     raster: Raster
     grid: Grid
+
+
+_PHYSICS: dict[str, Any] = {
+    name: (kind, ...) for name, kind in get_type_hints(LocalizationTable).items() if name in PHYSICS
+}
+_WholeHeader = create_model("_WholeHeader", __base__=_Header, **_PHYSICS)
 
 
 def save_table(table: LocalizationTable, path: Path | str) -> None:
@@ -105,14 +93,9 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
         "mode": table.drive_mode,
-        "plate": asdict(table.plate),
-        "eras": [asdict(era) for era in table.eras],
-        "masses": [mass.numbers for mass in table.masses],
-        "uncertainty": asdict(table.uncertainty),
-        "fingertip": None if table.fingertip is None else asdict(table.fingertip),
-        "threshold": table.threshold,
-        "mesh": table.mesh.to_dict(),
-        "reference_mesh": table.reference_mesh.to_dict(),
+        **{name: to_jsonable_python(getattr(table, name)) for name in PHYSICS},
+        "mesh": str(table.mesh),
+        "reference_mesh": str(table.reference_mesh),
         "discretisation_error": table.discretisation_error.tolist(),
         "frequencies_hz": table.frequencies.tolist(),
         "raster": asdict(table.raster),
@@ -123,17 +106,15 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
     write_arrays(place, {"header": encoded, **arrays})
 
 
-def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
+def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable:
     """Read a table.
 
-    fingerprint: of the rig, if the table must be of its plate. Raises InputError for a missing,
-    damaged or foreign file.
+    rig: that it must be of, but for what may differ (`model.rig.rig.MAY_DIFFER`). Raises InputError
+    for a missing, damaged or foreign file, with the keys in which it is of another rig.
     """
     path = expect_path(path, what="path")
-    if fingerprint is not None and not isinstance(fingerprint, str):
-        raise InputError(
-            f"fingerprint must be text, got {shown(fingerprint)}; give rig.fingerprint"
-        )
+    if rig is not None:
+        expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     rebuild = f"build it again, with the options it had: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
@@ -153,7 +134,7 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         ) from error
     try:
         text = content.pop("header").tobytes()
-        header = _Header.model_validate_json(text)
+        header = _WholeHeader.model_validate_json(text)
     except ValidationError as error:
         where, said = first_problem(error)
         raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
@@ -170,11 +151,12 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         raise InputError(f"{path}: {error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
         raise InputError(f"{path}: fingerprint does not match the plate of the file; {rebuild}")
-    if fingerprint is not None and fingerprint != table.fingerprint:
+    if rig is not None and (different := differences(table, rig)):
+        more = len(different) - _MAX_SHOWN
         raise InputError(
-            f"{path}: fingerprint must be the rig's, {fingerprint[:12]}, got "
-            f"{table.fingerprint[:12]}, of another plate, uncertainty or fingertip; build it "
-            f"again: era table build RIG -o {path} {_options(table)}"
+            f"{path}: must be a table of this rig: {'; '.join(different[:_MAX_SHOWN])}"
+            f"{f'; and {more} more' if more > 0 else ''}; build it again: era table build RIG "
+            f"-o {path} {_options(table)}"
         )
     return table
 
@@ -202,17 +184,13 @@ def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     return digest_of(json.dumps(hashed, sort_keys=True), arrays)
 
 
-def _assemble(header: _Header, arrays: dict[str, NDArray[Any]]) -> LocalizationTable:
+def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
     """Build a table from checked entries; sizes must match and all numbers be finite."""
+    physics: dict[str, Any] = {name: getattr(header, name) for name in PHYSICS}
     table = LocalizationTable(
-        plate=header.plate,
-        eras=header.eras,
-        masses=header.masses,
-        uncertainty=header.uncertainty,
-        fingertip=header.fingertip,
-        threshold=header.threshold,
-        mesh=mesh_from_dict(header.mesh.model_dump()),
-        reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
+        **physics,
+        mesh=parse_mesh(header.mesh, physics["plate"]),
+        reference_mesh=parse_mesh(header.reference_mesh, physics["plate"]),
         discretisation_error=np.array(header.discretisation_error, dtype=float),
         raster=header.raster,
         grid=header.grid,

@@ -5,50 +5,55 @@ deviations are values of the rig, and masses and moved ERAs act where the raster
 For changes as a plate in service has them; a rig that is another is built anew.
 """
 
-import math
-from dataclasses import astuple, fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.rig.rig import Rig
-from model.structure.attachments import footprints_of
+from model.rig.rig import Rig, differences
+from model.structure.attachments import Era, footprints_of
+from model.structure.modal_elasticity import check_scales
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+
+_Part = TypeVar("_Part", Plate, Era)
 
 _SAME_PLACE = 1e-9  # m
 _MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
 
 
+_FOLLOWED = ("masses", "uncertainty", "fingertip", "threshold")
+_FOLLOWED_OF_PLATE = ("loss_factor", "loss_exponent", "mode_deviations")
+_FOLLOWED_OF_ERA = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
+"""Fields of a rig, its plate and its ERAs that may differ; all others must be the table's."""
+
+
 def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     """The table for a rig whose parameters differ from those that it was built for.
 
-    Raises InputError for other ERAs, a plate that differs in more than modulus, thickness, losses
-    and deviations of modes, those of all layers alike, and for frequencies or masses of modes that
-    differ by more than 10 %, 1 % before an air gap.
+    Raises InputError for a rig that differs in more than modulus and thickness, those of all layers
+    alike, and what is followed; for frequencies or masses of modes that differ by more than 10 %,
+    1 % before an air gap; and for a plate of which a part does not scale.
     """
     before, after = table.plate, rig.plate
-    names = [era.name for era in table.eras]
-    if [era.name for era in rig.eras] != names:
-        raise InputError(
-            f"ERAs must be {', '.join(names)}, those of the table, got "
-            f"{', '.join(era.name for era in rig.eras)}; build it again"
-        )
     thicker = after.thickness / before.thickness
     stiffer = after.material.E / before.material.E
+    others = {era.name: era for era in rig.eras}
     like = replace(
-        before.scaled(modulus=stiffer, thickness=thicker),
-        loss_factor=after.loss_factor,
-        loss_exponent=after.loss_exponent,
-        mode_deviations=after.mode_deviations,
+        table,
+        plate=_taking(before.scaled(modulus=stiffer, thickness=thicker), after, _FOLLOWED_OF_PLATE),
+        eras=tuple(_taking(era, others.get(era.name, era), _FOLLOWED_OF_ERA) for era in table.eras),
+        **{name: getattr(rig, name) for name in _FOLLOWED},
     )
-    for field, own, other in zip(fields(Plate), astuple(like), astuple(after), strict=True):
-        if not _is_same(own, other):
-            raise InputError(
-                f"plate.{field.name} must be that of the table, but for one factor on all moduli "
-                f"and one on all thicknesses, {own}, got {other}; build it again"
-            )
+    if different := differences(like, rig):
+        raise InputError(
+            "a table can follow one factor on all moduli and one on all thicknesses; but for that "
+            f"{'; '.join(different)}; build it again"
+        )
+    check_scales(before, thicker, stiffer)
     faster = thicker * np.sqrt(stiffer)
     max_scale = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
     if max(abs(thicker - 1), abs(faster - 1)) > max_scale:
@@ -57,13 +62,7 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
             f"factors of {thicker:.4g} and {faster:.4g}; build it again"
         )
     return replace(
-        table,
-        plate=after,
-        eras=rig.eras,
-        masses=rig.masses,
-        uncertainty=rig.uncertainty,
-        fingertip=rig.fingertip,
-        threshold=rig.threshold,
+        like,
         omega=faster * table.omega,
         losses=faster**2 * table.losses,
         dispersion=faster**2 * table.dispersion,
@@ -72,13 +71,9 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     )
 
 
-def _is_same(one: object, other: object) -> bool:
-    """Whether values, and those in them, are the same but for rounding."""
-    if isinstance(one, tuple) and isinstance(other, tuple):
-        return len(one) == len(other) and all(map(_is_same, one, other))
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other)
-    return one == other
+def _taking(own: _Part, other: _Part, names: Sequence[str]) -> _Part:
+    """A part of a rig with some fields of another."""
+    return replace(own, **{name: getattr(other, name) for name in names})
 
 
 def _attachment_shapes(table: LocalizationTable, rig: Rig) -> FloatArray:

@@ -23,7 +23,7 @@ from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import decibels, detection_threshold, is_background
 from model.reduction.reduced_plate import ReducedPlate
-from model.rig.rig import physics_fingerprint
+from model.rig.rig import fingerprint_of
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
@@ -116,9 +116,7 @@ class LocalizationTable:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the rig that this table is for."""
-        return physics_fingerprint(
-            self.plate, self.eras, self.masses, self.uncertainty, self.fingertip, self.threshold
-        )
+        return fingerprint_of(self)
 
     @property
     def pattern_count(self) -> int:

@@ -44,7 +44,7 @@ def cached_table(
         return solve_table(problem, drive_mode=drive_mode), None
     path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
     try:
-        table = load_table(path, fingerprint=rig.fingerprint)
+        table = load_table(path, rig=rig)
     except InputError as error:
         reason, _, _ = str(error).partition("; ")  # without the remedy, which follows here
         _logger.info("table cache: building a table: %s", reason)

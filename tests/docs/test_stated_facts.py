@@ -13,8 +13,10 @@ from drivers.errors import CommandError
 from drivers.protocol.table import REACTION
 from drivers.protocol.timing import BOOT_TIME
 from drivers.wires.known import address_of
-from model.table.request import MIN_CONTRAST_DB
+from model.table.effect_level import MIN_RAISED_CONTRAST_DB
+from model.table.request import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.table.verify import MIN_KEPT_SHARE
+from model.table.weak_cells import WANTED_CONTRAST_DB
 from registry.limits import GuardLimits
 
 ROOT = Path(model.__file__).parents[1]
@@ -33,12 +35,43 @@ def text_of(page: str) -> str:
         ("docs/architecture.md", r"no frame confirms \((\d+) ms", 1000 * CONTACT_TIMEOUT),
         ("docs/reference/touch.md", r"after (\d+) ms without a frame", 1000 * CONTACT_TIMEOUT),
         ("docs/reference/protocol.md", r"of its request \| – \| (\d+) ms", 1000 * REACTION),
-        ("docs/reference/effects.md", r"below (\d+) dB at any finger", MIN_CONTRAST_DB),
+        *(
+            (f"docs/{page}.md", stated, MIN_CONTRAST_DB)
+            for page, stated in (
+                ("reference/effects", r"less than (\d+) dB, contents give way"),
+                ("reference/effects", r"(\d+) to \d+ dB \| `mixed`"),
+                ("reference/effects", r"\| below (\d+) dB at any finger"),
+                ("reference/effects", r"still below (\d+) dB"),
+                ("reference/effects", r"would fall below (\d+) dB"),
+                ("reference/effects", r"names the pairs below (\d+) dB"),
+                ("reference/commands", r"not even one content reaches (\d+) dB"),
+                ("reference/python-api", r"would have less than (\d+) dB"),
+                ("tutorials/reading-a-table", r"with less than (\d+) dB vibrations are"),
+                ("how-to/design-a-layout", r"same time, below (\d+) dB"),
+                ("measured/promise", r"which below (\d+) dB they are"),
+            )
+        ),
+        *(
+            (f"docs/{page}.md", stated, OWN_CONTRAST_DB)
+            for page, stated in (
+                ("reference/effects", r"\| from (\d+) dB \| `own`"),
+                ("reference/effects", r"to (\d+) dB \| `mixed`"),
+                ("reference/effects", r"`own: true`: (\d+) dB are required"),
+                ("reference/effects", r"duration; below (\d+) dB they are mixed"),
+                ("reference/api", r"promised contrast below (\d+) dB"),
+                ("concepts/each-finger-its-own", r"^(\d+) dB make a content"),
+                ("tutorials/reading-a-table", r"less than (\d+) dB\s+are `mixed`"),
+                ("how-to/design-a-layout", r"from (\d+) dB two regions"),
+            )
+        ),
+        ("docs/reference/effects.md", r"half of it \((\d+) dB\)", MIN_RAISED_CONTRAST_DB),
+        ("docs/reference/table-file.md", r"has (\d+) dB of felt contrast", WANTED_CONTRAST_DB),
+        ("docs/concepts/localization.md", r"have (\d+) dB to the median", WANTED_CONTRAST_DB),
     ],
 )
 def test_page_states_the_constant(page: str, stated: str, constant: float) -> None:
     """The number beside these words is that of the code."""
-    (found,) = re.findall(stated, text_of(page))
+    (found,) = re.findall(stated, text_of(page), re.MULTILINE)
     assert float(found) == pytest.approx(constant)
 
 

@@ -17,7 +17,7 @@ PATTERN = era.Pattern({"SW": era.Tone(110.0, 1e-5)}, 0.04, 20.0, None, None)
 GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.load_rig: {"path": era.example_rig_path(), "mesh": "12x9"},
     era.example_rig_path: {},
-    era.load_table: {"path": "t.npz", "fingerprint": RIG.fingerprint},
+    era.load_table: {"path": "t.npz", "rig": RIG},
     era.save_table: {"table": None, "path": "t.npz"},
     era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
     era.query: {

@@ -17,7 +17,7 @@ from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.play.choice import Chooser
+from controller.play.chooser import Chooser
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
 from controller.play.selection import Selector

@@ -440,7 +440,7 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
         def refuse(*_: Any, **__: Any) -> None:
             raise InputError("nothing is felt there")
 
-        monkeypatch.setattr("controller.play.choice.query_table", refuse)
+        monkeypatch.setattr("controller.play.chooser.query_table", refuse)
         fingers.at[2] = (0.162, 0.049)
         await fingers.hold(0.02)
         assert len(fingers.committed) == count
@@ -564,7 +564,7 @@ async def test_an_answer_that_fails_silences_all_and_says_why(
 
     async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
         with monkeypatch.context() as patched:
-            patched.setattr("controller.play.choice.query_jointly", fail)
+            patched.setattr("controller.play.chooser.query_jointly", fail)
             fingers.at[2] = RIGHT
             await fingers.hold(0.5)
         assert calls == 1

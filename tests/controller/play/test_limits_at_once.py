@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.choice import Chooser
+from controller.play.chooser import Chooser
 from controller.play.content import Selection
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.joint_answer import query_jointly, unshaped

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.choice import Chooser
+from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
 from controller.play.table_query import strongest

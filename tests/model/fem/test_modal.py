@@ -12,7 +12,7 @@ from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Element, Mesh
 from model.fem.plate import PlateMatrices, assemble, lowest_modes, rigidities
 from model.reduction.free_plate import solve_free_plate
-from model.rig.meshes import mesh_from_dict, parse_mesh
+from model.rig.meshes import parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
 from model.vibration.natural_modes import natural_modes
@@ -155,12 +155,6 @@ def test_mesh_refuses_no_elements_and_wide_strips(arguments):
     """No elements, or strips that fill the plate."""
     with pytest.raises(InputError, match=r"^mesh: "):
         Mesh(*arguments)
-
-
-def test_mesh_refuses_an_unknown_element():
-    """The error names the element."""
-    with pytest.raises(InputError, match="'MITC9'"):
-        mesh_from_dict(Mesh(4, 4, 0.3, 0.2).to_dict() | {"element": "MITC9"})
 
 
 DX, DY = 0.03, 0.02  # m; not square, so that a swap of x and y shows

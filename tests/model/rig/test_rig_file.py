@@ -365,18 +365,6 @@ def test_load_rig_moves_an_era_within_rounding_onto_the_edge(tmp_path: Path) -> 
     assert rig.era("NE").x == 0.3048
 
 
-def test_fingerprint_depends_on_values_only(tmp_path: Path) -> None:
-    """Units, a material's name and the wiring do not make another plate; a value does."""
-    fingerprint = load_rig(write(tmp_path, GOOD)).fingerprint
-    same = GOOD.replace("12 in", "304.8 mm").replace(
-        "aluminium", "{name: alloy, E: 70e9, rho: 2.7 g/cm^3, nu: 33 %}"
-    )
-    same = same.replace("channel: 1", "channel: 3").replace("sim://", "serial:///dev/ttyUSB0")
-    assert load_rig(write(tmp_path, same)).fingerprint == fingerprint
-    other = GOOD.replace("1.5 mm", "1.5001 mm")
-    assert load_rig(write(tmp_path, other)).fingerprint != fingerprint
-
-
 def test_config_check_refuses_an_unsupported_plate(tmp_path: Path) -> None:
     """Two ERAs let the plate tip over; such a rig loads, so that a study can start from it."""
     path = write(tmp_path, GOOD)

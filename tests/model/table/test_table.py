@@ -257,7 +257,7 @@ def test_a_frequency_that_a_table_lacks_is_refused(table: LocalizationTable) -> 
 
 
 def test_other_plates_are_refused(rig: Rig, table: LocalizationTable) -> None:
-    """Other ERAs, sides, masses or layers, or a thickness 20 % larger, need a build."""
+    """Other ERAs or strokes, sides, masses or layers, or a thickness 20 % larger: build."""
     plate, half = rig.plate, Layer(rig.plate.material, rig.plate.thickness / 2)
     layered = replace(plate, laminate=Laminate((half, half)))
     heavier = replace(half, material=replace(half.material, rho=2 * half.material.rho))
@@ -278,6 +278,10 @@ def test_other_plates_are_refused(rig: Rig, table: LocalizationTable) -> None:
     ):
         with pytest.raises(InputError):
             table_following(one, replace(rig, plate=other))
-    for other in (replace(rig, eras=rig.eras[:3]), *(replace(rig, plate=each) for each in plates)):
+    longer = replace(rig.eras[0], stroke=2 * rig.eras[0].stroke)
+    for other in (
+        *(replace(rig, eras=eras) for eras in (rig.eras[:3], (longer, *rig.eras[1:]))),
+        *(replace(rig, plate=each) for each in plates),
+    ):
         with pytest.raises(InputError):
             table_following(table, other)

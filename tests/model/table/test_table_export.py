@@ -12,6 +12,7 @@ from scipy.io import loadmat
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
+from model.structure.plate import AirGap, Laminate, Layer
 from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table
@@ -49,10 +50,25 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     assert struct.fingerprint == table.fingerprint
     assert struct.mode == "switched"
     assert struct.plate.length_m == 0.3048
-    assert struct.plate.E_pa == 70e9
+    assert struct.plate.material.E_pa == 70e9
+    assert struct.plate.air_gap.size == 0
+    assert (struct.fingertip.phalanx_mass_kg, struct.uncertainty.thickness) == (0.005, 0.02)
     assert [era.name for era in struct.eras] == ["SW", "SE", "NE", "NW"]
     assert [era.stiffness_n_m for era in struct.eras] == [17000.0] * 4
     assert struct.eras[2].x_m == 0.3048
+
+
+def test_export_mat_holds_layers_and_air(table, tmp_path):
+    """A laminate is a struct with its layers, each with its material and rows by frequency."""
+    metal, rows = table.plate.material, ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
+    layers = (Layer(metal, 0.001), Layer(metal, 0.0005, by_frequency=rows))
+    plate = replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
+    export_mat(replace(table, plate=plate), tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"].plate
+    assert (struct.air_gap.depth_m, struct.air_gap.closed) == (0.002, 1)
+    first, second = struct.laminate.layers
+    assert (first.thickness_m, first.material.rho_kg_m3) == (0.001, metal.rho)
+    np.testing.assert_array_equal(second.by_frequency, rows)
 
 
 def test_export_mat_holds_masses(table, tmp_path):
@@ -126,9 +142,9 @@ def test_export_csv_of_fields(table, tmp_path):
 
 
 def test_format_page_names_everything_exported(struct, tmp_path, table):
-    """Every field of the struct and of its structs, every array and every key of the header."""
+    """Every field of the struct, every array and every key of the header."""
     page = (Path(__file__).parents[3] / "docs/reference/table-file.md").read_text("utf-8")
-    names = [*struct._fieldnames, *struct.plate._fieldnames, *struct.eras[0]._fieldnames]
+    names = [*struct._fieldnames]
     save_table(table, tmp_path / "t.npz")
     with np.load(tmp_path / "t.npz") as content:
         names += [*content, *json.loads(content["header"].tobytes())]

@@ -1,0 +1,157 @@
+"""Tables of keys: unit, default, limits and meaning of each, from the sections of a file.
+
+A key's meaning stands below it in its class, in the words of the page; a paragraph that begins with
+`Default:` or `Limits:` says what the type does not.
+"""
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from enum import Enum
+from itertools import pairwise
+from textwrap import dedent
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+from annotated_types import Ge, Le, MaxLen, MinLen
+from pydantic.fields import FieldInfo
+
+from model.config.sections import Quantity, Section
+from model.config.units import COMMON_FACTORS
+
+HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
+
+
+def key_rows(page: str, heading: str) -> dict[str, list[str]]:
+    """The table of keys under a heading of the second level: [unit, default, limits, meaning]."""
+    (text,) = [
+        section
+        for section in re.split(r"^## ", page, flags=re.MULTILINE)
+        if section.startswith(f"{heading}\n")
+    ]
+    table = text[text.index("| key |") :].split("\n\n")[0].splitlines()[2:]
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table]
+    return {key.replace("`", ""): rest for key, *rest in cells}
+
+
+def key_table(section: type[Section]) -> str:
+    """The table of all keys of a section."""
+    return "\n".join([HEAD, *rows_of(section)])
+
+
+def rows_of(section: type[Section], *, above: type[Section] = Section) -> Iterator[str]:
+    """A row for each key that a section has and the one above it has not, in their order.
+
+    Of a section that has one above it the name is before the key, as in `click.duration`.
+    """
+    prefix = "" if above is Section else f"{section.__name__.lower()}."
+    said = _docstrings(section)
+    for name, field in section.model_fields.items():
+        if name in above.model_fields:
+            continue
+        meaning, *further = said[name].split("\n\n")
+        stated = dict(" ".join(each.split()).split(": ", 1) for each in further)
+        quantity = next(iter(quantities(field)), None)
+        cells = (
+            f"`{prefix}{name}`",
+            quantity.dimension.unit if quantity else "",
+            stated.get("Default") or _default(field, quantity),
+            stated.get("Limits") or (bounds_in_words(quantity) if quantity else _limits(field)),
+            in_cell(meaning),
+        )
+        yield re.sub(r"\|(  )+", "| ", f"| {' | '.join(cells)} |")
+
+
+def in_cell(docstring: str) -> str:
+    """The first paragraph, in one line, as a cell: without full stop and capital, but of names."""
+    text = " ".join(docstring.split("\n\n")[0].split()).removesuffix(".")
+    first = text.split(" ")[0]
+    return text[0].lower() + text[1:] if first.istitle() and "'" not in first else text
+
+
+def quantities(field: FieldInfo) -> list[Quantity]:
+    """Every Quantity that a field's type carries, however deep."""
+
+    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
+        found = [part for part in metadata if isinstance(part, Quantity)]
+        for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
+            found += [part] if isinstance(part, Quantity) else within(part)
+        return found
+
+    return within(field.annotation, field.metadata)
+
+
+def bounds_in_words(asked: Quantity) -> str:
+    """Every finite bound of a quantity, in the words of the error."""
+    bounds = {
+        "above": asked.above,
+        "at least": asked.at_least,
+        "at most": asked.at_most,
+        "below": asked.below,
+    }
+    return ", ".join(f"{word} {b:g}" for word, b in bounds.items() if abs(b) != float("inf"))
+
+
+def _docstrings(of: type) -> dict[str, str]:
+    """What stands below each field of a class, by its name."""
+    (tree,) = ast.parse(dedent(inspect.getsource(of))).body
+    body = tree.body if isinstance(tree, ast.ClassDef) else []
+    return {
+        field.target.id: inspect.cleandoc(str(below.value.value))
+        for field, below in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+    }
+
+
+def _default(field: FieldInfo, quantity: Quantity | None) -> str:
+    value = field.get_default(call_default_factory=True)
+    if field.is_required():
+        return "required"
+    if value is None or value in ({}, []):
+        return "none"
+    if isinstance(value, Section):
+        return "see there"
+    if isinstance(value, tuple):
+        return f"`[{', '.join(f'{each:g}' for each in value)}]`"
+    if quantity is None:
+        return f"`{str(value).lower()}`"
+    units = COMMON_FACTORS[quantity.dimension.unit] if quantity.dimension.unit else {}
+    forms = [f"{value:.7g}", *(f"{value / float(by):.7g} {unit}" for unit, by in units.items())]
+    return min(forms, key=lambda form: (len(form.split()[0]), len(form)))
+
+
+def _limits(field: FieldInfo) -> str:
+    """Choices, the range of a whole number, or how many entries there may be."""
+    kind, bounds = field.annotation, field.metadata
+    parts = get_args(kind)
+    if parts and parts[-1] is NoneType:  # of a key that may be left out
+        kind = (get_args(parts[0]) or parts)[0]
+        annotations = getattr(parts[0], "__metadata__", ())
+        bounds = [own for each in annotations for own in getattr(each, "metadata", (each,))]
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{each}`" for each in get_args(kind))
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return ", ".join(f"`{each.value}`" for each in kind)
+    least = next(
+        (
+            str(b.ge if isinstance(b, Ge) else b.min_length)
+            for b in bounds
+            if isinstance(b, Ge | MinLen)
+        ),
+        "",
+    )
+    most = next(
+        (
+            str(b.le if isinstance(b, Le) else b.max_length)
+            for b in bounds
+            if isinstance(b, Le | MaxLen)
+        ),
+        "",
+    )
+    if least and most:
+        return f"{least} to {most}"
+    return f"{least} or more" if least else f"up to {most}" if most else ""

@@ -1,0 +1,26 @@
+"""The tables of keys in reference/rig.md, from the sections of a rig file."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from key_tables import key_table
+from model.config.sections import Section
+from model.rig import sections
+
+SECTIONS: Mapping[str, type[Section]] = {
+    "rig": sections.RigSection,
+    "plate": sections.PlateSection,
+    "layers": sections.LayerSection,
+    "air_gap": sections.AirGapSection,
+    "material": sections.MaterialSection,
+    "eras": sections.EraSection,
+    "masses": sections.MassSection,
+    "amplifiers": sections.AmplifierSection,
+    "limits": sections.LimitsSection,
+    "uncertainty": sections.UncertaintySection,
+    "fingertip": sections.FingertipSection,
+}
+
+PARTS: Mapping[str, Callable[[], str]] = {
+    name: partial(key_table, each) for name, each in SECTIONS.items()
+}

@@ -1,11 +1,14 @@
 """Status and events of the daemon, as commands show them to people."""
 
+from collections.abc import Iterable
 from datetime import datetime
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.client_protocol import Notification
 from controller.api.methods import StatusResult
-from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
+from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
+from drivers.protocol.table import readings_in
 from model.counting import counted
 
 
@@ -115,6 +118,13 @@ def _learning(learning: LearningSummary) -> list[str]:
     ]
 
 
+def _readings(amplifier: AmplifierStatus) -> Iterable[tuple[str, object]]:
+    """What an amplifier has measured, where it has a place in its line."""
+    for each in readings_in("status"):
+        unit = each.quantity.unit.replace("°", "deg")
+        yield f"{each.label} {{:.{each.decimals}f}} {unit}", getattr(amplifier, each.key)
+
+
 def _amplifier(amplifier: AmplifierStatus) -> str:
     """Format an amplifier's last status."""
     details = _given(
@@ -124,7 +134,7 @@ def _amplifier(amplifier: AmplifierStatus) -> str:
         ("closed because another was lost", amplifier.closed_with_lost),
         ("{}", amplifier.silence and amplifier.silence.words),
         ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
-        ("{:.1f} degC", amplifier.temperature_c),
+        *_readings(amplifier),
         ("last reply {:.2f} s ago", amplifier.reply_age_s),
         ("no reply yet", amplifier.reply_age_s is None),
     )

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.schema import (
     STATE_WORDS,
-    AmplifierStatus,
     LatencySummary,
     LearningSummary,
     PlateEvent,

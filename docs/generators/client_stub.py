@@ -1,6 +1,6 @@
-"""Signatures of the clients' methods that are made from the registry of the API's methods.
+"""Signatures of what the API makes from a table: methods of the clients, readings of amplifiers.
 
-`python docs/generators/client_stub.py` writes controller/api/calls.pyi.
+`python docs/generators/client_stub.py` writes controller/api/calls.pyi and amplifier_status.pyi.
 """
 
 import inspect
@@ -12,16 +12,29 @@ import controller.api
 from controller.api.calls import BY_HAND, signature_of
 from controller.api.methods import METHODS
 from controller.api.schema import Empty
+from drivers.protocol.table import READINGS
 
 STUB = Path(controller.api.__file__).with_name("calls.pyi")
+STATUS_STUB = STUB.with_name("amplifier_status.pyi")
+_HEAD = "# Written by docs/generators/client_stub.py."
+
+
+def status_stub() -> str:
+    """The whole file amplifier_status.pyi."""
+    lines = [
+        *(_HEAD, "", "from controller.api.schema import AmplifierState", ""),
+        "class AmplifierStatus(AmplifierState):",
+        *(f"    {each.key}: float | None{' = None' * each.is_added}" for each in READINGS),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def stub() -> str:
-    """The whole file."""
+    """The whole file calls.pyi."""
     made = {name: method for name, method in METHODS.items() if name not in BY_HAND}
     results = sorted({each.result.__name__ for each in made.values() if each.result is not Empty})
     lines = [
-        "# Written by docs/generators/client_stub.py.",
+        _HEAD,
         "",
         "import inspect",
         "",
@@ -65,3 +78,4 @@ def _kind(annotation: Any) -> str:
 
 if __name__ == "__main__":
     STUB.write_text(stub(), encoding="utf-8")
+    STATUS_STUB.write_text(status_stub(), encoding="utf-8")

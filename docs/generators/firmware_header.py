@@ -30,6 +30,7 @@ from drivers.protocol.table import (
     SHORTENED_FADE,
     STAGED_LIFE,
     STATES,
+    STATUS,
     STATUS_FLAGS,
     VERSION,
 )
@@ -54,7 +55,7 @@ _HEAD = """\
 _RECORDS: Mapping[str, Record] = {
     **{message.name: message.request for message in MESSAGES.values()},
     "Capabilities": MESSAGES["GetCaps"].reply,
-    "Status": MESSAGES["GetStatus"].reply,
+    "Status": STATUS,
     "Taken": MESSAGES["Set"].reply,
     "Faults": MESSAGES["GetFaults"].reply,
     "Achieved": MESSAGES["GetAchieved"].reply,
@@ -127,16 +128,13 @@ def _layout(name: str, record: Record) -> str:
     """Return the places of the fields of a record up to the first of variable length."""
     places, bits, at = dict[str, int](), dict[str, int](), 0
     for field in record.fields:
-        places["BITS" if isinstance(field, Bits) else field.name] = at
-        if isinstance(field, Bits):
-            bits = _bits(field)
-            at += 1
-        elif isinstance(field, Number):
-            at += 2 if field.quantity.wire == "u32" else 1
-        elif isinstance(field, Real):
-            at += 2
-        else:
+        if field in record.added:
             break
+        places["BITS" if isinstance(field, Bits) else field.name] = at
+        if not isinstance(field, Number | Bits | Real):
+            break
+        at += field.words
+        bits = _bits(field) if isinstance(field, Bits) else bits
     return _numbers(f"{_upper(name)}_", {**places, "WORDS": at, **bits}) if places else ""
 
 

@@ -29,6 +29,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     REFUSALS,
     STATES,
+    STATUS,
     STATUS_FLAGS,
     sensor_reading,
 )
@@ -39,7 +40,7 @@ from word_names import word_names
 
 WRITER = "docs/generators/protocol_tables.py"
 _REPLIES: Mapping[str, Record] = {
-    **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": MESSAGES["GetStatus"].reply},
+    **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": STATUS},
     **{"Taken": MESSAGES["Set"].reply, "Faults": MESSAGES["GetFaults"].reply},
     **{"Achieved": MESSAGES["GetAchieved"].reply, "Measured": MESSAGES["GetMeasured"].reply},
     **{"Sensors": MESSAGES["GetSensors"].reply, "Reading": MESSAGES["GetReading"].reply},
@@ -127,9 +128,10 @@ def layout(record: Record) -> str:
 
 def _field(field: object) -> str:
     match field:
-        case Number(name=name, quantity=quantity):
+        case Number(name=name, quantity=quantity, is_added=is_added):
             kind = "" if name == quantity.name else f": {quantity.name}"
-            return name + kind + (" (2 words)" if quantity.wire == "u32" else "")
+            marks = "; ".join(["2 words"] * (quantity.words - 1) + ["added"] * is_added)
+            return name + kind + (f" ({marks})" if marks else "")
         case Bits(parts=parts):
             return "[" + ", ".join(f"{name} {bits}" for name, bits in parts) + "]"
         case Real(name=name):

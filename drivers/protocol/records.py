@@ -2,7 +2,8 @@
 
 Values are the integers of the wire (see `WireQuantity.to_wire`); only type f32 is a float, and a
 text a str. Requests are read strictly, by the amplifier: `Refusal` for a word that is missing, too
-many or out of range. Replies may grow, so what follows their fields is ignored.
+many or out of range. Replies may grow at their end: what follows the fields of a record is ignored,
+and a number that `is_added` is None in the reply of an amplifier that does not state it.
 """
 
 import math
@@ -12,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, product
-from typing import Any
+from typing import Any, Literal
 
 from drivers.errors import CommandError, FrameError
 
@@ -23,7 +24,15 @@ TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
+_KEY_ENDS: Mapping[str, str] = {
+    **{"Hz": "_hz", "s": "_s", "degrees": "_deg", "m": "_m", "V": "_v", "A": "_a", "°C": "_c"},
+    "full levels/s": "_per_s",
+}
+"""Of the keys of values in a unit."""
+
 Values = dict[str, Any]
+View = Literal["status", "page", "metrics"]
+"""Where a reading is shown: the line of `era status`, the dashboard, the metrics."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,11 @@ class WireQuantity:
     def step(self) -> float:
         """Resolution on the wire, in the unit."""
         return 1 / self.per_unit
+
+    @property
+    def words(self) -> int:
+        """How many words a number takes."""
+        return 2 if self.wire == "u32" else 1
 
     @property
     def low(self) -> float:
@@ -101,10 +115,48 @@ class Refusal(FrameError):
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """An integer of a quantity: one word, or two with the high one first for u32."""
+    """An integer of a quantity: one word, or two with the high one first for u32.
+
+    is_added: later than the first edition of its record, at whose end it stands. Amplifiers need
+    not state it: their reply ends before it, or has 0 there as the registers of Modbus do.
+    views: what shows it beside `era amp status` and the API; None if it is no reading.
+    """
 
     name: str
     quantity: WireQuantity
+    is_added: bool = False
+    views: frozenset[View] | None = None
+
+    def __post_init__(self) -> None:
+        if self.is_added and self.quantity.minimum < 1:
+            raise ValueError(f"{self.name} must begin at 1, since 0 is not stated")
+
+    @property
+    def words(self) -> int:
+        """How many words it takes."""
+        return self.quantity.words
+
+    @property
+    def key(self) -> str:
+        """Its name in JSON, which ends in the unit."""
+        return f"{self.name}{_KEY_ENDS.get(self.quantity.unit, '')}"
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        return self.name.replace("_", " ")
+
+    @property
+    def decimals(self) -> int:
+        """Decimal places of its step."""
+        return math.ceil(math.log10(self.quantity.per_unit))
+
+    def in_unit(self, values: Values) -> float | None:
+        """Return its value in the unit, an int without one; None where it is not stated."""
+        value: int | None = values[self.name]
+        if value is None or not self.quantity.unit:
+            return value
+        return self.quantity.from_wire(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +164,7 @@ class Bits:
     """Unsigned numbers that share a word, the first in the highest bits; unused bits are 0."""
 
     parts: tuple[tuple[str, int], ...]
+    words = 1
 
     @property
     def shifts(self) -> list[int]:
@@ -124,6 +177,7 @@ class Real:
     """A number of type f32: finite and not negative, two words."""
 
     name: str
+    words = 2
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the number."""
@@ -239,13 +293,28 @@ Field = Number | Bits | Real | Text | Numbers | Rows | Rest
 
 
 class Record:
-    """Fields that follow each other in words."""
+    """Fields that follow each other in words; those that are added stand at its end.
+
+    places: the word of each value by its name, as far as none before varies in length; words: how
+    many these are.
+    """
 
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
+        self.added = tuple([each for each in fields if isinstance(each, Number) and each.is_added])
+        self._first = fields[: len(fields) - len(self.added)]
+        if any(each in self.added for each in self._first):
+            raise ValueError(f"added fields must be the last, got {fields}")
         self.names: list[str] = []
+        self.places: dict[str, int] = {}
+        self.words, is_fixed = 0, True
         for field in fields:
-            self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
+            names = [*dict(field.parts)] if isinstance(field, Bits) else [field.name]
+            self.names += names
+            is_fixed = is_fixed and isinstance(field, Number | Bits | Real) and field in self._first
+            if is_fixed and isinstance(field, Number | Bits | Real):
+                self.places |= dict.fromkeys(names, self.words)
+                self.words += field.words
         self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
         """Of the numbers that share a word."""
 
@@ -258,11 +327,12 @@ class Record:
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
 
-        ValueError for one out of range, KeyError for none.
+        ValueError for one out of range, KeyError for none. What is added and not stated is left out
+        at the end, and 0 before a field that is stated.
 
         Numbers and words, nearly all, without a call: every set has dozens of them.
         """
-        for values, field in product(rows, self.fields):
+        for values, field in product(rows, self._first):
             if isinstance(field, Number):
                 quantity, value = field.quantity, values[field.name]
                 if not quantity.minimum <= value <= quantity.maximum:
@@ -282,7 +352,20 @@ class Record:
                 words.extend(values[field.name])
             else:
                 field.pack(values, words)
+        for values in rows if self.added else ():
+            self._append_added(words, values)
         return words
+
+    def _append_added(self, words: list[int], values: Mapping[str, Any]) -> None:
+        """Append what is added, but for zeros at the end."""
+        end = len(words)
+        for field in self.added:
+            number = values.get(field.name) or 0
+            if number and not field.quantity.minimum <= number <= field.quantity.maximum:
+                raise ValueError(_out_of_range(field.name, field.quantity, number))
+            words.extend(divmod(number, WORD)[-field.words :])
+        while len(words) > end and not words[-1]:
+            words.pop()
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
@@ -322,7 +405,7 @@ class Record:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}
         try:
-            for field in self.fields:
+            for field in self._first:
                 if isinstance(field, Number):
                     quantity, word = field.quantity, words[at]
                     if quantity.wire == "u32":
@@ -356,7 +439,20 @@ class Record:
                     at = field.unpack(words, at, values)
         except IndexError:
             raise Refusal("message is too short", "BAD_LENGTH") from None
-        return values, at
+        return values, self._read_added(words, at, values) if self.added else at
+
+    def _read_added(self, words: Sequence[int], at: int, values: Values) -> int:
+        """Read what is added, None where the words end before or are 0; return the next index."""
+        for field in self.added:
+            end = at + field.words
+            number = 0
+            for word in (*words[at:end], 0, 0)[: field.words]:
+                number = number * WORD + word
+            if number and not field.quantity.minimum <= number <= field.quantity.maximum:
+                raise Refusal(_out_of_range(field.name, field.quantity, number))
+            values[field.name] = number or None
+            at = min(end, len(words))
+        return at
 
     def unpack(self, words: Sequence[int], *, is_strict: bool) -> Values:
         """Read the values; is_strict: nothing may follow them. Raises Refusal."""

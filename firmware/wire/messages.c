@@ -93,7 +93,7 @@ static void put_status(struct words *reply, struct amplifier *amplifier)
     words[STATUS_LATCH] = amplifier->latch;
     words[STATUS_WATCHDOG_LEFT] = amplifier_watchdog_left(amplifier);
     words[STATUS_TEMPERATURE] = (uint16_t)amplifier->measured.temperature;
-    words[STATUS_VOLTAGE] = amplifier->measured.voltage;
+    words[STATUS_HIGH_VOLTAGE] = amplifier->measured.voltage;
     words[STATUS_TOKEN] = amplifier->committed;
     words[STATUS_BITS] = (uint16_t)(CHANNELS << STATUS_CHANNELS_SHIFT | LAYERS);
     reply->count = STATUS_WORDS;

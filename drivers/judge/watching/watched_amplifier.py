@@ -13,7 +13,6 @@ from drivers.judge.watching.decoded import (
     CHANGING,
     FEEDING,
     REPLIES,
-    STATUS_RECORD,
     Request,
     Sent,
     is_carried_out,
@@ -21,7 +20,7 @@ from drivers.judge.watching.decoded import (
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION
+from drivers.protocol.table import REACTION, STATUS
 
 _LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
 
@@ -106,7 +105,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         self._answered = sent.number
         name = sent.request.name
         self.advance(sent.earliest)
-        if REPLIES.get(name) is STATUS_RECORD:
+        if REPLIES.get(name) is STATUS:
             self._resolve(sent.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return

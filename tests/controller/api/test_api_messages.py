@@ -238,6 +238,7 @@ def test_reference_page_is_up_to_date() -> None:
 def test_stub_of_the_clients_is_up_to_date() -> None:
     """Editors and mypy see of each method what is registered of it."""
     assert client_stub.stub() == client_stub.STUB.read_text("utf-8")
+    assert client_stub.status_stub() == client_stub.STATUS_STUB.read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", METHODS)

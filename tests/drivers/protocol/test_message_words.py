@@ -9,7 +9,7 @@ from drivers.protocol.table import BY_NUMBER, IDENTITY, MAX_WORDS, MESSAGES, sen
 
 STATUS: Values = {
     **{"state": 4, "fault": 0, "flags": 1, "latch": 0, "watchdog_left": 250},
-    **{"temperature": -53, "voltage": 1800, "token": 513, "channels": 4, "layers": 2},
+    **{"temperature": -53, "high_voltage": 1800, "token": 513, "channels": 4, "layers": 2},
     **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
 }
 STATUS_WORDS = [

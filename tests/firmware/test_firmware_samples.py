@@ -8,11 +8,17 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
+from drivers.protocol.table import STATUS
 from hand_written import tone as command
 from model.arrays import FloatArray
 from moved_firmware import PER_MS, RATE, SERIAL, MovedFirmware, Script, apply, arm, replay, request
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
+
+
+def word_of(status: bytes, name: str) -> int:
+    """A word of an unstuffed status, behind type, version, address and sequence."""
+    return int.from_bytes(status[5 + 2 * STATUS.places[name] :][:2], "little")
 
 
 def seconds(count: int) -> FloatArray:
@@ -125,7 +131,7 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < TOLERANCE
     firmware.receive(SERIAL, request(hand.GET_STATUS))
     status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
-    assert (status[5], status[7]) == (7, 1)  # FAULT, of the watchdog
+    assert (word_of(status, "state"), word_of(status, "fault")) == (hand.FAULT, hand.WATCHDOG)
 
 
 def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
@@ -137,5 +143,5 @@ def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
     firmware.move(0.21)
     firmware.receive(SERIAL, request(hand.GET_STATUS))
     status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
-    assert status[5] == 4  # OPERATION_ENABLED
-    assert int.from_bytes(status[13:15], "little") == pytest.approx(40, abs=1)
+    assert word_of(status, "state") == hand.ENABLED
+    assert word_of(status, "watchdog_left") == pytest.approx(40, abs=1)

@@ -7,24 +7,30 @@ import tty
 import minimalmodbus
 import pytest
 
-from drivers.protocol.table import STATES
+from drivers.protocol.table import STATES, STATUS
+from drivers.wires.modbus.registers import HEAD
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
-STATUS = 256 * 9 + 128
+STATUS_AREA = 256 * 9 + 128
+
+
+def register(name: str) -> int:
+    """The register of a value of the status, of the first level for the levels."""
+    return STATUS_AREA + HEAD + STATUS.places.get(name, STATUS.words)
 
 
 def drive(master: minimalmodbus.Instrument) -> None:
     """Identity, status, arm, a set of one tone, a refusal, stop; every function it has."""
     assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
-    assert master.read_register(STATUS + 2, functioncode=3) == STATES["SWITCH_ON_DISABLED"]
-    assert master.read_register(STATUS + 7, 1, functioncode=4, signed=True) == 25.0
+    assert master.read_register(register("state"), functioncode=3) == STATES["SWITCH_ON_DISABLED"]
+    assert master.read_register(register("temperature"), 1, functioncode=4, signed=True) == 25
     master.write_registers(0x300, [1, 9, 2000])
     master.write_registers(0x500, [2, 9, 7, 3, 1, 0, 0, 0x30, 2200, 2000, 0])
     assert master.read_registers(0x580, 5) == [2, 0, 7, 5, 0]
-    levels = STATUS + 2 + 9
+    levels = register("levels")
     assert master.read_registers(levels, 4, functioncode=4) == [0, 0, 0, 2000]
-    assert master.read_register(STATUS + 2 + 7) == 7
+    assert master.read_register(register("token")) == 7
     with pytest.raises(minimalmodbus.IllegalRequestError):
         master.write_register(0x900, 1, functioncode=6)
     master.write_registers(0x800, [3, 0])

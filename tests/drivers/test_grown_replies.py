@@ -9,7 +9,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from drivers.protocol.table import MESSAGES, QUANTITIES, STATUS
 from firmware_header import header
-from grown_status import SUPPLY, WORD
+from grown_status import LATER, WORD
 from grown_status import age as age
 from hand_written_talk import HALF, Talk
 from judged_line import judged
@@ -19,7 +19,7 @@ from sim.far_ends.can_bus.word_objects import ObjectServer, SdoAbort
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of
 
-STATED = {"older": {"supply_voltage": None}, "same": {"supply_voltage": WORD}, "newer": {}}
+STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
 """Of what is added, by the age of the amplifier."""
 
 
@@ -35,11 +35,13 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
     assert end.levels("a") == [0.5, 0.0]
     assert {each: status[each] for each in status if each not in _FIRST} == STATED[age]
     shown = {"older": None, "same": 24.0, "newer": "no key"}[age]
-    assert status_rows(status).get("supply_voltage_v", "no key") == shown
+    assert status_rows(status).get("later_voltage_v", "no key") == shown
     assert (await group.stop())["a"].is_confirmed
 
 
 _FIRST = frozenset(STATUS.names)
+_OLDER = 9 + 4 + 8 + sum(each.words for each in STATUS.added)
+"""Words of 4 channels and 8 layers."""
 _CHECKS = ("capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths")
 
 
@@ -59,22 +61,22 @@ def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch
 
 
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
-    """21 words of 4 channels and 8 layers, and the one that is added under the next subindex."""
+    """Those of 4 channels and 8 layers, and the one that is added under the next subindex."""
     objects = ObjectServer(Amplifier("a", channels=4), 1)
     if age == "older":
-        assert objects.read(0x2002, 0, 0.0) == bytes([21])
+        assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER])
         with pytest.raises(SdoAbort):
-            objects.read(0x2002, 22, 0.0)
+            objects.read(0x2002, _OLDER + 1, 0.0)
     else:
-        assert objects.read(0x2002, 0, 0.0) == bytes([22])
-        assert int.from_bytes(objects.read(0x2002, 22, 0.0), "little") == WORD
+        assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER + 1])
+        assert int.from_bytes(objects.read(0x2002, _OLDER + 1, 0.0), "little") == WORD
 
 
 @pytest.mark.parametrize("age", ["same"], indirect=True)
 def test_pages_and_files_have_what_is_added(age: str) -> None:
     """At the end of its row and sheet; the places of the header stay as they are."""
-    assert " · tokens: played_token, each of layers · supply_voltage (added) |" in records()
-    assert "[2002sub16]\nParameterName=supply_voltage\n" in eds_text()
+    assert " · later_voltage (added) |" in records()
+    assert f"[2002sub{_OLDER + 1:X}]\nParameterName=later_voltage\n" in eds_text()
     assert "STATUS_LEVELS = 9, STATUS_WORDS = 9, STATUS_CHANNELS_SHIFT" in header()
 
 
@@ -82,7 +84,7 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
     """Two are added, the first of two words; nothing behind them is looked at."""
     age_, code = (Number(name, QUANTITIES[name]) for name in ("age", "code"))
     long = Number("long", WireQuantity("long", "u32", 1, "", 1, 1 << 31), is_added=True)
-    record = Record(code, long, SUPPLY)
+    record = Record(code, long, LATER)
     for words, stated in {
         (7,): (None, None),
         (7, 1): (65536, None),
@@ -90,7 +92,7 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
         (7, 0, 0, 2400): (None, 2400),
         (7, 1, 2, 2400, 9): (65538, 2400),
     }.items():
-        values = dict(zip(("code", "long", SUPPLY.name), (7, *stated), strict=True))
+        values = dict(zip(("code", "long", LATER.name), (7, *stated), strict=True))
         assert record.unpack(words, is_strict=False) == values
         assert record.pack(values) == [*words[:4]]
     with pytest.raises(Refusal):

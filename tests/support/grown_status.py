@@ -10,8 +10,8 @@ from drivers.protocol.table import STATUS
 from drivers.wires.wire import reply_words
 from sim.amplifier.contract import Amplifier
 
-SUPPLY = Number(
-    "supply_voltage", WireQuantity("supply_voltage", "u16", 100, "V", 1, 65535), is_added=True
+LATER = Number(
+    "later_voltage", WireQuantity("later_voltage", "u16", 100, "V", 1, 65535), is_added=True
 )
 WORD = 2400
 """That it states: 24 V."""
@@ -25,13 +25,13 @@ def make_of_age(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
         pack = STATUS.pack
         monkeypatch.setattr(STATUS, "pack", lambda values: [*pack(values), WORD])
         return
-    for name, value in vars(Record(*STATUS.fields, SUPPLY)).items():
+    for name, value in vars(Record(*STATUS.fields, LATER)).items():
         monkeypatch.setattr(STATUS, name, value)
     status = Amplifier.status
     if age == "same":
 
         def stating(amplifier: Amplifier, now: float) -> Values:
-            return {**status(amplifier, now), SUPPLY.name: WORD}
+            return {**status(amplifier, now), LATER.name: WORD}
 
         monkeypatch.setattr(Amplifier, "status", stating)
 

@@ -6,13 +6,14 @@ import pytest
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BY_NUMBER, IDENTITY, MAX_WORDS, MESSAGES, sensor_reading
+from drivers.protocol.table import STATUS as STATUS_RECORD
 
 STATUS: Values = {
     **{"state": 4, "fault": 0, "flags": 1, "latch": 0, "watchdog_left": 250},
     **{"temperature": -53, "high_voltage": 1800, "token": 513, "channels": 4, "layers": 2},
     **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
 }
-NOT_STATED = dict.fromkeys((each.name for each in MESSAGES["GetStatus"].reply.added), None)
+NOT_STATED = dict.fromkeys(each.name for each in STATUS_RECORD.added)
 """What later editions add."""
 STATUS_WORDS = [
     *(4, 0, 1, 0, 250, 0xFFCB, 1800, 513, 0x0402),

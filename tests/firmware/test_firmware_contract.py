@@ -45,7 +45,7 @@ def differences(made: Sent, expected: Sent) -> list[str]:
     return [
         f"{name}: {ours[name]} for {theirs[name]}"
         for name in ours
-        if not agree(name, ours[name], theirs[name])
+        if ours[name] is not None and not agree(name, ours[name], theirs[name])  # None: not stated
     ]
 
 

@@ -26,7 +26,6 @@ from controller.api.schema import (
     Message,
     Name,
     Playing,
-    ReadingDescription,
     RigSummary,
     TableSummary,
     Topic,
@@ -53,8 +52,8 @@ class HelloResult(Message):
     table: TableSummary
     rig_text: str = Field(description="the rig file, from which vibration fields can be computed")
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
-    readings: list[ReadingDescription] = Field(
-        [], description="of the status of an amplifier, those for a page"
+    readings: dict[str, tuple[str, str]] = Field(
+        {}, description="of amplifiers, for a page: name and unit, by the key in their status"
     )
 
 

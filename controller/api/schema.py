@@ -290,14 +290,6 @@ class AmplifierReport(Explained):
     kind: ReportKind
 
 
-class ReadingDescription(Message):
-    """A reading of amplifiers: the key of its value in their status, its name and its unit."""
-
-    key: str
-    label: str
-    unit: str
-
-
 class AmplifierState(Message):
     """One amplifier according to its last reply, but for its readings; null where unknown."""
 

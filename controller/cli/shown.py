@@ -1,6 +1,5 @@
 """Status and events of the daemon, as commands show them to people."""
 
-from collections.abc import Iterable
 from datetime import datetime
 
 from controller.api.amplifier_status import AmplifierStatus
@@ -118,13 +117,6 @@ def _learning(learning: LearningSummary) -> list[str]:
     ]
 
 
-def _readings(amplifier: AmplifierStatus) -> Iterable[tuple[str, object]]:
-    """What an amplifier has measured, where it has a place in its line."""
-    for each in readings_in("status"):
-        unit = each.quantity.unit.replace("°", "deg")
-        yield f"{each.label} {{:.{each.decimals}f}} {unit}", getattr(amplifier, each.key)
-
-
 def _amplifier(amplifier: AmplifierStatus) -> str:
     """Format an amplifier's last status."""
     details = _given(
@@ -134,7 +126,10 @@ def _amplifier(amplifier: AmplifierStatus) -> str:
         ("closed because another was lost", amplifier.closed_with_lost),
         ("{}", amplifier.silence and amplifier.silence.words),
         ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
-        *_readings(amplifier),
+        *(
+            (f"{each.label} {{:g}} {each.quantity.unit}", getattr(amplifier, each.key))
+            for each in readings_in("status")
+        ),
         ("last reply {:.2f} s ago", amplifier.reply_age_s),
         ("no reply yet", amplifier.reply_age_s is None),
     )

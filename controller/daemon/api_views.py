@@ -19,7 +19,6 @@ from controller.api.schema import (
     LinkCounters,
     PlateEvent,
     PlayedTone,
-    ReadingDescription,
     RigSummary,
     TableSummary,
 )
@@ -234,10 +233,9 @@ def hello_result(
         ),
         rig_text=config.rig_text,
         layout=layout,
-        readings=[
-            ReadingDescription(key=each.key, label=each.label.capitalize(), unit=each.quantity.unit)
-            for each in readings_in("page")
-        ],
+        readings={
+            each.key: (each.label.capitalize(), each.quantity.unit) for each in readings_in("page")
+        },
     )
 
 

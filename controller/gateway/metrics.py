@@ -22,8 +22,6 @@ from controller.api.schema import (
 )
 from controller.learning.learning_status import LearningState
 from drivers.host.reports import ReportKind
-from drivers.protocol.records import Number
-from drivers.protocol.table import readings_in
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -35,8 +33,6 @@ _LINK_COUNTS = {
     "timeouts": "Requests without a reply in time.",
     "refusals": "Requests refused by an amplifier.",
 }
-_READINGS = readings_in("metrics")
-_UNITS = {"°C": "celsius", "V": "volts", "A": "amperes"}
 
 
 class _Metrics(Collector):
@@ -172,11 +168,6 @@ def _histogram(name: str, text: str, latency: LatencySummary) -> Metric:
     return HistogramMetricFamily(name, text, buckets=buckets, sum_value=None)
 
 
-def _name_of(reading: Number) -> str:
-    """The name of a reading, with its unit as Prometheus spells it."""
-    return f"{reading.name}_{_UNITS[reading.quantity.unit]}"
-
-
 def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     gauges = {
         name: GaugeMetricFamily(f"era_amplifier_{name}", text, labels=["amplifier"])
@@ -185,7 +176,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
             ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
             ("high_voltage", "Whether high voltage is on."),
-            *((_name_of(each), f"{each.label.capitalize()}.") for each in _READINGS),
+            ("temperature_celsius", "Temperature."),
             ("reply_age_seconds", "Time since the last reply."),
             ("round_trip_seconds", "From the last request to its reply."),
         )
@@ -207,7 +198,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
             "lost": float(amplifier.lost),
             "fault": None if amplifier.fault is None else float(amplifier.fault != "NONE"),
             "high_voltage": amplifier.high_voltage,
-            **{_name_of(each): getattr(amplifier, each.key) for each in _READINGS},
+            "temperature_celsius": amplifier.temperature_c,
             "reply_age_seconds": amplifier.reply_age_s,
             "round_trip_seconds": None if round_trip is None else round_trip / 1e3,
         }

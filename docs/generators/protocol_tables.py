@@ -128,9 +128,9 @@ def layout(record: Record) -> str:
 
 def _field(field: object) -> str:
     match field:
-        case Number(name=name, quantity=quantity, is_added=is_added):
+        case Number(name=name, quantity=quantity, words=words, is_added=is_added):
             kind = "" if name == quantity.name else f": {quantity.name}"
-            marks = "; ".join(["2 words"] * (quantity.words - 1) + ["added"] * is_added)
+            marks = "; ".join(["2 words"] * (words - 1) + ["added"] * is_added)
             return name + kind + (f" ({marks})" if marks else "")
         case Bits(parts=parts):
             return "[" + ", ".join(f"{name} {bits}" for name, bits in parts) + "]"

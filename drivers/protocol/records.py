@@ -31,8 +31,8 @@ _KEY_ENDS: Mapping[str, str] = {
 """Of the keys of values in a unit."""
 
 Values = dict[str, Any]
-View = Literal["status", "page", "metrics"]
-"""Where a reading is shown: the line of `era status`, the dashboard, the metrics."""
+View = Literal["status", "page"]
+"""Where a reading is shown: the line of `era status`, the dashboard."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,6 @@ class WireQuantity:
     def step(self) -> float:
         """Resolution on the wire, in the unit."""
         return 1 / self.per_unit
-
-    @property
-    def words(self) -> int:
-        """How many words a number takes."""
-        return 2 if self.wire == "u32" else 1
 
     @property
     def low(self) -> float:
@@ -134,7 +129,7 @@ class Number:
     @property
     def words(self) -> int:
         """How many words it takes."""
-        return self.quantity.words
+        return 2 if self.quantity.wire == "u32" else 1
 
     @property
     def key(self) -> str:
@@ -145,11 +140,6 @@ class Number:
     def label(self) -> str:
         """Its name for people."""
         return self.name.replace("_", " ")
-
-    @property
-    def decimals(self) -> int:
-        """Decimal places of its step."""
-        return math.ceil(math.log10(self.quantity.per_unit))
 
     def in_unit(self, values: Values) -> float | None:
         """Return its value in the unit, an int without one; None where it is not stated."""
@@ -301,20 +291,19 @@ class Record:
 
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
-        self.added = tuple([each for each in fields if isinstance(each, Number) and each.is_added])
-        self._first = fields[: len(fields) - len(self.added)]
-        if any(each in self.added for each in self._first):
-            raise ValueError(f"added fields must be the last, got {fields}")
+        self.added = [each for each in fields if isinstance(each, Number) and each.is_added]
+        self._unstated = [0] * sum(each.words for each in self.added)
         self.names: list[str] = []
-        self.places: dict[str, int] = {}
-        self.words, is_fixed = 0, True
         for field in fields:
-            names = [*dict(field.parts)] if isinstance(field, Bits) else [field.name]
-            self.names += names
-            is_fixed = is_fixed and isinstance(field, Number | Bits | Real) and field in self._first
-            if is_fixed and isinstance(field, Number | Bits | Real):
-                self.places |= dict.fromkeys(names, self.words)
-                self.words += field.words
+            self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
+        self.places: dict[str, int] = {}
+        self.words = 0
+        for field in fields:
+            if not isinstance(field, Number | Bits | Real) or field in self.added:
+                break
+            names = dict(field.parts) if isinstance(field, Bits) else [field.name]
+            self.places |= dict.fromkeys(names, self.words)
+            self.words += field.words
         self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
         """Of the numbers that share a word."""
 
@@ -332,10 +321,15 @@ class Record:
 
         Numbers and words, nearly all, without a call: every set has dozens of them.
         """
-        for values, field in product(rows, self._first):
+        if self.added:
+            unstated = dict.fromkeys(each.name for each in self.added)
+            rows = tuple([{**unstated, **row} for row in rows])
+        for values, field in product(rows, self.fields):
             if isinstance(field, Number):
                 quantity, value = field.quantity, values[field.name]
-                if not quantity.minimum <= value <= quantity.maximum:
+                if field.is_added and value is None:
+                    value = 0
+                elif not quantity.minimum <= value <= quantity.maximum:
                     raise ValueError(_out_of_range(field.name, quantity, value))
                 if quantity.wire == "u32":
                     words.append(value >> 16)
@@ -352,20 +346,11 @@ class Record:
                 words.extend(values[field.name])
             else:
                 field.pack(values, words)
-        for values in rows if self.added else ():
-            self._append_added(words, values)
-        return words
-
-    def _append_added(self, words: list[int], values: Mapping[str, Any]) -> None:
-        """Append what is added, but for zeros at the end."""
-        end = len(words)
-        for field in self.added:
-            number = values.get(field.name) or 0
-            if number and not field.quantity.minimum <= number <= field.quantity.maximum:
-                raise ValueError(_out_of_range(field.name, field.quantity, number))
-            words.extend(divmod(number, WORD)[-field.words :])
-        while len(words) > end and not words[-1]:
+        for _ in self._unstated:
+            if words[-1]:
+                break
             words.pop()
+        return words
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
@@ -404,8 +389,11 @@ class Record:
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}
+        end_of_words = len(words)
+        if self.added:
+            words = [*words, *self._unstated]
         try:
-            for field in self._first:
+            for field in self.fields:
                 if isinstance(field, Number):
                     quantity, word = field.quantity, words[at]
                     if quantity.wire == "u32":
@@ -413,10 +401,12 @@ class Record:
                         word = word * WORD + words[at]
                     elif quantity.minimum < 0 and word >= WORD // 2:
                         word -= WORD
-                    if not quantity.minimum <= word <= quantity.maximum:
+                    if not quantity.minimum <= word <= quantity.maximum and (
+                        word or not field.is_added
+                    ):
                         code = _CODES.get(quantity.name, "BAD_VALUE")
                         raise Refusal(_out_of_range(field.name, quantity, word), code)
-                    values[field.name] = word
+                    values[field.name] = word or None if field.is_added else word
                     at += 1
                 elif isinstance(field, Bits):
                     word = words[at]
@@ -439,20 +429,7 @@ class Record:
                     at = field.unpack(words, at, values)
         except IndexError:
             raise Refusal("message is too short", "BAD_LENGTH") from None
-        return values, self._read_added(words, at, values) if self.added else at
-
-    def _read_added(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read what is added, None where the words end before or are 0; return the next index."""
-        for field in self.added:
-            end = at + field.words
-            number = 0
-            for word in (*words[at:end], 0, 0)[: field.words]:
-                number = number * WORD + word
-            if number and not field.quantity.minimum <= number <= field.quantity.maximum:
-                raise Refusal(_out_of_range(field.name, field.quantity, number))
-            values[field.name] = number or None
-            at = min(end, len(words))
-        return at
+        return values, min(at, end_of_words)
 
     def unpack(self, words: Sequence[int], *, is_strict: bool) -> Values:
         """Read the values; is_strict: nothing may follow them. Raises Refusal."""

@@ -178,7 +178,7 @@ LAYER = Record(
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    _reading("temperature", -1000, 2000, 10, "°C", "status", "page", "metrics"),
+    _reading("temperature", -1000, 2000, 10, "°C", "status", "page"),
     _reading("high_voltage", 0, 65535, 1, "V", "page"),
     *_numbers("token:played_token"),
     Bits((("channels", 8), ("layers", 8))),

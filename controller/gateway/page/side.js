@@ -49,7 +49,7 @@ function tile(amplifier, eras, readings) {
   const list = element("dl");
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
   add("Energised", high_voltage === null ? "unknown" : high_voltage ? "yes" : "no");
-  for (const { key, label, unit } of readings) {
+  for (const [key, [label, unit]] of Object.entries(readings)) {
     if (typeof amplifier[key] === "number") add(label, `${threeDigits(amplifier[key])} ${unit}`);
   }
   add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
@@ -60,7 +60,7 @@ function tile(amplifier, eras, readings) {
 }
 
 // amplifiers: null if unknown.
-export function showAmplifiers(container, amplifiers, eras, readings = []) {
+export function showAmplifiers(container, amplifiers, eras, readings = {}) {
   const tiles = amplifiers?.map((amplifier) => tile(amplifier, eras, readings));
   container.replaceChildren(...(tiles ?? [element("p", "unknown", "quiet")]));
 }

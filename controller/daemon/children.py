@@ -19,8 +19,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from controller.child import child_command, ended
 from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.process.child import child_command, ended
 from model.errors import InputError
 from registry import clock
 from registry.pauses import Backoff

@@ -14,10 +14,10 @@ from controller.api.admission import MIN_DESCRIPTORS, allow_many_descriptors
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.config_sections import loopback_address
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread, open_log_file, start_log
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
 from controller.gateway.settings import require_gateway
+from controller.process.log import LogThread, open_log_file, start_log
+from controller.process.service_manager import ServiceManager
+from controller.process.socket_lock import SocketLock
 from drivers.errors import DriverError
 from drivers.trace import tracing
 from model.compiled.kernels import kernels

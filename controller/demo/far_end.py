@@ -18,8 +18,8 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.child import ended
 from controller.demo.touch_row import FingerVibration, Position
+from controller.process.child import ended
 from drivers.errors import LinkError
 from model.finger.perception import DEFAULT_THRESHOLD
 from registry.wording import first_problem

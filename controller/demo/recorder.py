@@ -17,10 +17,10 @@ from controller.demo.touch_row import (
     peak_contrast_db,
     steady_contrast_db,
 )
-from controller.loop.content import HELD_BACK, Prediction
-from controller.loop.observer import Applied, Observer, Silenced
-from controller.loop.playing import PlayedContent
-from controller.sources.contacts import Change, Contact, ContactKey
+from controller.play.content import HELD_BACK, Prediction
+from controller.play.observer import Applied, Observer, Silenced
+from controller.play.playing import PlayedContent
+from controller.touch.contacts import Change, Contact, ContactKey
 from model.transients.measures import ONSET_WINDOW
 from registry import clock
 

@@ -14,7 +14,7 @@ from controller.diagnosis.plate_sensors import (
     start_together,
 )
 from controller.diagnosis.tone_player import TonePlayer
-from controller.loop.plate_set import Drive
+from controller.play.routing import Drive
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.sensors import Reading, measure_tones
 from drivers.opening import Lines

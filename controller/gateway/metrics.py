@@ -14,13 +14,13 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from controller.api.amplifier_status import AmplifierStatus
+from controller.api.learning_status import LearningState
 from controller.api.methods import StatusResult
 from controller.api.schema import (
     DaemonStateName,
     LatencySummary,
     LearningSummary,
 )
-from controller.learning.learning_status import LearningState
 from drivers.host.reports import ReportKind
 
 _LINK_COUNTS = {

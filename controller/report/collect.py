@@ -25,8 +25,8 @@ from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from controller.daemon.config import file_of, is_daemon_document
 from controller.daemon.config_sections import DaemonSection
-from controller.daemon.dumps import DUMP_PATTERN
 from controller.effects.layout_file import LayoutSection
+from controller.operation.dumps import DUMP_PATTERN
 from drivers.errors import LinkError
 from drivers.protocol.records import Record, Rows
 from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD

@@ -12,9 +12,9 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, Self, cast
 
-from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer, Silenced
-from controller.sources.touch import Touch, TouchFrame
+from controller.play.loop import Controller
+from controller.play.observer import Applied, Observer, Silenced
+from controller.touch.frames import Touch, TouchFrame
 from drivers.judge.watching.witness import OperatorCommand
 from drivers.opening import Lines
 from drivers.protocol.records import Values

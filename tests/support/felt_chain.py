@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from chain import Chain
-from controller.daemon.api_views import PlateView
+from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.loop.observer import Applied
+from controller.play.observer import Applied
 from drivers.judge.watching.capture import Violation
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig

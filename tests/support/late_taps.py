@@ -20,8 +20,8 @@ from contextlib import suppress
 from dataclasses import replace
 
 from chain import Chain
-from controller.loop.intent import HapticIntent, Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.play.intent import HapticIntent, Pulse, Target
+from controller.touch.contacts import Contact, ContactKey
 from drivers.errors import DriverError
 from model.rig.rig import Channel
 from model.vibration.excitation import Tone

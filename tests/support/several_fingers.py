@@ -16,8 +16,8 @@ from controller.effects.buzz import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.loop.observer import Applied
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.observer import Applied
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
@@ -235,7 +235,7 @@ class Pressed:
         """
         with pytest.MonkeyPatch.context() as patched:
             if not self.is_shaped:
-                plain = "controller.loop.capabilities.envelope_support"
+                plain = "controller.play.capabilities.envelope_support"
                 patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
             return run_virtual(self._run(ways, held))
 

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from typing import Any, get_args
 
-from controller.loop.loop import Controller
+from controller.play.loop import Controller
 from drivers.judge.watching.witness import OperatorCommand, Witness
 from registry import clock
 from sim.amplifier.contract import Amplifier

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from controller.api.async_client import AsyncClient
-from controller.loop.content import BEING_CHOSEN
-from controller.loop.intent import NO_CONTACTS
-from controller.loop.selection import GIVEN_UP
+from controller.play.content import BEING_CHOSEN
+from controller.play.intent import NO_CONTACTS
+from controller.play.selection import GIVEN_UP
 from daemon_bench import (
     ENABLED,
     READY,

@@ -8,13 +8,13 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import FailFast, Field
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.schema import (
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
     STATE_WORDS,
     AmplifierSilence,
-    AmplifierStatus,
     Count,
     DaemonStateName,
     EffectDescription,
@@ -52,6 +52,9 @@ class HelloResult(Message):
     table: TableSummary
     rig_text: str = Field(description="the rig file, from which vibration fields can be computed")
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
+    readings: dict[str, tuple[str, str]] = Field(
+        {}, description="of amplifiers, for a page: name and unit, by the key in their status"
+    )
 
 
 class StatusResult(Playing, Explained):

@@ -290,8 +290,8 @@ class AmplifierReport(Explained):
     kind: ReportKind
 
 
-class AmplifierStatus(Message):
-    """One amplifier according to its last reply; null where unknown."""
+class AmplifierState(Message):
+    """One amplifier according to its last reply, but for its readings; null where unknown."""
 
     name: str
     url: str
@@ -305,9 +305,7 @@ class AmplifierStatus(Message):
     levels: list[float] = Field(
         description="0 to 1 of the full stroke, by channel, as it reports; empty if unknown"
     )
-    temperature_c: float | None
     high_voltage: bool | None
-    high_voltage_v: float | None
     reply_age_s: float | None = Field(description="time since its last reply")
     degraded: bool = Field(
         False, description="whether it does not reply but may still play, so that nothing new plays"

@@ -11,12 +11,12 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.connection import Connection
 from controller.api.jsonrpc import event_line
 from controller.api.schema import (
     MAX_RATE,
     STATE_WORDS,
-    AmplifierStatus,
     ContactStatus,
     Count,
     DaemonStateName,

@@ -2,10 +2,12 @@
 
 from datetime import datetime
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.client_protocol import Notification
 from controller.api.methods import StatusResult
-from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
+from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
+from drivers.protocol.table import readings_in
 from model.counting import counted
 
 
@@ -124,7 +126,10 @@ def _amplifier(amplifier: AmplifierStatus) -> str:
         ("closed because another was lost", amplifier.closed_with_lost),
         ("{}", amplifier.silence and amplifier.silence.words),
         ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
-        ("{:.1f} degC", amplifier.temperature_c),
+        *(
+            (f"{each.label} {{:g}} {each.quantity.unit}", getattr(amplifier, each.key))
+            for each in readings_in("status")
+        ),
         ("last reply {:.2f} s ago", amplifier.reply_age_s),
         ("no reply yet", amplifier.reply_age_s is None),
     )

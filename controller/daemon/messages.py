@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.learning_status import LearningStatus
 from controller.api.methods import EffectsResult, HelloResult
 from controller.api.schema import (
     API_VERSION,
     AmplifierReport,
     AmplifierSilence,
-    AmplifierStatus,
     ContactStatus,
     EffectDescription,
     EraPosition,
@@ -37,13 +37,20 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.stop import Stopped
-from drivers.protocol.table import FAULTS, QUANTITIES, STATES, has_flag, name_of
+from drivers.protocol.table import (
+    FAULTS,
+    QUANTITIES,
+    READINGS,
+    STATES,
+    has_flag,
+    name_of,
+    readings_in,
+)
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import clock
 
-_LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
-_VOLTAGE = QUANTITIES["voltage"]
+_LEVEL = QUANTITIES["level"]
 
 
 @dataclass
@@ -226,6 +233,9 @@ def hello_result(
         ),
         rig_text=config.rig_text,
         layout=layout,
+        readings={
+            each.key: (each.label.capitalize(), each.quantity.unit) for each in readings_in("page")
+        },
     )
 
 
@@ -320,6 +330,9 @@ def _amplifier_status(
             _report(kind, targets) for kind, at in amplifier.reported_at.items() if at > recent
         ]
         counts = amplifier.statistics
+    readings: dict[str, Any] = {
+        each.key: each.in_unit(status) if status else None for each in READINGS
+    }
     return AmplifierStatus(
         name=name,
         url=url,
@@ -327,9 +340,8 @@ def _amplifier_status(
         state=name_of(STATES, status["state"]) if status else None,
         fault=name_of(FAULTS, status["fault"]) if status else None,
         levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
-        temperature_c=_TEMPERATURE.from_wire(status["temperature"]) if status else None,
         high_voltage=has_flag(status, "high_voltage") if status else None,
-        high_voltage_v=_VOLTAGE.from_wire(status["voltage"]) if status else None,
+        **readings,
         reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
         degraded=is_degraded,
         lost=status is None and not closed_with_lost,

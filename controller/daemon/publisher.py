@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from controller.api.amplifier_status import AmplifierStatus
 from controller.api.learning_status import LearningStatus
 from controller.api.schema import (
     STATE_WORDS,
-    AmplifierStatus,
     LatencySummary,
     LearningSummary,
     PlateEvent,

@@ -1,4 +1,4 @@
-"""controller/api/calls.pyi: signatures of the clients' methods made from the API's registry."""
+"""Signatures of what the API makes from a table: methods of the clients, readings of amplifiers."""
 
 import inspect
 import types
@@ -7,14 +7,27 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from controller.api.calls import BY_HAND, signature_of
 from controller.api.methods import METHODS
 from controller.api.schema import Empty
+from drivers.protocol.table import READINGS
+
+_HEAD = "# Written by docs/generators/client_stub.py."
+
+
+def status_stub() -> str:
+    """The whole file amplifier_status.pyi."""
+    lines = [
+        *(_HEAD, "", "from controller.api.schema import AmplifierState", ""),
+        "class AmplifierStatus(AmplifierState):",
+        *(f"    {each.key}: float | None{' = None' * each.is_added}" for each in READINGS),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def stub() -> str:
-    """The whole file."""
+    """The whole file calls.pyi."""
     made = {name: method for name, method in METHODS.items() if name not in BY_HAND}
     results = sorted({each.result.__name__ for each in made.values() if each.result is not Empty})
     lines = [
-        "# Written by docs/generators/client_stub.py.",
+        _HEAD,
         "",
         "import inspect",
         "",

@@ -18,7 +18,7 @@ import rig_page
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from api_page import api_reference
-from client_stub import stub
+from client_stub import status_stub, stub
 from command_page import command_reference
 from firmware_header import header
 from firmware_records import records_header
@@ -64,6 +64,7 @@ def _of_protocol(page: str) -> list[Writer]:
 
 WRITTEN: Mapping[str, Sequence[Writer]] = {
     "controller/api/calls.pyi": [whole(stub)],  # before python-api.md, which shows it
+    "controller/api/amplifier_status.pyi": [whole(status_stub)],
     "firmware/core/protocol.h": [whole(header)],
     "firmware/core/records.h": [whole(records_header)],
     "docs/reference/amplifier.dbc": [whole(dbc_text)],

@@ -21,6 +21,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     REFUSALS,
     STATES,
+    STATUS,
     STATUS_FLAGS,
     sensor_reading,
 )
@@ -29,7 +30,7 @@ from sim.amplifier.state_table import TRANSITIONS
 from word_names import word_names
 
 _REPLIES: Mapping[str, Record] = {
-    **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": MESSAGES["GetStatus"].reply},
+    **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": STATUS},
     **{"Taken": MESSAGES["Set"].reply, "Faults": MESSAGES["GetFaults"].reply},
     **{"Achieved": MESSAGES["GetAchieved"].reply, "Measured": MESSAGES["GetMeasured"].reply},
     **{"Sensors": MESSAGES["GetSensors"].reply, "Reading": MESSAGES["GetReading"].reply},
@@ -117,9 +118,10 @@ def layout(record: Record) -> str:
 
 def _field(field: object) -> str:
     match field:
-        case Number(name=name, quantity=quantity):
+        case Number(name=name, quantity=quantity, words=words, is_added=is_added):
             kind = "" if name == quantity.name else f": {quantity.name}"
-            return name + kind + (" (2 words)" if quantity.wire == "u32" else "")
+            marks = "; ".join(["2 words"] * (words - 1) + ["added"] * is_added)
+            return name + kind + (f" ({marks})" if marks else "")
         case Bits(parts=parts):
             return "[" + ", ".join(f"{name} {bits}" for name, bits in parts) + "]"
         case Real(name=name):

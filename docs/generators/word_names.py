@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, WireQuantity
+from drivers.protocol.records import Bits, Number, Numbers, Record, Rows
 
 
 def word_names(record: Record, counts: Mapping[str, int]) -> list[str]:
@@ -13,7 +13,7 @@ def word_names(record: Record, counts: Mapping[str, int]) -> list[str]:
 def _names(record: Record, counts: Mapping[str, int]) -> Iterator[str]:
     for field in record.fields:
         match field:
-            case Number(name=name, quantity=WireQuantity(wire="u32")):
+            case Number(name=name, words=2):
                 yield f"{name} high"
                 yield f"{name} low"
             case Number(name=name):

@@ -22,6 +22,7 @@ from drivers.protocol.table import (
     NO_CHANNEL,
     QUANTITIES,
     STATES,
+    STATUS,
     STATUS_FLAGS,
     name_of,
 )
@@ -29,21 +30,13 @@ from drivers.protocol.timing import shortest_watchdog
 from registry import clock
 from registry.limits import GuardLimits
 
-_ENDS: Mapping[str, str] = {
-    **{"Hz": "_hz", "s": "_s", "degrees": "_deg", "m": "_m", "V": "_v", "A": "_a"},
-    "full levels/s": "_per_s",
-}
-
 
 def in_units(record: Record, values: Values) -> dict[str, Any]:
     """Return the numbers of a record, and those of its rows, in their units."""
     rows: dict[str, Any] = {}
     for field in record.fields:
         if isinstance(field, Number):
-            quantity = field.quantity
-            value = values[field.name]
-            in_unit = value if quantity.per_unit == 1 else quantity.from_wire(value)
-            rows[f"{field.name}{_ENDS.get(quantity.unit, '')}"] = in_unit
+            rows[field.key] = field.in_unit(values)
         elif isinstance(field, Rows):
             rows[field.name] = [in_units(field.record, row) for row in values[field.name]]
     return rows
@@ -78,16 +71,17 @@ def status_rows(status: Values) -> dict[str, Any]:
     """Return a status for reading."""
     flags = names_of_bits(STATUS_FLAGS, status["flags"])
     others = [name for name in flags if name not in STATUS_FLAGS]
-    level = QUANTITIES["level"]
+    numbers = {
+        key: value
+        for key, value in in_units(STATUS, status).items()
+        if key not in ("state", "fault", "flags", "latch")
+    }
     return {
         "state": name_of(STATES, status["state"]),
         "fault": name_of(FAULTS, status["fault"]),
         **{name: name in flags for name in STATUS_FLAGS},
-        "token": status["token"],
-        "high_voltage_v": QUANTITIES["voltage"].from_wire(status["voltage"]),
-        "temperature_c": QUANTITIES["temperature"].from_wire(status["temperature"]),
-        "watchdog_left_s": QUANTITIES["watchdog_left"].from_wire(status["watchdog_left"]),
-        "levels": [level.from_wire(each) for each in status["levels"]],
+        **numbers,
+        "levels": [QUANTITIES["level"].from_wire(each) for each in status["levels"]],
         "layer_tokens": status["tokens"],
         **({"other_flags": others} if others else {}),
         "reports": [

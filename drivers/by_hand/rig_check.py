@@ -9,13 +9,12 @@ from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.protocol.table import QUANTITIES
 from drivers.protocol.timing import (
     MAX_LOSS_DETECTION_TIME,
-    TAKEN_WORDS,
     check_watchdog,
     loss_detection_time,
 )
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
-from drivers.wires.wire import request_words
+from drivers.wires.wire import reply_words, request_words
 from registry.limits import GuardLimits
 
 COMMIT_SKEW = 0.001
@@ -40,7 +39,7 @@ def check_links(
     for name, url in urls.items():
         try:
             address = address_of(url)
-            set_time = address.make_wire().exchange_time(request_words("Set"), TAKEN_WORDS)
+            set_time = address.make_wire().exchange_time(request_words("Set"), reply_words("Set"))
             check_watchdog(WATCHDOG, set_time)
             address.check_agrees(lines.setdefault(address.line, address).settings)
         except (CommandError, LinkError) as error:

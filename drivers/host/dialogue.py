@@ -31,14 +31,16 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
 from drivers.protocol.table import (
     ENABLED,
+    EVENT_RECORD,
     FAULTS,
     MESSAGES,
     QUANTITIES,
     REACTION,
     STATES,
+    STATUS,
     name_of,
 )
-from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
+from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
 if TYPE_CHECKING:
@@ -53,10 +55,11 @@ MAX_CONTRADICTIONS = 2
 _SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _LEFT = QUANTITIES["watchdog_left"]
-_STATUS = MESSAGES["GetStatus"].reply
 _SILENCING = ("Stop", "Disarm", "Silence")
 _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
-_EVENT_WORDS = 11  # of a frame of its own, which precedes the reply to what changes the state
+_EVENT_WORDS = (
+    EVENT_RECORD.words + 7
+)  # with a frame of its own, which precedes the reply to what changes the state
 _logger = logging.getLogger(__name__)
 
 
@@ -268,7 +271,7 @@ class Dialogue:
         takes = self.exchange_time(name) if takes is None else takes
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
-            takes = self.line.wire.exchange_time(words, TAKEN_WORDS)
+            takes = self.line.wire.exchange_time(words, reply_words("Set"))
         longer = takes - FAST if takes > FAST else 0.0
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return longer
@@ -336,7 +339,7 @@ class Dialogue:
             feeding.since, feeding.confirmed_at = sent_at, now
             if sent_at > feeding.plays:
                 feeding.plays, feeding.fade = sent_at, 0.0
-        if message.reply is not _STATUS:
+        if message.reply is not STATUS:
             if name == "Set" and reply["played"]:
                 self._confirm(values["token"], now)
             return

@@ -2,7 +2,8 @@
 
 Values are the integers of the wire (see `WireQuantity.to_wire`); only type f32 is a float, and a
 text a str. Requests are read strictly, by the amplifier: `Refusal` for a word that is missing, too
-many or out of range. Replies may grow, so what follows their fields is ignored.
+many or out of range. Replies may grow at their end: what follows the fields of a record is ignored,
+and a number that `is_added` is None in the reply of an amplifier that does not state it.
 """
 
 import math
@@ -12,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, product
-from typing import Any
+from typing import Any, Literal
 
 from drivers.errors import CommandError, FrameError
 
@@ -23,7 +24,15 @@ TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
+_KEY_ENDS: Mapping[str, str] = {
+    **{"Hz": "_hz", "s": "_s", "degrees": "_deg", "m": "_m", "V": "_v", "A": "_a", "°C": "_c"},
+    "full levels/s": "_per_s",
+}
+"""Of the keys of values in a unit."""
+
 Values = dict[str, Any]
+View = Literal["status", "page"]
+"""Where a reading is shown: the line of `era status`, the dashboard."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +110,43 @@ class Refusal(FrameError):
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """An integer of a quantity: one word, or two with the high one first for u32."""
+    """An integer of a quantity: one word, or two with the high one first for u32.
+
+    is_added: later than the first edition of its record, at whose end it stands. Amplifiers need
+    not state it: their reply ends before it, or has 0 there as the registers of Modbus do.
+    views: what shows it beside `era amp status` and the API; None if it is no reading.
+    """
 
     name: str
     quantity: WireQuantity
+    is_added: bool = False
+    views: frozenset[View] | None = None
+
+    def __post_init__(self) -> None:
+        if self.is_added and self.quantity.minimum < 1:
+            raise ValueError(f"{self.name} must begin at 1, since 0 is not stated")
+
+    @property
+    def words(self) -> int:
+        """How many words it takes."""
+        return 2 if self.quantity.wire == "u32" else 1
+
+    @property
+    def key(self) -> str:
+        """Its name in JSON, which ends in the unit."""
+        return f"{self.name}{_KEY_ENDS.get(self.quantity.unit, '')}"
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        return self.name.replace("_", " ")
+
+    def in_unit(self, values: Values) -> float | None:
+        """Return its value in the unit, an int without one; None where it is not stated."""
+        value: int | None = values[self.name]
+        if value is None or not self.quantity.unit:
+            return value
+        return self.quantity.from_wire(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +154,7 @@ class Bits:
     """Unsigned numbers that share a word, the first in the highest bits; unused bits are 0."""
 
     parts: tuple[tuple[str, int], ...]
+    words = 1
 
     @property
     def shifts(self) -> list[int]:
@@ -124,6 +167,7 @@ class Real:
     """A number of type f32: finite and not negative, two words."""
 
     name: str
+    words = 2
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the number."""
@@ -239,13 +283,27 @@ Field = Number | Bits | Real | Text | Numbers | Rows | Rest
 
 
 class Record:
-    """Fields that follow each other in words."""
+    """Fields that follow each other in words; those that are added stand at its end.
+
+    places: the word of each value by its name, as far as none before varies in length; words: how
+    many these are.
+    """
 
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
+        self.added = [each for each in fields if isinstance(each, Number) and each.is_added]
+        self._unstated = [0] * sum(each.words for each in self.added)
         self.names: list[str] = []
         for field in fields:
             self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
+        self.places: dict[str, int] = {}
+        self.words = 0
+        for field in fields:
+            if not isinstance(field, Number | Bits | Real) or field in self.added:
+                break
+            names = dict(field.parts) if isinstance(field, Bits) else [field.name]
+            self.places |= dict.fromkeys(names, self.words)
+            self.words += field.words
         self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
         """Of the numbers that share a word."""
 
@@ -258,14 +316,20 @@ class Record:
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
 
-        ValueError for one out of range, KeyError for none.
+        ValueError for one out of range, KeyError for none. What is added and not stated is left out
+        at the end, and 0 before a field that is stated.
 
         Numbers and words, nearly all, without a call: every set has dozens of them.
         """
+        if self.added:
+            unstated = dict.fromkeys(each.name for each in self.added)
+            rows = tuple([{**unstated, **row} for row in rows])
         for values, field in product(rows, self.fields):
             if isinstance(field, Number):
                 quantity, value = field.quantity, values[field.name]
-                if not quantity.minimum <= value <= quantity.maximum:
+                if field.is_added and value is None:
+                    value = 0
+                elif not quantity.minimum <= value <= quantity.maximum:
                     raise ValueError(_out_of_range(field.name, quantity, value))
                 if quantity.wire == "u32":
                     words.append(value >> 16)
@@ -282,6 +346,10 @@ class Record:
                 words.extend(values[field.name])
             else:
                 field.pack(values, words)
+        for _ in self._unstated:
+            if words[-1]:
+                break
+            words.pop()
         return words
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
@@ -321,6 +389,9 @@ class Record:
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}
+        end_of_words = len(words)
+        if self.added:
+            words = [*words, *self._unstated]
         try:
             for field in self.fields:
                 if isinstance(field, Number):
@@ -330,10 +401,12 @@ class Record:
                         word = word * WORD + words[at]
                     elif quantity.minimum < 0 and word >= WORD // 2:
                         word -= WORD
-                    if not quantity.minimum <= word <= quantity.maximum:
+                    if not quantity.minimum <= word <= quantity.maximum and (
+                        word or not field.is_added
+                    ):
                         code = _CODES.get(quantity.name, "BAD_VALUE")
                         raise Refusal(_out_of_range(field.name, quantity, word), code)
-                    values[field.name] = word
+                    values[field.name] = word or None if field.is_added else word
                     at += 1
                 elif isinstance(field, Bits):
                     word = words[at]
@@ -356,7 +429,7 @@ class Record:
                     at = field.unpack(words, at, values)
         except IndexError:
             raise Refusal("message is too short", "BAD_LENGTH") from None
-        return values, at
+        return values, min(at, end_of_words)
 
     def unpack(self, words: Sequence[int], *, is_strict: bool) -> Values:
         """Read the values; is_strict: nothing may follow them. Raises Refusal."""

@@ -23,7 +23,7 @@ from drivers.protocol.table import (
 
 _SPAN = 1 << 16
 _LAST_TOKEN = QUANTITIES["token"].maximum
-PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
+PART_WORDS = MAX_WORDS - MESSAGES["Set"].request.words
 MAX_PARTS = 127
 _LAYER, _AFTER, _RENEW, _COUNT = LAYER.shifts
 _HEAD_FORM, _COMMAND_FORM = LAYER.form, COMMAND.form

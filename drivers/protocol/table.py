@@ -20,6 +20,7 @@ from drivers.protocol.records import (
     Rows,
     Text,
     Values,
+    View,
     WireQuantity,
 )
 
@@ -120,8 +121,6 @@ _QUANTITIES = (
     _word("knots", 0, 32),
     _word("envelope_step", 1, 1000, 10000, "s"),
     _word("slew", 0, 65535, 10, "full levels/s"),
-    _word("temperature", -1000, 2000, 10, "°C"),
-    _word("voltage", 0, 65535, 1, "V"),
     _word("channel_voltage", 0, 65535, 10, "V"),
     _word("channel_current", 0, 65535, 1000000, "A"),
     _word("age", 0, 0xFFFFFFFF, 1000, "s"),
@@ -137,13 +136,31 @@ _QUANTITIES = (
     _word("window_start", 0, 0xFFFFFFFF, 1000000, "s"),
     _word("tone_count", 1, 16),
 )
-QUANTITIES: Mapping[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
+QUANTITIES: dict[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
+"""By name, with those of the readings below."""
 
 
 def _numbers(*names: str) -> tuple[Number, ...]:
     """Fields by name; a name of another quantity is written name:quantity."""
     split = (name.partition(":") for name in names)
     return tuple(Number(name, QUANTITIES[quantity or name]) for name, _, quantity in split)
+
+
+def _reading(
+    name: str,
+    low: int,
+    high: int,
+    per_unit: int,
+    unit: str,
+    *views: View,
+    is_added: bool = False,
+) -> Number:
+    """Return a field of Status that is a reading, which declares its quantity.
+
+    `era amp status` and the API have it under its name and unit; views: what else shows it.
+    """
+    QUANTITIES[name] = _word(name, low, high, per_unit, unit)
+    return Number(name, QUANTITIES[name], is_added, frozenset(views))
 
 
 _TONES = Record(*_numbers("frequency", "level", "phase"))
@@ -159,13 +176,25 @@ LAYER = Record(
 )
 
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
-_STATUS = Record(
+STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    *_numbers("temperature", "voltage", "token:played_token"),
+    _reading("temperature", -1000, 2000, 10, "°C", "status", "page"),
+    _reading("high_voltage", 0, 65535, 1, "V", "page"),
+    *_numbers("token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
+    # Later ones, as _reading("supply_voltage", 1, 65535, 100, "V", "status", is_added=True)
 )
+READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.views is not None]
+"""Fields of Status that are values in a unit for people."""
+
+
+def readings_in(view: View) -> list[Number]:
+    """Return the readings that a view shows."""
+    return [each for each in READINGS if each.views is not None and view in each.views]
+
+
 _CAPABILITIES = Record(
     *_numbers("channels:channel_count", "layers:layer_count", "voices", "set_words", "knots"),
     *_numbers("features:flags", "frequency_min:frequency", "frequency_max:frequency"),
@@ -226,9 +255,9 @@ _READING = Record(
 
 _MESSAGES = (
     Message("GetCaps", 2, Record(), _CAPABILITIES),
-    Message("Arm", 3, Record(*_numbers("session", "watchdog")), _STATUS, feeds=True),
+    Message("Arm", 3, Record(*_numbers("session", "watchdog")), STATUS, feeds=True),
     # A longer ramp than the longest counts as that one: nothing keeps an amplifier from silence.
-    Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), _STATUS),
+    Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), STATUS),
     Message(
         "Set",
         5,
@@ -241,16 +270,16 @@ _MESSAGES = (
         feeds=True,
     ),
     Message(
-        *("Commit", 6, Record(*_numbers("session", "token")), _STATUS),
+        *("Commit", 6, Record(*_numbers("session", "token")), STATUS),
         is_broadcast=True,
         feeds=True,
     ),
-    Message("Silence", 7, Record(*_numbers("session", "ramp")), _STATUS, feeds=True),
-    Message("Stop", 8, Record(*_numbers("ramp:any_ramp")), _STATUS, is_broadcast=True),
-    Message("GetStatus", 9, Record(), _STATUS),
+    Message("Silence", 7, Record(*_numbers("session", "ramp")), STATUS, feeds=True),
+    Message("Stop", 8, Record(*_numbers("ramp:any_ramp")), STATUS, is_broadcast=True),
+    Message("GetStatus", 9, Record(), STATUS),
     Message("GetFaults", 10, Record(), Record(*_numbers("count"), Rows("faults", "count", _FAULT))),
-    Message("Clear", 11, Record(*_numbers("latch")), _STATUS),
-    Message("Ping", 12, Record(*_numbers("session")), _STATUS, feeds=True),
+    Message("Clear", 11, Record(*_numbers("latch")), STATUS),
+    Message("Ping", 12, Record(*_numbers("session")), STATUS, feeds=True),
     Message(
         *("GetAchieved", 13, Record(*_numbers("layer"))),
         Record(*_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)),
@@ -260,7 +289,7 @@ _MESSAGES = (
         Record(*_numbers("count"), Rows("channels", "count", _MEASURED)),
     ),
     Message(
-        *("SetAddress", 15, Record(*_numbers("address"), Text("serial_number")), _STATUS),
+        *("SetAddress", 15, Record(*_numbers("address"), Text("serial_number")), STATUS),
         is_broadcast=True,
     ),
     Message(

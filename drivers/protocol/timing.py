@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from drivers.errors import CommandError
-from drivers.protocol.table import REACTION
+from drivers.protocol.table import COMMAND, LAYER, MESSAGES, REACTION
 
 BOOT_TIME = 6.0
 """For the first reply on a line [s], of a board that restarts when its port is opened."""
@@ -20,17 +20,14 @@ HEARTBEAT = 0.05
 MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT
 """Longest time to detect a loss without a warning [s]."""
 _HEARTBEATS = 3  # a watchdog must outlast this many intervals
-_LAYER_HEAD, _COMMAND = 3, 4  # words
 
-SET_WORDS = 3
+SET_WORDS = MESSAGES["Set"].request.words
 """Of a part of a set, before its stream."""
-TAKEN_WORDS = 3
-"""Of the reply to a set."""
 
 
 def set_words(channels: int) -> int:
     """Return the words of a set of this many channels in one layer, without envelopes."""
-    return SET_WORDS + _LAYER_HEAD + _COMMAND * channels
+    return SET_WORDS + LAYER.words + COMMAND.words * channels
 
 
 def shortest_watchdog(round_trip: float) -> float:

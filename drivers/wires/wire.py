@@ -12,6 +12,7 @@ from typing import Protocol, TypeAlias
 from drivers.counters import WireCounters
 from drivers.protocol.records import (
     TEXT_MAX,
+    Bits,
     Number,
     Numbers,
     Real,
@@ -21,7 +22,6 @@ from drivers.protocol.records import (
     Rows,
     Text,
     Values,
-    WireQuantity,
 )
 from drivers.protocol.table import (
     EVENT,
@@ -34,7 +34,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     REFUSALS,
 )
-from drivers.protocol.timing import TAKEN_WORDS, set_words
+from drivers.protocol.timing import set_words
 
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
 """Channels and layers of the largest amplifier there can be."""
@@ -124,7 +124,7 @@ def request_words(name: str) -> int:
 
 
 @cache
-def reply_words(name: str, channels: int, layers: int) -> int:
+def reply_words(name: str, channels: int = WIDEST[0], layers: int = WIDEST[1]) -> int:
     """Return the most words of a reply of an amplifier with so many channels and layers."""
     if name in ("Hello", "GetCaps"):
         channels, layers = WIDEST
@@ -147,10 +147,8 @@ def _words(record: Record, rows: Mapping[str, int]) -> int:
                 words += MAX_WORDS
             case Text():
                 words += 1 + TEXT_MAX // 2
-            case Number(quantity=WireQuantity(wire="u32")) | Real():
-                words += 2
-            case _:
-                words += 1
+            case Number() | Bits() | Real():
+                words += field.words
     return min(words, MAX_WORDS)
 
 
@@ -187,4 +185,4 @@ class Wire(Protocol):
 
     def set_time(self, channels: int) -> float:
         """Return how long a set of so many channels and its reply take [s]; 0 if unknown."""
-        return self.exchange_time(set_words(channels), TAKEN_WORDS)
+        return self.exchange_time(set_words(channels), reply_words("Set"))

@@ -82,7 +82,7 @@ class AdaptedAmplifier(Amplifier):
 
     def status(self, now: float) -> Values:
         """Return the status with what the device may still play, without what is not measured."""
-        status = {**super().status(now), "voltage": 0, "temperature": 250}
+        status = {**super().status(now), "high_voltage": 0, "temperature": 250}
         pairs = zip(status["levels"], self.device_levels, strict=True)
         status["levels"] = [level or _LEVEL.to_wire(played) for level, played in pairs]
         if any(status["levels"]):

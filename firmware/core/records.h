@@ -37,7 +37,7 @@ static inline void put_capabilities(struct words *words, const struct wire_capab
 struct wire_status {
     uint16_t state, fault, flags, latch, watchdog_left;
     int16_t temperature;
-    uint16_t voltage, token;
+    uint16_t high_voltage, token;
     uint8_t channels, layers;
     const uint16_t *levels;
     const uint16_t *tokens;
@@ -46,8 +46,8 @@ struct wire_status {
 static inline void put_status(struct words *words, const struct wire_status *from)
 {
     PUT(words, from->state, from->fault, from->flags, from->latch, from->watchdog_left,
-        (uint16_t)from->temperature, from->voltage, from->token, (uint16_t)(from->channels << 8 |
-        from->layers));
+        (uint16_t)from->temperature, from->high_voltage, from->token,
+        (uint16_t)(from->channels << 8 | from->layers));
     put_all(words, from->levels, from->channels);
     put_all(words, from->tokens, from->layers);
 }

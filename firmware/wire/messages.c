@@ -100,7 +100,7 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
         .latch = amplifier->latch,
         .watchdog_left = amplifier_watchdog_left(amplifier),
         .temperature = amplifier->measured.temperature,
-        .voltage = amplifier->measured.voltage,
+        .high_voltage = amplifier->measured.voltage,
         .token = amplifier->committed,
         .channels = CHANNELS,
         .layers = LAYERS,

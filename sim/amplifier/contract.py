@@ -186,7 +186,7 @@ class Amplifier:
             "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
             **{"latch": self.latch, "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0))},
             "temperature": _Q["temperature"].to_wire(self._heat.at(now)),
-            "voltage": round(HIGH_VOLTAGE if is_on else HIGH_VOLTAGE * decayed),
+            "high_voltage": round(HIGH_VOLTAGE if is_on else HIGH_VOLTAGE * decayed),
             **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
             "levels": [_Q["level"].to_wire(level) for level in levels],
             "tokens": [tokens.get(layer, 0) for layer in range(layers)],

@@ -19,7 +19,7 @@ from sim.amplifier.contract import Amplifier
 REQUESTS = 600
 TOLERANCE = 3e-4  # of full level: 16-bit samples, and fixed point in up to 16 voices
 # Where replies differ by rounding; supply and temperature are the boards' own.
-ROUNDED = {"levels": 2, "watchdog_left": 1, "temperature": 9999, "voltage": 9999, "age": 2}
+ROUNDED = {"levels": 2, "watchdog_left": 1, "temperature": 9999, "high_voltage": 9999, "age": 2}
 LIMITED = 4  # the flag: one is foreseen at a commit, the other seen in samples
 BUILDS = {"-DSMALLEST": 4, **{f"-DCHANNELS={channels}": channels for channels in (4, 8, 16)}}
 """Options of the compiler, with the number of channels."""
@@ -45,7 +45,7 @@ def differences(made: Sent, expected: Sent) -> list[str]:
     return [
         f"{name}: {ours[name]} for {theirs[name]}"
         for name in ours
-        if not agree(name, ours[name], theirs[name])
+        if ours[name] is not None and not agree(name, ours[name], theirs[name])  # None: not stated
     ]
 
 

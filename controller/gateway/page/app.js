@@ -241,7 +241,7 @@ const HANDLERS = {
   amplifiers({ amplifiers }) {
     silences = silencesOf({ amplifiers });
     showBanner();
-    showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
+    showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? [], daemon?.readings);
   },
   layout({ layout }) {
     if (JSON.stringify(layout) === JSON.stringify(daemon.layout)) return;

@@ -25,9 +25,9 @@ function silenceText({ silence, may_play_for_s }) {
   return may_play_for_s === null ? "may play until it is switched off" : `may play for ${fixed(may_play_for_s, 2)} s more`;
 }
 
-// eras: of the rig, for the names of the channels.
-function tile(amplifier, eras) {
-  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost, silence, reports = [] } = amplifier;
+// eras: of the rig, for the names of the channels. readings: of the daemon's hello, which of them are shown, and how.
+function tile(amplifier, eras, readings) {
+  const { name, word, state, fault, levels, high_voltage, reply_age_s, lost, closed_with_lost, silence, reports = [] } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty || reports.length ? "tile bad" : "tile");
   const title = element("h3");
@@ -48,8 +48,10 @@ function tile(amplifier, eras) {
   made.append(levels.length ? channels : element("p", "channels: unknown", "quiet"));
   const list = element("dl");
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
-  if (temperature_c !== null) add("Temperature", `${fixed(temperature_c)} °C`);
-  add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${fixed(high_voltage_v)} V`);
+  add("Energised", high_voltage === null ? "unknown" : high_voltage ? "yes" : "no");
+  for (const [key, [label, unit]] of Object.entries(readings)) {
+    if (typeof amplifier[key] === "number") add(label, `${threeDigits(amplifier[key])} ${unit}`);
+  }
   add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
   if (silence) add("Silence", silenceText(silence));
   made.append(list);
@@ -58,8 +60,8 @@ function tile(amplifier, eras) {
 }
 
 // amplifiers: null if unknown.
-export function showAmplifiers(container, amplifiers, eras) {
-  const tiles = amplifiers?.map((amplifier) => tile(amplifier, eras));
+export function showAmplifiers(container, amplifiers, eras, readings = {}) {
+  const tiles = amplifiers?.map((amplifier) => tile(amplifier, eras, readings));
   container.replaceChildren(...(tiles ?? [element("p", "unknown", "quiet")]));
 }
 

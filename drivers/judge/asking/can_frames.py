@@ -27,7 +27,7 @@ from drivers.judge.asking.client import (
 from drivers.judge.asking.material import layer
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
-from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK, STATES, TEXTS, name_of
+from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK, STATES, STATUS, TEXTS, name_of
 from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import (
     NODE_MAX,
@@ -288,7 +288,7 @@ async def network_management(subject: Subject) -> None:
     expect_equal(shown, (b"\0", bytes([_PRE_OPERATIONAL])), "heartbeats after reset_node")
     await client.command("start")
     reply = await client.exchange(_STATUS, ())
-    status = MESSAGES["GetStatus"].reply.unpack(reply.words, is_strict=False)
+    status = STATUS.unpack(reply.words, is_strict=False)
     seen = name_of(STATES, status["state"]), any(status["levels"]), status["token"]
     expect_equal(seen, ("SWITCH_ON_DISABLED", False, 0), "state, levels, token after reset_node")
     subject.require_alone()
@@ -321,9 +321,8 @@ async def heartbeats(subject: Subject) -> None:
 @reading("can.md#objects", "can")
 async def objects(subject: Subject) -> None:
     """It shows identity, capabilities and status as objects, of which 1017 alone can be written."""
-    client, caps = _client(subject), MESSAGES["GetCaps"].reply.pack(subject.can)
-    status = (await subject.request("GetStatus")).values
-    words = client.reply_words[_STATUS]
+    client, caps = _client(subject), (await subject.request("GetCaps")).words
+    status = (await subject.request("GetStatus")).words
     for index, subindex, size, value in (
         (0x1000, 0, 4, None),
         (0x1001, 0, 1, None),
@@ -332,8 +331,9 @@ async def objects(subject: Subject) -> None:
         (0x2000, 5, 2, subject.identity["versions"]),
         (0x2001, 0, 1, len(caps)),
         *((0x2001, number, 2, word) for number, word in enumerate(caps, 1)),
-        (0x2002, 0, 1, words),
-        (0x2002, 1, 2, status["state"]),
+        (0x2002, 0, 1, len(status)),
+        (0x2002, STATUS.places["state"] + 1, 2, status[STATUS.places["state"]]),
+        (0x2002, len(status), 2, None),
     ):
         data = await read_object(client, index, subindex)
         seen = len(data), value and int.from_bytes(data, "little")
@@ -341,7 +341,8 @@ async def objects(subject: Subject) -> None:
     for number, field in enumerate(TEXTS, 1):
         text = (await read_object(client, 0x2000, number)).decode("utf-8", errors="replace")
         expect_equal(text, subject.identity[field.name], f"{field.name} in object 2000")
-    missing = [(0x1003, 0), (0x1016, 1), (0x2000, 6), (0x2001, len(caps) + 1)]
+    missing = [(0x1003, 0), (0x1016, 1), (0x2000, 6)]
+    missing += [(0x2001, len(caps) + 1), (0x2002, len(status) + 1)]
     for index, subindex in missing:
         await read_object(client, index, subindex, is_there=False)
     for index, subindex in ((0x1000, 0), (0x2000, 1), (0x2002, 1)):

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 from drivers import trace
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import REACTION
+from drivers.protocol.table import NAK_RECORD, REACTION
 from drivers.wires.wire import read_nak
 from registry import clock
 
@@ -338,7 +338,7 @@ class Client(ABC):
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""
         nak = read_as("Nak", read_nak, words, is_strict=True)
-        expect_equal(words[0], number, "request that a Nak names")
+        expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")
         return Answer(nak.code, nak.channel, (), When(sent, came))
 
 

@@ -69,7 +69,8 @@ def _unlimited(field: Field) -> Field:
     if isinstance(field, RowsOf):
         return replace(field, record=Record(*map(_unlimited, field.record.fields)))
     if isinstance(field, Number) and field.name != "channels":
-        return replace(field, quantity=replace(field.quantity, minimum=0, maximum=_WORD))
+        lowest = int(field.is_added)  # 0: not stated
+        return replace(field, quantity=replace(field.quantity, minimum=lowest, maximum=_WORD))
     return field
 
 
@@ -84,7 +85,7 @@ def _ranges(can: Values) -> Iterator[_Range]:
     rows = [(_REPLY, can), *((_LIMITS, one) for one in can["limits"])]
     for record, row in rows:
         for field in record.fields:
-            if isinstance(field, Number):
+            if isinstance(field, Number) and row[field.name] is not None:
                 name = field.name if record is _REPLY else "limits"
                 yield name, field.quantity.minimum, row[field.name], field.quantity.maximum
     for name in ("frequency_step", "level_step", "phase_step", "level_max"):

@@ -9,7 +9,7 @@ from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, s
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8
@@ -127,17 +127,22 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
     ):
         yield _part(pack_layers([good, layer_set]))
     words = pack_layers([layer(0, tone)])
+    head, command = LAYER.places, COMMAND.places
     for at, word, named in (
-        (0, words[0] | 1 << 15, (None,)),
-        (1, QUANTITIES["ramp"].maximum + 1, (None,)),
-        (2, QUANTITIES["valid_for"].maximum + 1, (None,)),
-        (3, words[3] | 1 << 12, (None, 0)),
-        (5, _LEVEL + 1, (None, 0)),
-        (6, _PHASE.maximum + 1, (None, 0)),
-        (6, 0x10000 + _PHASE.minimum - 1, (None, 0)),
+        (head["layer"], words[head["layer"]] | 1 << 15, (None,)),
+        *((head[name], QUANTITIES[name].maximum + 1, (None,)) for name in ("ramp", "valid_for")),
+        *(
+            (LAYER.words + command[name], word, (None, 0))
+            for name, word in (
+                ("channel", words[LAYER.words + command["channel"]] | 1 << 12),
+                ("level", _LEVEL + 1),
+                ("phase", _PHASE.maximum + 1),
+                ("phase", 0x10000 + _PHASE.minimum - 1),
+            )
+        ),
     ):
         yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
-    for wrong in (words[:-1], [*words, 0], [words[0] + 1, *words[1:]]):
+    for wrong in (words[:-1], [*words, 0], [words[head["count"]] + 1, *words[1:]]):
         yield _part(wrong, "BAD_LENGTH")
 
 

@@ -8,10 +8,10 @@ from drivers.judge.asking.material import Material, Rows, layer, play, send, sta
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
-from drivers.protocol.table import STAGED_LIFE
+from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, STAGED_LIFE
 
 _PLACE = "protocol.md#sets"
-_LAYER_HEAD, _SHAPED = 3, 8  # words of a layer, of a command with two empty envelopes
+_SHAPED = COMMAND.words + 2 * ENVELOPE.words  # of a command with two empty envelopes
 _MAX_TRIED = 2000  # words of a set: more take a slow wire longer than a set lives
 _LONG, _SHORT = 600, 60  # words of a set of several parts
 _SLOW = 0.03  # s; of a line, for an exchange of the longest messages
@@ -22,12 +22,12 @@ def set_of(material: Material, room: int) -> list[LayerSet]:
     """Make a set of this many words, or of as many as there can be."""
     channels, max_knots = len(material.channels), material.can["knots"]
     # All but the heads of layers has an even number of words.
-    bare = _LAYER_HEAD + _SHAPED * channels
+    bare = LAYER.words + _SHAPED * channels
     max_layers = min(len(material.layers), room // bare)
     counts = [each for each in range(1, max_layers + 1) if each % 2 == room % 2] or [max_layers]
-    full = bare + 4 * channels * max_knots
+    full = bare + 2 * KNOT.words * channels * max_knots
     count = next((each for each in counts if each * full >= room), counts[-1])
-    left = max(room - count * bare, 0) // 2  # knots
+    left = max(room - count * bare, 0) // KNOT.words
     layers = []
     for number in range(count):
         tones = []
@@ -184,6 +184,6 @@ def newer_sets_replace(subject: Subject) -> Rows:
 def committed_together(subject: Subject) -> Rows:
     """It starts all layers and channels of a set at one moment."""
     tones = [subject.tone(each, 1 / len(subject.layers)) for each in subject.channels]
-    room = subject.can["set_words"] // (_LAYER_HEAD + 4 * len(tones))
+    room = subject.can["set_words"] // (LAYER.words + COMMAND.words * len(tones))
     layers = [layer(each, *tones, ramp=subject.ramp) for each in subject.layers[:room]]
     return [[stage(*layers), send("Commit", token=1)]]

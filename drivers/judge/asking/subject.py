@@ -130,7 +130,8 @@ class Subject(Material):
             except ValueError:  # beyond the table
                 raw = [values[each] for each in message.request.names]
         if name == "Set":
-            is_part = self.sent_set and [*self.sent_set[-1][:2]] == [*raw[:2]]
+            head = message.request.places["index"]  # session and token
+            is_part = self.sent_set and [*self.sent_set[-1][:head]] == [*raw[:head]]
             self.sent_set = [*(self.sent_set if is_part else ()), raw]
         client, sent = self.client, clock.now()
         answer = await client.exchange(message.number, raw)

@@ -22,6 +22,7 @@ from drivers.protocol.table import (
     NAK_RECORD,
     REFUSALS,
     STATES,
+    STATUS,
     VERSION,
     read_request,
 )
@@ -31,14 +32,13 @@ from drivers.wires.serial_line.frames import NEUTRAL, FrameReader, unpack_identi
 HELLO = "Hello"
 A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
-STATUS_RECORD = MESSAGES["GetStatus"].reply
 REPLIES = {HELLO: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
 """Records of replies by the name of the request."""
 NAMES = {HELLO_NUMBER: HELLO, **{number: message.name for number, message in BY_NUMBER.items()}}
 """Names of requests by number."""
 BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
 """Requests that may be for all amplifiers of a line."""
-_WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
+_WITH_STATE = (STATUS, EVENT_RECORD)
 
 
 @dataclass(eq=False, slots=True)
@@ -158,7 +158,12 @@ def sent_by_amplifier(
             return damaged(f"an invalid Event: {event.problem}")
         return Notice("event", address, values=event.values)
     if number == NAK:
-        return reply_of(NAK_RECORD, words, address, (address, sequence, *words[:1]))
+        return reply_of(
+            NAK_RECORD,
+            words,
+            address,
+            (address, sequence, *words[: NAK_RECORD.places["request"] + 1]),
+        )
     if number not in NAMES:
         return damaged(f"a reply of unknown type {number}")
     return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))

@@ -13,13 +13,12 @@ from drivers.judge.watching.decoded import (
     CHANGING,
     FEEDING,
     REPLIES,
-    STATUS_RECORD,
     Request,
     is_carried_out,
 )
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION
+from drivers.protocol.table import REACTION, STATUS
 
 _LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
 
@@ -104,7 +103,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         self._answered = request.number
         name = request.name
         self.advance(request.earliest)
-        if REPLIES.get(name) is STATUS_RECORD:
+        if REPLIES.get(name) is STATUS:
             self._resolve(request.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return

@@ -16,6 +16,7 @@ from drivers.by_hand.cli import app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
 from drivers.playing.contents import Tone
+from drivers.protocol.table import STATUS
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -84,6 +85,7 @@ URL = f"sim://{example_rig_path()}?exact"
 COMMON = {
     *("url", "state", "fault", "interlock_open", "limited", "token", "high_voltage"),
     *("high_voltage_v", "temperature_c", "watchdog_left_s", "levels", "layer_tokens", "reports"),
+    *(each.key for each in STATUS.added),
 }
 
 

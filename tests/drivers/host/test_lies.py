@@ -1,7 +1,6 @@
 """Amplifiers and lines that lie, on every kind of wire: refused or counted; stops are truthful.
 
-Words of replies are altered by their place in the page of the protocol (docs/decisions/0061), not
-by the table that reads them.
+Words of replies are altered after they were packed, by the name of the first value in them.
 """
 
 import asyncio
@@ -25,27 +24,35 @@ from words_line import KINDS, Alter, MemoryLine, group_of, unaltered
 PACKED = len(pack_frames([CanFrame(0, b"")]))
 LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 STATUS = {
-    **{"state": (0, 255), "latch": (3, 0), "watchdog_left": (4, 65535), "temperature": (5, 32767)},
-    **{"channels": (8, 200 << 8 | 8), "no channels": (8, 8), "levels": (9, 65535)},
-    **{"layers": (8, 2 << 8 | 7), "fault": (1, 2), "interlock": (2, 0b11), "latch jumps": (3, 77)},
+    **{"state": ("state", 255), "latch": ("latch", 0), "watchdog_left": ("watchdog_left", 65535)},
+    **{"temperature": ("temperature", 32767), "channels": ("channels", 200 << 8 | 8)},
+    **{"no channels": ("channels", 8), "levels": ("levels", 65535), "fault": ("fault", 2)},
+    **{"layers": ("layers", 2 << 8 | 7), "interlock": ("flags", 0b11)},
+    "latch jumps": ("latch", 77),
 }
 """Word and value of what each status says."""
 CAPABILITIES = {
-    **{"channels": (0, 255), "no channels": (0, 0), "layers": (1, 0), "voices": (2, 0)},
-    **{"set_words": (3, 0), "knots": (4, 255), "frequency_step": (8, 0), "level_step": (10, 0)},
-    **{"phase_step": (11, 0), "ramp_max": (12, 65535), "watchdog_max": (15, 65535)},
-    **{"frequency_min is above": (6, 65535), "level_max": (9, 65535), "level 0": (10, 10001)},
-    **{"watchdog_min": (14, 2001), "envelope_step_max": (17, 5), "limits": (18, 30000)},
+    **{"channels": ("channels", 255), "no channels": ("channels", 0), "layers": ("layers", 0)},
+    **{"voices": ("voices", 0), "set_words": ("set_words", 0), "knots": ("knots", 255)},
+    **{"frequency_step": ("frequency_step", 0), "level_step": ("level_step", 0)},
+    **{"phase_step": ("phase_step", 0), "ramp_max": ("ramp_max", 65535)},
+    **{"watchdog_max": ("watchdog_max", 65535), "level_max": ("level_max", 65535)},
+    **{"frequency_min is above": ("frequency_min", 65535), "level 0": ("level_step", 10001)},
+    **{"watchdog_min": ("watchdog_min", 2001), "envelope_step_max": ("envelope_step_max", 5)},
+    "limits": ("limits", 30000),
 }
 
 
 @pytest.fixture
-def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int, int], None]:
-    """A function that has all replies of a record say a value in a word."""
+def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, int], None]:
+    """A function that has all replies of a record say a value in a word.
 
-    def alter(name: str, at: int, value: int) -> None:
+    field: in it; of a variable number of words the first one.
+    """
+
+    def alter(name: str, field: str, value: int) -> None:
         record = MESSAGES[name].reply
-        pack = record.pack
+        pack, at = record.pack, record.places.get(field, record.words)
 
         def lying(values: Values) -> list[int]:
             words = pack(values)
@@ -75,7 +82,7 @@ async def stops_truthfully(group: Group, end: MemoryLine) -> None:
 
 @pytest.mark.parametrize("lie", CAPABILITIES)
 def test_capabilities_that_cannot_be_are_refused(
-    wire: str, lie: str, altered: Callable[[str, int, int], None]
+    wire: str, lie: str, altered: Callable[[str, str, int], None]
 ) -> None:
     """It is not opened, and nothing but questions was sent; one message says why."""
     altered("GetCaps", *CAPABILITIES[lie])
@@ -91,11 +98,11 @@ def test_capabilities_that_cannot_be_are_refused(
 
 @in_virtual_time
 async def test_watchdog_that_stands_still_is_found_amid_sets(
-    altered: Callable[[str, int, int], None],
+    altered: Callable[[str, str, int], None],
 ) -> None:
     """Ten sets a second feed it, each with a heartbeat that comes too early to tell."""
     group, _ = await armed("serial")
-    altered("GetStatus", 4, round(1000 * group.amplifiers["a"].feeding.watchdog))
+    altered("GetStatus", "watchdog_left", round(1000 * group.amplifiers["a"].feeding.watchdog))
 
     async def play() -> None:
         for _ in range(10):
@@ -111,7 +118,7 @@ async def test_watchdog_that_stands_still_is_found_amid_sets(
 @pytest.mark.parametrize("lie", STATUS)
 @in_virtual_time
 async def test_status_that_cannot_be_ends_in_silence(
-    wire: str, lie: str, altered: Callable[[str, int, int], None]
+    wire: str, lie: str, altered: Callable[[str, str, int], None]
 ) -> None:
     """Two beats at most; a stop that cannot be read is not confirmed."""
     group, end = await armed(wire)

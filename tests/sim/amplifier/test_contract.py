@@ -106,5 +106,5 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert measured["channel_voltage"] == pytest.approx(10 * voltage, abs=1)
     assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
-    assert amplifier.handle("GetStatus", {}, 0.12)["voltage"] == round(1800 / math.e)
-    assert Amplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["voltage"] == 0
+    assert amplifier.handle("GetStatus", {}, 0.12)["high_voltage"] == round(1800 / math.e)
+    assert Amplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["high_voltage"] == 0

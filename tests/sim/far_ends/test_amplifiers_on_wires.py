@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.table import FAULTS, STATES
+from drivers.protocol.table import FAULTS, STATES, STATUS
 from model.errors import InputError
 from model.rig.rig import Rig
 from registry import clock
@@ -233,6 +233,6 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
         main = rig.group.amplifiers["main"]
         begin = clock.now()
         await main.read_status()
-        words = 9 + 4 + 8  # of a status: numbers, levels, tokens
+        words = STATUS.words + 4 + 8  # levels, tokens
         least = 2 * words * bits / 9600
         assert least < clock.now() - begin < 2 * least + 0.02

@@ -3,9 +3,11 @@
 import asyncio
 
 import pytest
+from drivers.wires.modbus.registers import HEAD
 
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
+from drivers.protocol.table import MESSAGES, STATUS
 from drivers.wires.modbus.host import ModbusWire
 from drivers.wires.wire import Broken, More, Nak, Reply
 from sim.amplifier.contract import Amplifier
@@ -87,10 +89,14 @@ def test_request_has_the_bytes_written_by_hand(case: str) -> None:
 
 
 def test_as_many_registers_are_read_as_the_reply_can_have() -> None:
-    """Of 4 channels and 8 layers: status 2 + 9 + 4 + 8, achieved 2 + 4 + 4 · 4; faults any."""
+    """Of 4 channels and 8 layers, at first of the most: levels, tokens, limits, tones of each."""
     wire, peer = ModbusWire(0, is_rtu=True, number=0), Peer(is_rtu=True)
-    counts = {"GetStatus": 43, "GetCaps": 68, "GetAchieved": 70, "GetFaults": 122}
-    after = {"GetStatus": 23, "GetCaps": 68, "GetAchieved": 22, "GetFaults": 122}
+    status = HEAD + STATUS.words + sum(each.words for each in STATUS.added)
+    capabilities = HEAD + MESSAGES["GetCaps"].reply.words + 3 * 16
+    achieved = HEAD + MESSAGES["GetAchieved"].reply.words
+    both = {"GetCaps": capabilities, "GetFaults": 122}
+    counts = {"GetStatus": status + 16 + 16, "GetAchieved": achieved + 4 * 16, **both}
+    after = {"GetStatus": status + 4 + 8, "GetAchieved": achieved + 4 * 4, **both}
     for expected in (counts, after):
         for name, count in expected.items():
             values = {"layer": 0} if name == "GetAchieved" else {}

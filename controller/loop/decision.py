@@ -20,6 +20,7 @@ from controller.sources.contacts import Change, Contact, ContactKey, ContactTrac
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.rig.rig import Rig
+from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -124,7 +125,7 @@ class Decider:
         Raises InputError for a table that has no pattern for these amplifiers.
         """
         table, timing = self._selector.chooser.table, self._builder.timing
-        table.prepare(self.capabilities.drive_mode)
+        prepare_patterns(table, self.capabilities.drive_mode)
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
         question = Question(
@@ -138,7 +139,7 @@ class Decider:
         )
         pattern = timing.with_envelopes(
             question,
-            table.query(question),
+            find_pattern(table, question),
             onset=support.onset_knots > 0,
             ending=support.ending_knots > 0,
         )

@@ -16,6 +16,7 @@ from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
 from model.table.file import FORMAT_VERSION
+from model.table.pattern_query import find_pattern
 from model.table.table import LocalizationTable
 from model.table.weak_cells import pair_questions
 
@@ -88,7 +89,7 @@ def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
     for question in chain.from_iterable(pair_questions(table)):
         at = chain.from_iterable(question.contacts)
         try:
-            pattern = table.query(question)
+            pattern = find_pattern(table, question)
         except InputError:
             yield [*at, *[""] * (len(parts) + 2)]
             continue

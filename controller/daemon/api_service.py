@@ -51,7 +51,7 @@ from controller.loop.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
-from drivers.host.stop import Stopped
+from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 
@@ -240,7 +240,7 @@ class ApiService:
     def _play(self, client: Connection, params: PlayParams) -> Empty:
         """Start an effect at the contact nearest to a position, at its own level or below."""
         operation = self._supervisor.operation
-        if operation.state is not _ENABLED or self._controller.group.degraded:
+        if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
         effects = self._layout.layout.effects
         effect = effects.get(params.effect)

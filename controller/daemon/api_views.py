@@ -34,9 +34,9 @@ from controller.loop.plate_set import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier
+from drivers.host.feeding import Stopped
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
-from drivers.host.stop import Stopped
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, has_flag, name_of
 from drivers.statistics import LinkStatistics
 from model.rig.rig import Rig

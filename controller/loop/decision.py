@@ -18,7 +18,7 @@ from controller.loop.playing import PlayedContent, Playing, all_left
 from controller.loop.selection import Selector
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from model.rig.rig import Rig
 from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.question import Question

@@ -25,9 +25,9 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.group import Group
-from drivers.host.members import GroupState, Played
-from drivers.host.stop import UNREACHED, Stopped, what_may_play
+from drivers.host.feeding import UNREACHED, Stopped
+from drivers.host.group import Group, GroupState
+from drivers.host.joint_sets import Played
 from drivers.host.timing import HEARTBEAT, REPLY_TIMEOUT
 from drivers.opening import Lines
 from model.counting import counted
@@ -124,7 +124,7 @@ class Controller:
         """Whether a change of contacts is on its way to the amplifiers."""
         if self._decider_if_open is not None and self._decider_if_open.is_choosing:
             return True
-        return self.group.last_sent_at < self._changed_at
+        return self.group.members.last_sent_at < self._changed_at
 
     @property
     def drive_mode(self) -> str:
@@ -167,8 +167,8 @@ class Controller:
             lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
             for error in lost.values():
                 error.lost = tuple(lost)
-            opened = self.group.checked(results)
-            amplifiers = self.group.amplifiers = dict(zip(self.urls, opened, strict=True))
+            opened = self.group.members.checked(results)
+            amplifiers = dict(zip(self.urls, opened, strict=True))
             self._connected(amplifiers)
             await self.group.open()
             for name, amplifier in amplifiers.items():
@@ -273,7 +273,7 @@ class Controller:
     def what_may_play(self, name: str, cause: str = "") -> Stopped:
         """What an amplifier may play as far as is known; cause: why no more is; see there."""
         opened = self._opened.get(name)
-        return UNREACHED if opened is None else what_may_play(opened, cause)
+        return UNREACHED if opened is None else opened.what_may_play(cause)
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -365,7 +365,7 @@ class Controller:
         if decision is None:
             if now >= decider.playing.due:
                 await self._go_on(decider, now)
-        elif decision.started and self.group.degraded:
+        elif decision.started and self.group.members.degraded:
             await self._end_only(decider, decision)
         else:
             await self._execute(decider, decision)
@@ -404,7 +404,7 @@ class Controller:
         """Whether to feed the watchdogs now; pending silence has priority."""
         if not self.group.is_armed or self._decider.is_silence_pending:
             return False
-        return clock.now() >= min(self._heartbeat_due, self.group.lost_from)
+        return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
 
     @property
     def _decider(self) -> Decider:
@@ -447,7 +447,7 @@ class Controller:
 
     async def _go_on(self, decider: Decider, now: float) -> None:
         """Prolong the layers that are due, and report those that have ended; raises DriverError."""
-        due = {} if self.group.degraded else decider.renewal(now)
+        due = {} if self.group.members.degraded else decider.renewal(now)
         if due:
             decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
         if (ended := decider.ended(now)) is not None:
@@ -515,7 +515,7 @@ class Controller:
         Whatever is raised instead leaves it unknown what plays.
         """
         try:
-            if self.group.is_set_incomplete:
+            if self.group.sets.is_incomplete:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
             layers = {
                 name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
@@ -537,7 +537,7 @@ class Controller:
         if self._decider_if_open is not None:
             until = min(until, self._decider_if_open.due)
         if self.group.is_armed:
-            until = min(until, self._heartbeat_due, self.group.lost_from)
+            until = min(until, self._heartbeat_due, self.group.members.lost_from)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

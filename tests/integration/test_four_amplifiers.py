@@ -22,7 +22,7 @@ from drivers import clock
 from drivers.by_hand import actions
 from drivers.conformance.opening import opened
 from drivers.errors import LinkError, LinkTimeout
-from drivers.host.members import GroupState
+from drivers.host.group import GroupState
 from drivers.opening import Lines
 from long_form import in_turn, shortly
 from model.fem.mesh import Mesh

@@ -12,7 +12,7 @@ from controller.loop.loop import Controller
 from courses import courses, follow
 from drivers import clock
 from drivers.errors import CommandRefused
-from drivers.host.stop import Stopped
+from drivers.host.feeding import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from virtual_loop import in_virtual_time

@@ -16,7 +16,7 @@ from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time

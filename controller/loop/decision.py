@@ -83,6 +83,7 @@ class Decider:
         intent_source: IntentSource,
         timing: Timing,
         arrived: Callable[[], None] = lambda: None,
+        too_late: Callable[[int], None] = lambda clicks: None,
     ) -> None:
         self.capabilities = capabilities
         """Of the amplifiers together."""
@@ -100,14 +101,8 @@ class Decider:
         """The layers."""
         self._retry_at = math.inf  # s; when a ledger would admit what it refused
         self._is_new = True  # something has come that is not decided yet
-        self._arrived = arrived
+        self._arrived, self._too_late = arrived, too_late
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
-        self.clicks_too_late = 0
-        """Pulses that were over, or had lost their touch, before the amplifiers were to play them.
-
-        With fingers that had left before they were looked at; not what a ledger refuses, or
-        neighbours do not allow.
-        """
         self._seen: frozenset[ContactKey] = frozenset()  # fingers, when it was last decided
         self._awaited: dict[int, Pulse] = {}  # by identity: decided, and not known to have started
         self._touched_at = -math.inf  # s; when a finger came, moved or pressed last
@@ -166,7 +161,8 @@ class Decider:
     def note(self, time: float, change: Change) -> None:
         """Note that contacts have changed, by what arrived at a time [s]."""
         self._is_new = True
-        self.clicks_too_late += sum(each.key not in self._seen for each in change.up)
+        if unseen := [each for each in change.up if each.key not in self._seen]:
+            self._too_late(len(unseen))
         if change.down or change.moved or change.pressed:
             self._touched_at = time
         self._triggered_at = min(self._triggered_at, time)
@@ -196,7 +192,8 @@ class Decider:
         for number in decision.started:
             for _, target in playing.contents[number].content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
-                    self.clicks_too_late += played.sent_at > target.pulse.end
+                    if played.sent_at > target.pulse.end:
+                        self._too_late(1)
                     target.pulse.started_at = played.sent_at
                     self._intent_due = min(self._intent_due, target.pulse.end)
             playing.confirm_start(number, played, now)
@@ -296,8 +293,9 @@ class Decider:
                 self._played_until = now
         for number, pulse in [*self._awaited.items()]:
             if pulse.started_at is not None or now >= pulse.end:
-                self.clicks_too_late += pulse.started_at is None
                 del self._awaited[number]
+                if pulse.started_at is None:
+                    self._too_late(1)
         if not self._is_new and now < self.due:
             return None
         contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)

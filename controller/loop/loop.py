@@ -84,10 +84,9 @@ class Controller:
                 f"{', '.join(sorted(self.urls)) or 'none'}"
             )
         self._make_lines = lines
-        self._lines_if_open: Lines | None = None
+        self._lines: Lines | None = None  # also after an attempt to open that has failed
         self._opened: dict[str, Amplifier] = {}  # last, identified or not
         self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
-        self._lines_to_use: Lines | None = None  # of another attempt to open
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -104,7 +103,12 @@ class Controller:
         self.rejects = RejectCounter(_logger)
         """What of touches was rejected, at the sources and as contacts: the only such counter."""
         self.clicks_too_late = 0
-        """Short vibrations that came too late to be felt, since the start."""
+        """Short vibrations that came too late to be felt while armed, since the start.
+
+        They were over, or had lost their touch, before the amplifiers were to play them; with
+        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
+        do not allow.
+        """
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._changed_at = -math.inf  # s; of the last change, until all are decided
@@ -117,7 +121,7 @@ class Controller:
     @property
     def is_released(self) -> bool:
         """Whether all lines are closed."""
-        return self._lines_if_open is None
+        return self._lines is None
 
     @property
     def is_preparing(self) -> bool:
@@ -154,8 +158,9 @@ class Controller:
         restart whenever its port is opened.
         """
         self._is_closed = False
-        lines = self._lines_to_use = self._lines_to_use or self._make_lines()
-        self._lines_if_open = lines
+        if self._lines is None or self._lines.is_closing:
+            self._lines = self._make_lines()
+        lines = self._lines
         try:
             async with self._sending:  # to those of before
                 self.group = Group(
@@ -186,6 +191,7 @@ class Controller:
                 intent_source=self._intent_source,
                 timing=self._timing,
                 arrived=self._wake.set,
+                too_late=self._count_too_late,
             )
             await asyncio.to_thread(decider.prepare)  # seconds, of a large rig
         except BaseException as error:
@@ -287,8 +293,9 @@ class Controller:
 
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        lines = self._lines_if_open  # those of now: others may be opened meanwhile
-        self._lines_to_use = None
+        lines = self._lines  # those of now: others may be opened meanwhile
+        if lines is not None:
+            lines.is_closing = True
         try:
             await self.group.close(CLOSING_RAMP)
         finally:
@@ -296,8 +303,8 @@ class Controller:
                 if lines is not None:
                     await lines.close()
             finally:
-                if self._lines_if_open is lines:
-                    self._lines_if_open = None
+                if self._lines is lines:
+                    self._lines = None
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
@@ -323,10 +330,6 @@ class Controller:
         if (expired := self._tracker.expire(now)).up:
             decider.note(now, expired)
         decision = decider.decide(now)
-        late, decider.clicks_too_late = decider.clicks_too_late, 0
-        if late and self.group.is_armed:
-            self.clicks_too_late += late
-            _logger.warning("%s came too late to be felt: replies are late", counted(late, "click"))
         try:
             async with self._sending:
                 with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed
@@ -369,6 +372,13 @@ class Controller:
             await self._end_only(decider, decision)
         else:
             await self._execute(decider, decision)
+
+    def _count_too_late(self, clicks: int) -> None:
+        if self.group.is_armed:
+            self.clicks_too_late += clicks
+            _logger.warning(
+                "%s came too late to be felt: replies are late", counted(clicks, "click")
+            )
 
     def _feed_at_once(self) -> None:
         self._heartbeat_due = clock.now()

@@ -17,8 +17,7 @@ from drivers.errors import (
 )
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import Later, Priority
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart, Later, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -50,16 +49,15 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """A set that an amplifier has staged, or plays at once: as the wire has it, in messages.
+    """A set that an amplifier has staged, or plays at once: as the wire has it.
 
-    until: when [s] it must have been committed; is_exact: whether it plays to the word.
+    is_exact: to the word; until: when [s] it must have been committed.
     """
 
     token: int
     layers: tuple[LayerSet, ...]
-    messages: list[Values]
+    is_exact: bool
     until: float
-    is_exact: bool = True
 
 
 class Dialogue:
@@ -144,8 +142,8 @@ class Dialogue:
 
         def make() -> list[Values]:
             nonlocal staged
-            staged = self._admit(token, layers, now=now)
-            return staged.messages
+            staged, messages = self._admit(token, layers, now=now)
+            return messages
 
         for _ in range(MAX_CONTRADICTIONS):
             taken = await self.line.submit(self, priority, "Set", Later(make))
@@ -159,19 +157,21 @@ class Dialogue:
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
 
-    def _admit(self, token: int, layers: Sequence[Layer], *, now: bool) -> Staged:
-        """Have the ledger admit a set; raises CommandRefused."""
+    def _admit(
+        self, token: int, layers: Sequence[Layer], *, now: bool
+    ) -> tuple[Staged, list[Values]]:
+        """Have the ledger admit a set; returns its messages, too. Raises CommandRefused."""
         moment = self._time()
-        takes = self.exchange_time("Set")
         # Longest time from the admission of a set until it is committed.
-        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * takes)
+        attempts = ATTEMPTS * len(self.line.members)
+        delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
         admitted = self.ledger.admit(layers, moment, delay=delay)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         messages = parts(stream, session=self.session, token=token, now=now)
-        self._admitted = Staged(token, admitted, messages, until=moment + delay)
-        return self._admitted
+        self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        return self._admitted, messages
 
     def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.

@@ -21,7 +21,6 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
-from drivers.host.dialogue import Staged
 from drivers.host.feeding import Stopped
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
@@ -76,7 +75,8 @@ class Group:
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self._silencing = Silencing(self.amplifiers)
+        self.silencing = Silencing(self.amplifiers)
+        """Stops and disarms that go on."""
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
@@ -88,11 +88,6 @@ class Group:
     def is_armed(self) -> bool:
         """Whether layers may be played."""
         return self.state is GroupState.ARMED
-
-    @property
-    def is_silencing(self) -> bool:
-        """Whether a stop or disarm goes on."""
-        return bool(self._silencing)
 
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
@@ -124,20 +119,20 @@ class Group:
                 )
             if self.state is GroupState.STOPPED:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if self._silencing:  # the result would depend on the order of frames
+            if self.silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
             members.check_none_since(before)
             amplifiers = [*self.amplifiers.values()]
             if self.is_armed:
-                statuses = await self._read(Priority.ARM)
+                statuses = await self.statuses(Priority.ARM)
                 members.check_none_since(before)
                 if all(each["state"] == ENABLED for each in statuses.values()):
                     return
                 self._leave_armed()
                 before = members.epoch
-                await self._silencing.begin(self._disarm, amplifiers, STOP_RAMP)
+                await self.silencing.begin(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
@@ -150,7 +145,7 @@ class Group:
                 members.check_none_since(before)
             except BaseException as error:
                 self._note(error)
-                await self._silencing.begin(self._disarm_armed, arming)
+                await self.silencing.begin(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     members.check_none_since(before)
                 if members.is_degraded_only(error):
@@ -176,7 +171,7 @@ class Group:
         if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
             await self.stop()
 
-    def beat(self) -> Coroutine[Any, Any, Sequence[Values | Staged]]:
+    def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
@@ -251,7 +246,7 @@ class Group:
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self._silencing.begin(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.silencing.begin(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
@@ -272,17 +267,17 @@ class Group:
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        stops = self._silencing.stop(ramp)
+        stops = self.silencing.stop(ramp)
         names = stops if waits_for is None else waits_for
-        outcomes = self._silencing.outcomes
-        return self._silencing.begin(outcomes, {name: stops[name] for name in names})
+        outcomes = self.silencing.outcomes
+        return self.silencing.begin(outcomes, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
         Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
-        if self._silencing:
+        if self.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         before = self.members.epoch
         try:
@@ -297,14 +292,11 @@ class Group:
         if self.members.epoch == before and self.state is GroupState.STOPPED:
             self.state = GroupState.DISARMED
 
-    async def statuses(self) -> dict[str, Values]:
+    async def statuses(self, priority: Priority = Priority.OTHER) -> dict[str, Values]:
         """Read the status of every amplifier, by name; again while one does not reply.
 
         Raises LinkError once that one is lost.
         """
-        return await self._read(Priority.OTHER)
-
-    async def _read(self, priority: Priority) -> dict[str, Values]:
         amplifiers, retried = self.amplifiers.values(), self.members.retried
         statuses = await self._all(
             [retried(each, partial(each.read_status, priority)) for each in amplifiers]
@@ -334,10 +326,10 @@ class Group:
             ]
             try:
                 if amplifiers:
-                    await self._silencing.begin(self._disarm, amplifiers, ramp)
+                    await self.silencing.begin(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
-            await self._silencing.ended()  # only then is a line closed
+            await self.silencing.ended()  # only then is a line closed
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""

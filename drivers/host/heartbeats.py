@@ -15,7 +15,6 @@ from typing import TypeAlias
 from drivers.contents import Layer
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged
 from drivers.host.jobs import Later, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
@@ -29,7 +28,7 @@ _MAX_STATUS_LOAD = 0.05  # of the line's time, for these
 _UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
 _OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 
-Feed: TypeAlias = Callable[[], Awaitable[Values | Staged]]
+Feed: TypeAlias = Callable[[], Awaitable[object]]
 """What feeds an amplifier."""
 
 
@@ -48,7 +47,7 @@ class Heartbeats:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
 
-    def beat(self) -> Awaitable[Sequence[Values | Staged]]:
+    def beat(self) -> Awaitable[Sequence[object]]:
         """Feed every amplifier that replies, and read the status of any other meanwhile.
 
         One that has committed nothing since it was armed is fed by a silent set on a line that it

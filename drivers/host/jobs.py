@@ -1,19 +1,92 @@
-"""Requests that wait for a line: which one is sent next, and which are superseded.
+"""Requests that wait for a line, and commits that wait for other lines.
 
-Times [s] are of the event loop's clock.
+Which one is sent next, and which are superseded. Commits of several lines arrive at one moment,
+whatever the speeds of the lines and what keeps them; the remaining skew is that with which the
+operating system sends bytes. Times [s] are of the event loop's clock.
 """
 
 import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from operator import itemgetter
+from typing import NamedTuple, Protocol, TypeAlias, final
 
-from drivers.host.joint_start import JointStart
+from drivers.errors import CommandRefused, Preempted
 from drivers.host.timing import ATTEMPTS
 from drivers.host.wire import Event, OtherHost, Several
 from drivers.protocol.records import Values
 from drivers.statistics import LinkStatistics
+
+_SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
+
+Release: TypeAlias = Callable[[Exception | None], None]
+"""Sends a commit that was held, or fails it with an error."""
+
+
+@final
+class JointStart:
+    """Where so many lines wait, each free for its commit; the slowest one sends first.
+
+    until: latest time [s] at which the commits must arrive. Where one cannot send, none does that
+    has not sent before.
+    """
+
+    def __init__(self, count: int, until: float) -> None:
+        self._count, self._until = count, until
+        self._ready: list[tuple[float, Release]] = []  # how long each takes to arrive
+        self._failure: Exception | None = None
+        self._arrival = 0.0
+        self._looked_at = 0.0
+        self._loop = asyncio.get_running_loop()
+        self._timer = self._loop.call_at(until, self._give_up)
+
+    def arrive(self, takes: float, release: Release) -> None:
+        """Note that a line is free for a commit, which takes a time [s] to arrive.
+
+        release: called once; calls `fail` where that does not succeed.
+        """
+        self._ready.append((takes, release))
+        if self._failure is not None:
+            self._keep_back(self._failure)
+        elif len(self._ready) == self._count:
+            self._ready.sort(key=itemgetter(0))
+            self._arrival = self._loop.time() + self._ready[-1][0]
+            if self._arrival > self._until:
+                self._give_up()
+                return
+            self._timer.cancel()
+            self._loop.call_soon(self._send_due)  # none behind the pump of the line that came last
+
+    def fail(self, error: Exception) -> None:
+        """Note that one will not be sent: those that were not sent yet are not sent either."""
+        self._keep_back(Preempted(f"one of several commits failed: {error}"))
+
+    def _give_up(self) -> None:
+        text = "commits must be sent together; one of the lines is too busy"
+        self._keep_back(CommandRefused(text, until=self._loop.time()))
+
+    def _keep_back(self, error: Exception) -> None:
+        """Send none that waits or comes later: each fails with the first error of them."""
+        self._timer.cancel()
+        self._failure = self._failure or error
+        ready, self._ready = self._ready, []
+        for _, release in ready:
+            release(self._failure)
+
+    def _send_due(self) -> None:
+        now = self._loop.time()
+        while self._ready and self._arrival - self._ready[-1][0] <= now:
+            self._ready.pop()[1](None)
+        if not self._ready:
+            return
+        due = self._arrival - self._ready[-1][0]
+        if now == self._looked_at or due - now > 2 * _SLACK:  # virtual time: its timers are exact
+            self._loop.call_at(due if now == self._looked_at else due - _SLACK, self._send_due)
+        else:
+            self._loop.call_soon(self._send_due)
+        self._looked_at = now
+
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 
@@ -41,8 +114,8 @@ _SUPERSEDED = {
 class Later(NamedTuple):
     """What a request says, known once its turn has come.
 
-    make: returns the values of its messages, for each attempt until the first one has a reply;
-    raises CommandRefused. start: where it goes out together with commits of other lines.
+    make: called once, then; returns the values of its messages, or raises CommandRefused. start:
+    where it goes out together with commits of other lines.
     """
 
     make: Callable[[], list[Values]]
@@ -78,8 +151,8 @@ class Member(Protocol):
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    values: of the message on the line, or next. later: makes the messages until the first of them
-    has a reply; parts: those without one. attempts: left. start: of a commit that goes out together
+    values: of the message on the line, or next. later: until its turn has come; parts: what it made
+    that has no reply yet. attempts: left. start: of a commit that goes out together
     with those of other lines, until it was sent: is_held for them, then is_released. started_at
     [s]: when it went out behind what was sent before. longer: than on a fast wire its reply may
     take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier

@@ -16,8 +16,7 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
-from drivers.host.jobs import Later, Priority
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart, Later, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members
@@ -145,10 +144,9 @@ class JointSets:
                 requests[sharing[0]] = sharing[0].commit(token, start=start)
                 continue
             later = Later(partial(_commit_of, sharing, token), start)
-            sent = line.submit(None, Priority.SET, "Commit", later)
-            broadcasts.append(sent)
-            for each in sharing:
-                requests[each] = _status_of(each, token, sent)
+            broadcasts.append(line.submit(None, Priority.SET, "Commit", later))
+            for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
+                requests[each] = each.ping()
         # With the broadcasts: one that waits is not sent where this is given up.
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for each, status in zip(requests, statuses, strict=False):
@@ -186,7 +184,7 @@ def _commit_of(several: Sequence[Amplifier], token: int) -> list[Values]:
 
 
 async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
-    """Raise CommandRefused unless a status shows the token of a set, or the next one does.
+    """Raise CommandRefused unless a status shows the token of a set, or does once it is repeated.
 
     What its layers play is compared with every status.
     """
@@ -202,18 +200,6 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
-
-
-async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) -> Values:
-    """Read the status after a broadcast that was sent, and commit again where that was lost.
-
-    By a heartbeat: where replies are late the watchdogs run meanwhile.
-    """
-    status = await amplifier.ping()
-    if status["token"] == token:
-        return status
-    await sent
-    return await amplifier.commit(token)
 
 
 def _unchanged(amplifier: Amplifier) -> list[Layer]:

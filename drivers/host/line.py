@@ -150,7 +150,7 @@ class Line:
             if len(job.parts) <= 1:
                 job.result.set_result(arrival.values)
                 continue
-            job.later, job.parts = None, job.parts[1:]
+            job.parts = job.parts[1:]
             job.values, job.attempts = job.parts[0], ATTEMPTS
             job.queued_at, job.had_no_reply = self.time(), False
             if self._queue.jobs:
@@ -215,11 +215,15 @@ class Line:
         try:
             if not rest:
                 if self.ahead is not None and member is not None and job.start is None:
-                    self._commit_ahead(self.ahead(job.name, job.priority))
+                    ahead = self.ahead(job.name, job.priority)
+                    if ahead is not None:
+                        now, result = self.time(), self._loop.create_future()
+                        beat = Priority.HEARTBEAT
+                        self._start(Job(None, beat, "Commit", {}, 0.0, now, result, ahead))
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
                 if job.later is not None:
-                    job.parts = job.later.make()
+                    job.parts, job.later = job.later.make(), None
                     job.values = job.parts[0]
                 if member is not None:
                     job.longer = member.next_request(job.name, job.values, job.priority)
@@ -265,18 +269,9 @@ class Line:
         if self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
 
-    def _commit_ahead(self, values: Later | None) -> None:
-        """Send a commit to all ahead of a request whose turn has come, if there is one."""
-        if values is not None:
-            now, result = self.time(), self._loop.create_future()
-            job = Job(None, Priority.HEARTBEAT, "Commit", {}, 0.0, now, result, values)
-            self._start(job)
-
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
-        if job.is_stop_class:
-            return False
-        return any(other.is_stop_class for other in self._queue.jobs)
+        return not job.is_stop_class and any(other.is_stop_class for other in self._queue.jobs)
 
     def _refused(self, job: Job, member: Member, arrival: Nak | Broken) -> None:
         """End the request that was on the line with an error, or repeat it to a busy amplifier."""

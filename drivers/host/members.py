@@ -51,11 +51,8 @@ class Members:
     @property
     def lost_from(self) -> float:
         """When [s] the next beat stops all, since one that does not reply must be silent."""
-        first = math.inf
-        for each in self.amplifiers.values():
-            if each.silence_cause is not None:
-                first = min(first, each.feeding.lost_from)
-        return first
+        mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
+        return min([each.feeding.lost_from for each in mute], default=math.inf)
 
     @property
     def last_sent_at(self) -> float:
@@ -85,16 +82,9 @@ class Members:
 
         A lost link is first; last are what others have preempted and, after it, a degraded link.
         """
-        good: list[_T] = []
-        errors: list[BaseException] = []
-        for each in results:
-            if isinstance(each, BaseException):
-                errors.append(each)
-            else:
-                good.append(each)
-        if errors:
+        if errors := [each for each in results if isinstance(each, BaseException)]:
             raise min(errors, key=self._severity)
-        return good
+        return [each for each in results if not isinstance(each, BaseException)]
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):

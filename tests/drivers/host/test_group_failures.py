@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.group import Group
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope

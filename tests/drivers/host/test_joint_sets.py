@@ -9,7 +9,7 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
 from drivers.host.can_wire import CanWire
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire

@@ -70,7 +70,8 @@ class Decider:
     """Intent, selection and sets for the contacts on one plate; synchronous, times are arguments.
 
     A decision never raises: it falls back to silence on any exception. arrived: called when several
-    contents have been chosen, which a decision does not wait for.
+    contents have been chosen, which a decision does not wait for. too_late: called with how many
+    clicks came too late to be felt.
     """
 
     def __init__(

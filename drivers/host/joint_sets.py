@@ -134,9 +134,7 @@ class JointSets:
         for each, one in staged.items():
             by_line.setdefault(each.line, []).append(each)
             until = min(until, one.until)
-        start = None
-        if len(by_line) > 1:
-            start = JointStart(len(by_line), until=until)
+        start = JointStart(len(by_line), until=until) if len(by_line) > 1 else None
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():

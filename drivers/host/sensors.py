@@ -91,10 +91,12 @@ async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
     if not has_feature(amplifier.capabilities, "electrical"):
         return []
-    rows = (await amplifier.request("GetMeasured", {}, Priority.READING))["channels"]
-    voltages = [_Q["channel_voltage"].from_wire(row["channel_voltage"]) for row in rows]
-    currents = [_Q["channel_current"].from_wire(row["channel_current"]) for row in rows]
-    return list(zip(voltages, currents, strict=True))
+    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
+    voltage, current = _Q["channel_voltage"].from_wire, _Q["channel_current"].from_wire
+    return [
+        (voltage(row["channel_voltage"]), current(row["channel_current"]))
+        for row in measured["channels"]
+    ]
 
 
 async def start_reading(

@@ -83,12 +83,11 @@ class SetTable:
 
 
 def _query(table: object, question: Question, over_effect: object = None) -> Pattern:
-    found = getattr(table, "query", None) or partial(find_pattern, table)
-    return found(question, over_effect)
+    return getattr(table, "query", partial(find_pattern, table))(question, over_effect)
 
 
 def _prepare(table: object, drive_mode: str | None) -> None:
-    (getattr(table, "prepare", None) or partial(prepare_patterns, table))(drive_mode)
+    getattr(table, "prepare", partial(prepare_patterns, table))(drive_mode)
 
 
 decision.find_pattern = table_query.find_pattern = _query

@@ -132,7 +132,7 @@ class Group:
                     return
                 self._leave_armed()
                 before = members.epoch
-                await self.silencing.begin(self._disarm, amplifiers, STOP_RAMP)
+                await self.silencing.start(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
@@ -145,7 +145,7 @@ class Group:
                 members.check_none_since(before)
             except BaseException as error:
                 self._note(error)
-                await self.silencing.begin(self._disarm_armed, arming)
+                await self.silencing.start(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     members.check_none_since(before)
                 if members.is_degraded_only(error):
@@ -246,7 +246,7 @@ class Group:
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self.silencing.begin(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.silencing.start(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
@@ -270,7 +270,7 @@ class Group:
         stops = self.silencing.stop(ramp)
         names = stops if waits_for is None else waits_for
         outcomes = self.silencing.outcomes
-        return self.silencing.begin(outcomes, {name: stops[name] for name in names})
+        return self.silencing.start(outcomes, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
@@ -326,7 +326,7 @@ class Group:
             ]
             try:
                 if amplifiers:
-                    await self.silencing.begin(self._disarm, amplifiers, ramp)
+                    await self.silencing.start(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
             await self.silencing.ended()  # only then is a line closed

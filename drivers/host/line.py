@@ -132,7 +132,6 @@ class Line:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
-            self._boots_until = -math.inf
             late = self.time() - job.started_at - member.exchange_time(job.name)
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
@@ -140,6 +139,7 @@ class Line:
             if not isinstance(arrival, Reply):
                 self._refused(job, member, arrival)
                 continue
+            self._boots_until = -math.inf
             try:
                 member.note_reply(job.name, job.values, arrival.values, job.sent_at)
             except Exception as error:  # whatever it is, no caller may wait for ever

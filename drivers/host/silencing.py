@@ -28,10 +28,10 @@ class Silencing:
         """Whether a stop or disarm goes on."""
         return bool(self._tasks)
 
-    def begin(
+    def start(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
-        """Begin a stop or disarm, which goes on to its end whoever is cancelled meanwhile."""
+        """Start a stop or disarm, which goes on to its end whoever is cancelled meanwhile."""
         task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -178,8 +178,11 @@ class Amplifier(Dialogue):
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""
-        values = {"session": self.session, "ramp": self.wire_ramp(ramp)}
-        return await self.request("Silence", values, Priority.SILENCE)
+        return await self.request(
+            "Silence",
+            {"session": self.session, "ramp": self.wire_ramp(ramp)},
+            Priority.SILENCE,
+        )
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence, then switch the high voltage off; read back until it is silent.

@@ -167,8 +167,8 @@ class Group:
             ],
             return_exceptions=True,
         )
-        failures = [each for each in disarmed if isinstance(each, BaseException)]
-        if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
+        # One that is mute stops none.
+        if not all(isinstance(each, LinkError | None) for each in disarmed):
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:

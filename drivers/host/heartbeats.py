@@ -26,7 +26,6 @@ from drivers.protocol.sets import is_newer_token, token_after
 _STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for these
 _UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
-_OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 
 Feed: TypeAlias = Callable[[], Awaitable[object]]
 """What feeds an amplifier."""
@@ -136,7 +135,7 @@ class Heartbeats:
         those that have committed it, and the others may have their commit now. Not ahead of a
         status: it shows how a watchdog runs down only if none was fed before it.
         """
-        if priority not in _OF_LOOP or name == "GetStatus":
+        if priority not in (Priority.HEARTBEAT, Priority.SET) or name == "GetStatus":
             return None
         limit = HEARTBEAT
         if line.late <= GRACE:

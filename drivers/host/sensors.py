@@ -147,10 +147,9 @@ async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
         found = await _same_reading(amplifier, started, 0)
     count = (await amplifier.request("GetSensors", {"first": 0}, Priority.READING))["all"]
     sensors = found.sensors
-    while len(sensors) < count:
+    more = sensors
+    while more and len(sensors) < count:
         more = (await _same_reading(amplifier, started, len(sensors))).sensors
-        if not more:
-            break
         sensors += more
     if len(sensors) != count:
         raise FrameError(f"reading must have all {count} sensors, got {len(sensors)}; {_VIOLATION}")

@@ -34,7 +34,7 @@ class Lines:
 
     def __init__(self) -> None:
         self.is_closing = False
-        """Whether they are being closed: no other is opened any more."""
+        """Whether their owner is closing them: what it opens meanwhile is opened by others."""
         self._opened: dict[str, _Opened] = {}
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
         self._closing: set[asyncio.Task[None]] = set()
@@ -54,7 +54,7 @@ class Lines:
         CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
         address that is taken by one of another name; one of this name gives way.
         """
-        address = address_of(url)
+        address, before = address_of(url), self._opened
         async with self._changing.setdefault(address.line, asyncio.Lock()):
             opened = self._opened.get(address.line)
             if opened is not None and opened.line.loss is not None:
@@ -63,7 +63,7 @@ class Lines:
                 opened = None
             if opened is None:
                 opened = await _open(address)
-                if self.is_closing:
+                if self._opened is not before:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
                 self._opened[address.line] = opened
@@ -85,7 +85,7 @@ class Lines:
 
         A second call waits for the first. Lines are closed though the caller is cancelled.
         """
-        opened, self._opened, self.is_closing = self._opened, {}, True
+        opened, self._opened = self._opened, {}
         for each in opened.values():
             closing = asyncio.create_task(each.close(), name=f"close {each.line.name}")
             self._closing.add(closing)

@@ -13,8 +13,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 
-from controller.api.rate_limit import RateLimiter
 from controller.gateway.bridge import KeptLink
+from controller.process.rate_limit import RateLimiter
 
 MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request

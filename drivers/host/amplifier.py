@@ -5,9 +5,8 @@ from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
 
-from drivers import clock
+from drivers.counters import LinkStatistics
 from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
-from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import Stopped
@@ -15,7 +14,7 @@ from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.stop import Stop
-from drivers.host.timing import REPLY_TIMEOUT, STOP_RAMP
+from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
@@ -25,7 +24,8 @@ from drivers.protocol.table import (
     VERSION,
     has_feature,
 )
-from drivers.statistics import LinkStatistics
+from drivers.protocol.timing import REPLY_TIMEOUT, STOP_RAMP
+from registry import clock
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms

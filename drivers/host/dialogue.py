@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from drivers.contents import Layer
+from drivers.counters import LinkStatistics
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -28,12 +28,12 @@ from drivers.host.reports import (
     armed_problem,
     reports_of,
 )
-from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
-from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES
-from drivers.statistics import LinkStatistics
+from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
+from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""

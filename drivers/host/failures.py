@@ -1,9 +1,9 @@
 """What requests of an amplifier fail with, in words: the cause, and what to do."""
 
 from drivers.errors import CommandRefused, WrongAmplifier
-from drivers.host.wire import Nak
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, STATES, name_of
+from drivers.wires.wire import Nak
 
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 _REMEDIES = {"WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew"}

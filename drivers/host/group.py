@@ -9,8 +9,6 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any, TypeVar
 
-from drivers import clock
-from drivers.contents import Layer
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -27,9 +25,11 @@ from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
 from drivers.host.members import Members, is_lost
 from drivers.host.silencing import Silencing
-from drivers.host.timing import STOP_RAMP, check_watchdog
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
+from drivers.protocol.timing import STOP_RAMP, check_watchdog
+from registry import clock
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]

@@ -12,16 +12,16 @@ from functools import partial
 from operator import itemgetter
 from typing import TypeAlias
 
-from drivers.contents import Layer
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Later, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
-from drivers.host.timing import HEARTBEAT
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
+from drivers.protocol.timing import HEARTBEAT
 
 _STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for these

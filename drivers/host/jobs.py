@@ -12,11 +12,11 @@ from enum import IntEnum
 from operator import itemgetter
 from typing import NamedTuple, Protocol, TypeAlias, final
 
+from drivers.counters import LinkStatistics
 from drivers.errors import CommandRefused, Preempted
-from drivers.host.timing import ATTEMPTS
-from drivers.host.wire import Event, OtherHost, Several
 from drivers.protocol.records import Values
-from drivers.statistics import LinkStatistics
+from drivers.protocol.timing import ATTEMPTS
+from drivers.wires.wire import Event, OtherHost, Several
 
 _SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
 

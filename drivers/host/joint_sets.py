@@ -11,8 +11,6 @@ from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from drivers import clock
-from drivers.contents import Layer
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
@@ -20,10 +18,12 @@ from drivers.host.jobs import JointStart, Later, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members
-from drivers.host.timing import STOP_RAMP
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, STATES, name_of
+from drivers.protocol.timing import STOP_RAMP
+from registry import clock
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""

@@ -12,14 +12,14 @@ from functools import partial
 
 from drivers import trace
 from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
-from drivers.hardware import OpenPort
 from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Later, Member, Priority
-from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
-from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
+from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
 from drivers.protocol.table import BROADCAST
+from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.trace import Direction
+from drivers.wires.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier

@@ -6,9 +6,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import TypeVar
 
-from drivers import clock
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
+from registry import clock
 
 _T = TypeVar("_T")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited

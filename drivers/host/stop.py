@@ -3,14 +3,14 @@
 import asyncio
 import contextlib
 
-from drivers import clock
 from drivers.host.dialogue import Dialogue
 from drivers.host.feeding import Stopped
 from drivers.host.jobs import Later, Priority
-from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import LATCHED, QUANTITIES
+from drivers.protocol.timing import ATTEMPTS
+from registry import clock
 
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP = QUANTITIES["ramp"]

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from controller.loop import decision, table_query
+from controller.play import decision, table_query
 from model.arrays import FloatArray, IntArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig

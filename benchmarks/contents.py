@@ -30,6 +30,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import random_contacts, use_one_thread
+from model.table.pattern_query import prepare_patterns
+from model.table.raster_kernel import read_fingertips
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,7 +85,7 @@ def main() -> None:
                 drive_mode="phased",
                 frequencies=np.arange(40.0, 501.0 if options.distortion else 321.0, 10.0),
             )
-            table.prepare(with_ringing=False)
+            prepare_patterns(table, with_ringing=False)
             if options.sharing:
                 _print_sharing((name, label), table, count=options.sets)
                 continue
@@ -173,7 +175,7 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
     patient = replace(table)
-    patient.prepare(with_ringing=False)  # kernels read the numbers once for a table
+    prepare_patterns(patient, with_ringing=False)  # kernels read the numbers once for a table
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = chosen
     for targets in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20):
         lost: dict[float, list[float]] = {20.0: [], 90.0: []}
@@ -320,7 +322,7 @@ def _kept(
     )
     contents = range(len(found.layers))
     question = Question(tuple(each.request.at for each in found.layers), tuple(quiet))
-    weights = table.read_fingertips(question.contacts).fine_weights
+    weights = read_fingertips(table, question.contacts).fine_weights
     powers = []
     for layer in found.layers:
         rows, power = powers_on(table, question, layer.excitation, plates)

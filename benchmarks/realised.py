@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
+from model.table.pattern_query import find_pattern
 
 if TYPE_CHECKING:
     from model.arrays import FloatArray
@@ -97,7 +98,7 @@ def _line(row: Row, sets: int) -> str:
             size = (rig.plate.length, rig.plate.width)
             target, *others = random_contacts(rng, 1 + quiet, size, margin=MARGIN).tolist()
             asked = Question((tuple(target),), tuple(map(tuple, others)), envelopes=True)
-            pattern = table.query(asked)
+            pattern = find_pattern(table, asked)
             contrast, level = realised(rig, asked, pattern.excitation, number)
             found.append([*np.percentile(contrast, [50, 10]), np.percentile(level, 10)])
             promised = pattern.robust_felt_contrast_db

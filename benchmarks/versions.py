@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.setting import RIG, random_contacts, use_one_thread
+from model.table.pattern_query import find_pattern
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -93,7 +94,9 @@ def _answers(sets: int) -> dict[str, list[dict[str, list[float]]]]:
     found = {}
     for name, words, rig, table in _tables():
         for quiet in QUIET:
-            patterns = [table.query(_question(rig, quiet, number)) for number in range(sets)]
+            patterns = [
+                find_pattern(table, _question(rig, quiet, number)) for number in range(sets)
+            ]
             found[f"{name}, {words}, {quiet}"] = [
                 {
                     era: [tone.frequency, tone.amplitude, tone.phase]

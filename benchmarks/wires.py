@@ -29,7 +29,8 @@ class _Port:
     is_blocked = False
 
     def __init__(self, name: str) -> None:
-        self.line = Line(SerialWire(921_600, sequence=0), self, name)
+        self.line = Line(SerialWire(921_600, sequence=0), name)
+        self.line.open(self)
         amplifier = Amplifier(name, channels=CHANNELS)
         self._end = SerialAmplifiers({1: amplifier}, self._reply)
 

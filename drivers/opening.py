@@ -33,6 +33,8 @@ class Lines:
     """The open lines of a host; amplifiers at one port, connection or bus share a line."""
 
     def __init__(self) -> None:
+        self.is_closing = False
+        """Whether their owner is closing them: what it opens meanwhile is opened by others."""
         self._opened: dict[str, _Opened] = {}
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
         self._closing: set[asyncio.Task[None]] = set()
@@ -95,15 +97,7 @@ class Lines:
 
 
 async def _open(address: WireAddress) -> _Opened:
-    """Open the line of an address; what comes before it is made is lost, but not its loss."""
-    lines: list[Line] = []
-    losses: list[str] = []
-    port = await address.open_port(
-        lambda data: lines[0].received(data) if lines else None,
-        lambda cause: lines[0].lose(cause) if lines else losses.append(cause),
-    )
-    line = Line(address.make_wire(), port, address.line, boot_time=address.boot_time)
-    lines.append(line)
-    for cause in losses:
-        line.lose(cause)
+    line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
+    port = await address.open_port(line.received, line.lose)
+    line.open(port)
     return _Opened(line, port, address.settings)

@@ -94,7 +94,7 @@ async def again(hosted: HostedRig) -> None:
     """Let it reply, or reopen, clear and arm it, with all faults over."""
     hosted.devices["main"].recover()
     async with asyncio.timeout(60):
-        while hosted.group.is_armed and hosted.group.degraded:
+        while hosted.group.is_armed and hosted.group.members.degraded:
             await asyncio.sleep(HEARTBEAT)
             with contextlib.suppress(DriverError):
                 await hosted.group.beat()

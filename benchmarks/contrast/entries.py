@@ -32,7 +32,9 @@ from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.exact_plates import Plates, accelerations_on, draw_plates, touched
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
+from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, Tone
 
@@ -70,14 +72,14 @@ class _Case:
     @property
     def weights(self) -> FloatArray:
         """Of the points in the mean over the target, 0 at the others, (points,)."""
-        weights = self.table.read_fingertips(self.question.contacts).fine_weights.astype(float)
+        weights = read_fingertips(self.table, self.question.contacts).fine_weights.astype(float)
         weights[1:] = 0
         return weights.ravel()
 
     @property
     def is_target(self) -> NDArray[np.bool_]:
         """Whether a point is under the target, (points,)."""
-        tips = self.table.read_fingertips(self.question.contacts).fine_weights
+        tips = read_fingertips(self.table, self.question.contacts).fine_weights
         return np.repeat(np.arange(len(tips)) == 0, tips.shape[1])
 
     def excitation(self, frequency: float, weights: ComplexArray) -> Excitation:
@@ -119,13 +121,13 @@ def _inverse_filter(case: _Case) -> Excitation:
 
 def _paper(case: _Case) -> Excitation:
     known = replace(case.table, uncertainty=Uncertainty.none())
-    found = known.query(replace(case.question, drive_mode="switched")).excitation
+    found = find_pattern(known, replace(case.question, drive_mode="switched")).excitation
     strokes = case.table.strokes
     return {name: replace(tone, amplitude=strokes[name]) for name, tone in found.items()}
 
 
 def _ours(case: _Case) -> Excitation:
-    return case.table.query(replace(case.question, drive_mode="phased")).excitation
+    return find_pattern(case.table, replace(case.question, drive_mode="phased")).excitation
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,7 @@ def _hindsight(case: _Case) -> Excitation:
     for frequency in table.frequencies.tolist():
         asked = replace(case.question, drive_mode="phased", frequencies=(frequency, frequency))
         try:
-            promised.append(table.query(asked).robust_felt_contrast_db or -math.inf)
+            promised.append(find_pattern(table, asked).robust_felt_contrast_db or -math.inf)
         except InputError:
             promised.append(-math.inf)
     rows = np.sort(np.argsort(promised)[-FREQUENCIES_IN_HINDSIGHT:])

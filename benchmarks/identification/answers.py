@@ -15,6 +15,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
@@ -94,7 +95,7 @@ def answer(table: LocalizationTable, places: Reals) -> Answer:
     """The table's answer for fingers (k, 2) [m], the first the target."""
     points = [(float(x), float(y)) for x, y in places]
     question = Question((points[0],), tuple(points[1:]), level_db_sl=0.0, envelopes=True)
-    pattern = table.query(question)
+    pattern = find_pattern(table, question)
     tones = [pattern.excitation.get(era.name) for era in table.eras]
     (frequency,) = {tone.frequency for tone in tones if tone is not None}
     contrast, level = pattern.robust_felt_contrast_db, pattern.robust_level_db_sl

@@ -51,7 +51,8 @@ class FarEnd:
     def __init__(self, channels: int, written: Callable[[], None]) -> None:
         self._written = written
         self._end = SerialAmplifiers({1: SimulatedAmplifier("any", channels=channels)}, self._reply)
-        self.line = Line(SerialWire(0, sequence=0), self, "line")
+        self.line = Line(SerialWire(0, sequence=0), "line")
+        self.line.open(self)
 
     def write(self, data: bytes) -> None:
         """Take bytes of the host."""

@@ -18,6 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import use_one_thread
+from model.table.pattern_query import find_pattern
 
 if TYPE_CHECKING:
     from model.arrays import FloatArray
@@ -84,7 +85,7 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
         places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
         question = Question(places[:1], places[1:], LEVEL_DB_SL)
         solve = partial(levels.responses, question=question, duration=DURATION)
-        pattern = table.query(question, OverEffect(DURATION, solve))
+        pattern = find_pattern(table, question, OverEffect(DURATION, solve))
         raised = levels.raised(
             pattern, question, level_db_sl=LEVEL_DB_SL, duration=DURATION, limits=full
         )

@@ -24,6 +24,7 @@ from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.knots import steady_states
@@ -83,10 +84,11 @@ class Bench:
             for name, ramp in (("abrupt", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
                 columns[name].append(self._contrast(case, bases))
-            chosen = self.table.query(
+            chosen = find_pattern(
+                self.table,
                 Question(
                     tuple(case.targets), tuple(case.quiet), drive_mode="phased", level_db_sl=12.0
-                )
+                ),
             )
             bases = ramped_onset(chosen.excitation, self.rig.eras, ramp=chosen.ramp)
             columns["the table's pattern and ramp"].append(self._contrast(case, bases))

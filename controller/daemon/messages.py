@@ -34,9 +34,9 @@ from controller.play.routing import Drive
 from controller.touch.contacts import Contact, ContactKey
 from drivers.counters import LinkStatistics
 from drivers.host.amplifier import Amplifier
+from drivers.host.feeding import Stopped
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
-from drivers.host.stop import Stopped
 from drivers.protocol.table import (
     FAULTS,
     QUANTITIES,

@@ -50,7 +50,7 @@ from controller.play.loop import Controller
 from controller.play.table_query import MAX_DB_SL
 from controller.touch.contacts import Contact
 from controller.touch.frames import Touch, TouchFrame
-from drivers.host.stop import Stopped
+from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 from registry import clock
@@ -240,7 +240,7 @@ class ApiService:
     def _play(self, client: Connection, params: PlayParams) -> Empty:
         """Start an effect at the contact nearest to a position, at its own level or below."""
         operation = self._supervisor.operation
-        if operation.state is not _ENABLED or self._controller.group.degraded:
+        if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
         effects = self._layout.layout.effects
         effect = effects.get(params.effect)

@@ -36,6 +36,7 @@ from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.live_table import table_following
+from model.table.pattern_query import prepare_patterns
 from model.table.table import LocalizationTable
 
 _NICE = 10  # above that of the daemon, whose loop comes first
@@ -133,7 +134,7 @@ class Estimator:
     def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:
         # Of its own, not the one that the next correction starts from.
         table = replace(table)
-        table.prepare(self._start.drive_mode, with_ringing=whole)
+        prepare_patterns(table, self._start.drive_mode, with_ringing=whole)
         _ = table.in_time
         return Answers(self._base, table, whole)
 

@@ -22,7 +22,7 @@ from controller.operation.states import (
 from controller.play.observer import Observer
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
-from drivers.host.members import GroupState
+from drivers.host.group import GroupState
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
 from model.errors import InputError
@@ -227,7 +227,7 @@ class Supervisor(Operator):
         try:
             await self._check_disarmed()
         except LinkError as error:
-            if not self.controller.group.is_degraded_only(error):
+            if not self.controller.group.members.is_degraded_only(error):
                 await self._in_background(self._handle_loss(error))
         except DriverError:
             pass  # preempted by another request, which reports for itself
@@ -237,7 +237,7 @@ class Supervisor(Operator):
     async def _check_disarmed(self) -> None:
         epoch, group = self.operation.epoch, self.controller.group
         statuses = await group.statuses()
-        if epoch != self.operation.epoch or group.is_silencing:
+        if epoch != self.operation.epoch or group.silencing:
             return  # they may have been read before, or during a ramp
         problem, state = find_problem(statuses, group.amplifiers), self.operation.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
@@ -259,9 +259,9 @@ class Supervisor(Operator):
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""
         group, operation = self.controller.group, self.operation
-        degraded = group.degraded
+        degraded = group.members.degraded
         is_said = bool(degraded) is bool(operation.degraded)
-        if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.lost_by:
+        if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.members.lost_by:
             return  # of one that is lost the next heartbeat says so
         change: LinkChange = "restored"
         level, remedy = logging.INFO, "era disarm, or era stop"

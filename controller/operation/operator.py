@@ -35,7 +35,7 @@ from drivers.errors import (
     Preempted,
     WrongAmplifier,
 )
-from drivers.host.stop import Stopped
+from drivers.host.feeding import Stopped
 from registry import clock
 from registry.plugins import failure_text
 
@@ -276,7 +276,7 @@ class Operator:
 
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
-        causes = self.controller.group.lost_by.values()
+        causes = self.controller.group.members.lost_by.values()
         if causes and not self._is_loss_handled:
             try:
                 await self._handle_loss(LinkError(next(iter(causes))))
@@ -344,7 +344,7 @@ class Operator:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
             group = self.controller.group
-            lost = *group.lost_by, *group.degraded
+            lost = *group.members.lost_by, *group.members.degraded
             if self.operation.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, str(error))
             cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)

@@ -18,8 +18,9 @@ from controller.play.routing import FADE_RAMP, PlateSet, SetBuilder
 from controller.play.selection import Selector
 from controller.touch.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from model.rig.rig import Rig
+from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -69,7 +70,8 @@ class Decider:
     """Intent, selection and sets for the contacts on one plate; synchronous, times are arguments.
 
     A decision never raises: it falls back to silence on any exception. arrived: called when several
-    contents have been chosen, which a decision does not wait for.
+    contents have been chosen, which a decision does not wait for. too_late: called with how many
+    clicks came too late to be felt.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class Decider:
         intent_source: IntentSource,
         timing: Timing,
         arrived: Callable[[], None] = lambda: None,
+        too_late: Callable[[int], None] = lambda clicks: None,
     ) -> None:
         self.capabilities = capabilities
         """Of the amplifiers together."""
@@ -99,14 +102,8 @@ class Decider:
         """The layers."""
         self._retry_at = math.inf  # s; when a ledger would admit what it refused
         self._is_new = True  # something has come that is not decided yet
-        self._arrived = arrived
+        self._arrived, self._too_late = arrived, too_late
         self._triggered_at = math.inf  # s; when the first change since the last decision arrived
-        self.clicks_too_late = 0
-        """Pulses that were over, or had lost their touch, before the amplifiers were to play them.
-
-        With fingers that had left before they were looked at; not what a ledger refuses, or
-        neighbours do not allow.
-        """
         self._seen: frozenset[ContactKey] = frozenset()  # fingers, when it was last decided
         self._awaited: dict[int, Pulse] = {}  # by identity: decided, and not known to have started
         self._touched_at = -math.inf  # s; when a finger came, moved or pressed last
@@ -124,7 +121,7 @@ class Decider:
         Raises InputError for a table that has no pattern for these amplifiers.
         """
         table, timing = self._selector.chooser.table, self._builder.timing
-        table.prepare(self.capabilities.drive_mode)
+        prepare_patterns(table, self.capabilities.drive_mode)
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
         question = Question(
@@ -138,7 +135,7 @@ class Decider:
         )
         pattern = timing.with_envelopes(
             question,
-            table.query(question),
+            find_pattern(table, question),
             onset=support.onset_knots > 0,
             ending=support.ending_knots > 0,
         )
@@ -165,7 +162,8 @@ class Decider:
     def note(self, time: float, change: Change) -> None:
         """Note that contacts have changed, by what arrived at a time [s]."""
         self._is_new = True
-        self.clicks_too_late += sum(each.key not in self._seen for each in change.up)
+        if unseen := [each for each in change.up if each.key not in self._seen]:
+            self._too_late(len(unseen))
         if change.down or change.moved or change.pressed:
             self._touched_at = time
         self._triggered_at = min(self._triggered_at, time)
@@ -195,7 +193,8 @@ class Decider:
         for number in decision.started:
             for _, target in playing.contents[number].content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
-                    self.clicks_too_late += played.sent_at > target.pulse.end
+                    if played.sent_at > target.pulse.end:
+                        self._too_late(1)
                     target.pulse.started_at = played.sent_at
                     self._intent_due = min(self._intent_due, target.pulse.end)
             playing.confirm_start(number, played, now)
@@ -295,8 +294,9 @@ class Decider:
                 self._played_until = now
         for number, pulse in [*self._awaited.items()]:
             if pulse.started_at is not None or now >= pulse.end:
-                self.clicks_too_late += pulse.started_at is None
                 del self._awaited[number]
+                if pulse.started_at is None:
+                    self._too_late(1)
         if not self._is_new and now < self.due:
             return None
         contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)

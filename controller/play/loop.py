@@ -24,9 +24,9 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.group import Group
-from drivers.host.members import GroupState, Played
-from drivers.host.stop import UNREACHED, Stopped, what_may_play
+from drivers.host.feeding import UNREACHED, Stopped
+from drivers.host.group import Group, GroupState
+from drivers.host.joint_sets import Played
 from drivers.opening import Lines
 from drivers.protocol.timing import HEARTBEAT, REPLY_TIMEOUT
 from model.counting import counted
@@ -84,10 +84,9 @@ class Controller:
                 f"{', '.join(sorted(self.urls)) or 'none'}"
             )
         self._make_lines = lines
-        self._lines_if_open: Lines | None = None
+        self._lines: Lines | None = None  # also after an attempt to open that has failed
         self._opened: dict[str, Amplifier] = {}  # last, identified or not
         self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
-        self._lines_to_use: Lines | None = None  # of another attempt to open
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -104,7 +103,12 @@ class Controller:
         self.rejects = RejectCounter(_logger)
         """What of touches was rejected, at the sources and as contacts: the only such counter."""
         self.clicks_too_late = 0
-        """Short vibrations that came too late to be felt, since the start."""
+        """Short vibrations that came too late to be felt while armed, since the start.
+
+        They were over, or had lost their touch, before the amplifiers were to play them; with
+        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
+        do not allow.
+        """
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._changed_at = -math.inf  # s; of the last change, until all are decided
@@ -117,14 +121,14 @@ class Controller:
     @property
     def is_released(self) -> bool:
         """Whether all lines are closed."""
-        return self._lines_if_open is None
+        return self._lines is None
 
     @property
     def is_preparing(self) -> bool:
         """Whether a change of contacts is on its way to the amplifiers."""
         if self._decider_if_open is not None and self._decider_if_open.is_choosing:
             return True
-        return self.group.last_sent_at < self._changed_at
+        return self.group.members.last_sent_at < self._changed_at
 
     @property
     def drive_mode(self) -> str:
@@ -154,8 +158,9 @@ class Controller:
         restart whenever its port is opened.
         """
         self._is_closed = False
-        lines = self._lines_to_use = self._lines_to_use or self._make_lines()
-        self._lines_if_open = lines
+        if self._lines is None or self._lines.is_closing:
+            self._lines = self._make_lines()
+        lines = self._lines
         try:
             async with self._sending:  # to those of before
                 self.group = Group(
@@ -167,8 +172,8 @@ class Controller:
             lost = {name: each for name, each in by_name if isinstance(each, LinkError)}
             for error in lost.values():
                 error.lost = tuple(lost)
-            opened = self.group.checked(results)
-            amplifiers = self.group.amplifiers = dict(zip(self.urls, opened, strict=True))
+            opened = self.group.members.checked(results)
+            amplifiers = dict(zip(self.urls, opened, strict=True))
             self._connected(amplifiers)
             await self.group.open()
             for name, amplifier in amplifiers.items():
@@ -186,6 +191,7 @@ class Controller:
                 intent_source=self._intent_source,
                 timing=self._timing,
                 arrived=self._wake.set,
+                too_late=self._count_too_late,
             )
             await asyncio.to_thread(decider.prepare)  # seconds, of a large rig
         except BaseException as error:
@@ -273,7 +279,7 @@ class Controller:
     def what_may_play(self, name: str, cause: str = "") -> Stopped:
         """What an amplifier may play as far as is known; cause: why no more is; see there."""
         opened = self._opened.get(name)
-        return UNREACHED if opened is None else what_may_play(opened, cause)
+        return UNREACHED if opened is None else opened.what_may_play(cause)
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -287,8 +293,9 @@ class Controller:
 
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        lines = self._lines_if_open  # those of now: others may be opened meanwhile
-        self._lines_to_use = None
+        lines = self._lines  # those of now: others may be opened meanwhile
+        if lines is not None:
+            lines.is_closing = True
         try:
             await self.group.close(CLOSING_RAMP)
         finally:
@@ -296,8 +303,8 @@ class Controller:
                 if lines is not None:
                     await lines.close()
             finally:
-                if self._lines_if_open is lines:
-                    self._lines_if_open = None
+                if self._lines is lines:
+                    self._lines = None
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
@@ -323,10 +330,6 @@ class Controller:
         if (expired := self._tracker.expire(now)).up:
             decider.note(now, expired)
         decision = decider.decide(now)
-        late, decider.clicks_too_late = decider.clicks_too_late, 0
-        if late and self.group.is_armed:
-            self.clicks_too_late += late
-            _logger.warning("%s came too late to be felt: replies are late", counted(late, "click"))
         try:
             async with self._sending:
                 with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed
@@ -365,10 +368,17 @@ class Controller:
         if decision is None:
             if now >= decider.playing.due:
                 await self._go_on(decider, now)
-        elif decision.started and self.group.degraded:
+        elif decision.started and self.group.members.degraded:
             await self._end_only(decider, decision)
         else:
             await self._execute(decider, decision)
+
+    def _count_too_late(self, clicks: int) -> None:
+        if self.group.is_armed:
+            self.clicks_too_late += clicks
+            _logger.warning(
+                "%s came too late to be felt: replies are late", counted(clicks, "click")
+            )
 
     def _feed_at_once(self) -> None:
         self._heartbeat_due = clock.now()
@@ -404,7 +414,7 @@ class Controller:
         """Whether to feed the watchdogs now; pending silence has priority."""
         if not self.group.is_armed or self._decider.is_silence_pending:
             return False
-        return clock.now() >= min(self._heartbeat_due, self.group.lost_from)
+        return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
 
     @property
     def _decider(self) -> Decider:
@@ -447,7 +457,7 @@ class Controller:
 
     async def _go_on(self, decider: Decider, now: float) -> None:
         """Prolong the layers that are due, and report those that have ended; raises DriverError."""
-        due = {} if self.group.degraded else decider.renewal(now)
+        due = {} if self.group.members.degraded else decider.renewal(now)
         if due:
             decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
         if (ended := decider.ended(now)) is not None:
@@ -515,7 +525,7 @@ class Controller:
         Whatever is raised instead leaves it unknown what plays.
         """
         try:
-            if self.group.is_set_incomplete:
+            if self.group.sets.is_incomplete:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
             layers = {
                 name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
@@ -537,7 +547,7 @@ class Controller:
         if self._decider_if_open is not None:
             until = min(until, self._decider_if_open.due)
         if self.group.is_armed:
-            until = min(until, self._heartbeat_due, self.group.lost_from)
+            until = min(until, self._heartbeat_due, self.group.members.lost_from)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

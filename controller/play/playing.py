@@ -14,7 +14,7 @@ from controller.play.intent import Target
 from controller.play.routing import Drive, PlateSet, restarted_by, tones_by_era
 from controller.touch.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig

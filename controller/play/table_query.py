@@ -15,7 +15,7 @@ from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table.effect_level import DriveLimits, EffectLevels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
-from model.table.pattern_query import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel, find_pattern
 from model.table.pulse_gains import OverEffect
 from model.table.question import MAX_LEVEL_DB_SL, Question
 from model.table.request import OWN_CONTRAST_DB, Finger, Request
@@ -71,7 +71,7 @@ def query_table(
         duration = target.pulse.duration  # over which the level is felt
     if target.level_db_sl is None:
         rated = _over_effect(levels, question, duration)
-        pattern = strongest(table.query(question, rated), capabilities.max_amplitudes)
+        pattern = strongest(find_pattern(table, question, rated), capabilities.max_amplitudes)
         felt, promised = pattern.level_db_sl, pattern.robust_felt_contrast_db
         if duration is not None:
             # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
@@ -220,12 +220,12 @@ def _query(
 ) -> tuple[Question, Pattern]:
     """Query a table; allow_weaker: for the highest level where the stroke allows no more."""
     try:
-        return question, table.query(question, over_effect)
+        return question, find_pattern(table, question, over_effect)
     except UnreachableLevel as error:
         if not allow_weaker or error.reachable_db_sl >= question.level_db_sl:
             raise
         question = replace(question, level_db_sl=error.reachable_db_sl)
-        return question, table.query(question, over_effect)
+        return question, find_pattern(table, question, over_effect)
 
 
 def _as_neighbours_allow(
@@ -233,11 +233,13 @@ def _as_neighbours_allow(
 ) -> TableAnswer:
     """Return the pattern of a level, or one as strong as the neighbours allow."""
     try:
-        pattern = table.query(question)
+        pattern = find_pattern(table, question)
     except InputError:
         level = question.level_db_sl
         question = replace(question, level_db_sl=min(level, FELT_DB_SL))
-        pattern = strongest(table.query(question), capabilities.max_amplitudes, max_db_sl=level)
+        pattern = strongest(
+            find_pattern(table, question), capabilities.max_amplitudes, max_db_sl=level
+        )
     return _steady(question, pattern, pattern.level_db_sl)
 
 

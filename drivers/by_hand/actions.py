@@ -20,9 +20,9 @@ from drivers.by_hand.reaching import (
 )
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
-from drivers.host.stop import Stopped
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import (

@@ -25,9 +25,9 @@ from drivers.by_hand.reaching import (
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
+from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
-from drivers.host.stop import Stopped
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED

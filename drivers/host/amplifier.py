@@ -1,7 +1,6 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
-import math
 from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
@@ -9,21 +8,21 @@ from typing import Any
 from drivers.counters import LinkStatistics
 from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
+from drivers.host.failures import contradicted, disarmed, driven_by_another
+from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.stop import UNREACHED, Stop, Stopped, what_may_play
+from drivers.host.stop import Stop
 from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
     ENABLED,
-    FAULTS,
     QUANTITIES,
     STATES,
     VERSION,
     has_feature,
-    name_of,
 )
 from drivers.protocol.timing import REPLY_TIMEOUT, STOP_RAMP
 from registry import clock
@@ -37,7 +36,7 @@ CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
-_RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
+_WATCHDOG = QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
@@ -66,13 +65,11 @@ class Amplifier(Dialogue):
         self.limits, self._serial_number = limits, serial_number
         self._is_output = is_output
         self.identity: Values = {}
-        self.known = UNREACHED
-        """What it may play by what is known beside its statuses and what fed it."""
         self._stop: Stop | None = None
 
     def go_on_from(self, before: "Amplifier") -> None:
         """Know what was known of it when its line was opened before, and may have been lost."""
-        self.known = replace(what_may_play(before), is_confirmed=before.known.is_confirmed)
+        self.known = replace(before.what_may_play(), is_confirmed=before.known.is_confirmed)
         self.may_be_armed = before.may_be_armed
 
     async def open(self) -> None:
@@ -129,10 +126,10 @@ class Amplifier(Dialogue):
         It is identified anew: it may have lost its supply, and come back with other limits. What
         silences it from this call on comes first, also before this is awaited.
         """
-        return self._arm(session, watchdog, self.silences)
+        self.arming = self.silences, clock.now() + _ARM_WITHIN
+        return self._arm(session, watchdog)
 
-    async def _arm(self, session: int, watchdog: float, before: int) -> Values:
-        began = clock.now()
+    async def _arm(self, session: int, watchdog: float) -> Values:
         await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
@@ -141,18 +138,9 @@ class Amplifier(Dialogue):
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
         self.feeding.watchdog = max(self.feeding.watchdog, watchdog)
         values = {"session": session, "watchdog": wire}
-
-        def make() -> Values:
-            if self.silences != before:
-                raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-            if clock.now() - began > _ARM_WITHIN:  # this machine slept: nobody waits for it now
-                raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
-            self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
-            return values
-
         was_armed = self.may_be_armed
         try:
-            status = await self.line.submit(self, Priority.ARM, "Arm", values, make=make)
+            status = await self.line.submit(self, Priority.ARM, "Arm", values)
         except CommandRefused as error:
             if not (isinstance(error, Preempted) or error.may_play):
                 self.may_be_armed = was_armed
@@ -162,13 +150,7 @@ class Amplifier(Dialogue):
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:
-            raise CommandRefused(
-                f"amplifier {self.name} must be OPERATION_ENABLED after Arm, got "
-                f"{name_of(STATES, status['state'])}, fault {name_of(FAULTS, status['fault'])}; "
-                "once the cause is gone, clear and arm again",
-                may_play=True,
-                is_disarmed=True,
-            )
+            raise disarmed(self.name, status)
         return status
 
     async def read_achieved(self, one: LayerSet, token: int) -> LayerSet:
@@ -191,13 +173,16 @@ class Amplifier(Dialogue):
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:
             _, what, must, seen = problem
-            raise self.contradicted(f"{what} in layer {one.layer} must be {must}, got {seen}")
+            raise contradicted(self.name, f"{what} in layer {one.layer} must be {must}, got {seen}")
         return achieved
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""
-        values = {"session": self.session, "ramp": self.wire_ramp(ramp)}
-        return await self.request("Silence", values, Priority.SILENCE)
+        return await self.request(
+            "Silence",
+            {"session": self.session, "ramp": self.wire_ramp(ramp)},
+            Priority.SILENCE,
+        )
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence, then switch the high voltage off; read back until it is silent.
@@ -263,18 +248,6 @@ class Amplifier(Dialogue):
         """Counts of its requests, and of all frames on its line."""
         return replace(self.counts, **vars(self.line.wire.counters))
 
-    def wire_ramp(self, ramp: float) -> int:
-        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
-        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
-        if math.isnan(ramp):
-            return _RAMP.to_wire(STOP_RAMP)
-        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
-
-    def is_silent(self, status: Values) -> bool:
-        """Whether a status has the levels of all channels, and all are zero."""
-        known = self.capabilities.get("channels")
-        return known == len(status["levels"]) and not any(status["levels"])
-
     async def _listen_for_another_host(self, status: Values) -> None:
         """Wait for a watchdog that rises unasked; raises LinkError."""
         end = clock.now() + LISTENING
@@ -284,7 +257,7 @@ class Amplifier(Dialogue):
             status = await self.read_status()
             self.check_other_host()
             if status["watchdog_left"] > left:
-                raise self._driven_by_another()
+                raise driven_by_another(self.name)
             left = status["watchdog_left"]
 
 

@@ -1,11 +1,10 @@
 """What one amplifier was sent and has replied: sets, ledger, watchdog, latch, contradictions."""
 
+import asyncio
 import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING
 
 from drivers.counters import LinkStatistics
 from drivers.errors import (
@@ -13,12 +12,15 @@ from drivers.errors import (
     CommandRefused,
     FrameError,
     LinkDegraded,
+    LinkTimeout,
     Preempted,
-    WrongAmplifier,
 )
-from drivers.host.jobs import JointStart, Priority
+from drivers.host.failures import contradicted, disarmed, driven_by_another
+from drivers.host.feeding import UNREACHED, Feeding, Stopped
+from drivers.host.jobs import JointStart, Later, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
+from drivers.host.line import Line
 from drivers.host.reports import (
     REPORT_LIFE,
     REPORTS,
@@ -29,27 +31,10 @@ from drivers.host.reports import (
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
-from drivers.protocol.table import (
-    ENABLED,
-    EVENT_RECORD,
-    FAULTS,
-    MESSAGES,
-    QUANTITIES,
-    REACTION,
-    STATES,
-    STATUS,
-    name_of,
-)
-from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS
+from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
+from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
-if TYPE_CHECKING:
-    import asyncio
-
-    from drivers.host.line import Line
-
-SILENCING = 0.005 + REACTION
-"""From the expiry of a watchdog until the outputs are silent, at the most [s]."""
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
 _SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
@@ -61,66 +46,6 @@ _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
 _logger = logging.getLogger(__name__)
-
-
-@dataclass
-class Feeding:
-    """When its watchdog was fed, as far as the host knows: what may have, and what surely did.
-
-    delay, is_kept: of the wire; watchdog [s]. may: when [s] the last request that may have fed went
-    out. plays: the last such that does not also silence it, arrives: when it arrives unless it is
-    delayed: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
-    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
-    surely did went out, and its reply came.
-    """
-
-    delay: float = 0.0
-    is_kept: bool = False
-    watchdog: float = 0.0
-    may: float = -math.inf
-    plays: float = -math.inf
-    arrives: float = -math.inf
-    fade: float = 0.0
-    since: float = -math.inf
-    confirmed_at: float = -math.inf
-
-    @property
-    def lost_from(self) -> float:
-        """When the watchdog has silenced it, and one that does not reply is lost [s].
-
-        A request without reply may still be under way; what is confirmed came before its reply, and
-        not always in the time of the line: a busy machine may have kept it.
-        """
-        is_confirmed = self.plays <= self.since
-        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
-        return arrival + self.watchdog + self.fade + SILENCING
-
-    @property
-    def may_play_until(self) -> float:
-        """When the watchdog must have silenced it, even where it is fed once more [s].
-
-        What an adapter has kept comes at any time, all at once: after the watchdog without effect.
-        Of several attempts without reply one may have arrived, and the next been kept.
-        """
-        may_be_fed_again = self.is_kept and self.plays > self.since
-        return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
-
-    def tells(self, sent_at: float) -> bool:
-        """Whether a status asked for at a time [s] would show a watchdog that stands still."""
-        return self.may <= self.since and sent_at - self.confirmed_at > REACTION
-
-    def problem(self, left: float, sent_at: float, now: float) -> str | None:
-        """Describe an impossible time that is left [s] in a reply to a request; None if possible.
-
-        sent_at: of the request, which is not one that feeds; now: of the reply.
-        """
-        lowest = self.watchdog - (now - self.since) - REACTION
-        # One that may have fed and was not confirmed may have come just before this request.
-        fed_at = self.confirmed_at if self.may <= self.since else sent_at
-        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
-        if lowest <= left <= highest:
-            return None
-        return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +64,7 @@ class Staged:
 class Dialogue:
     """The exchanges with one amplifier, whose line is open; as it sees it."""
 
-    def __init__(self, line: "Line", address: int, name: str) -> None:
+    def __init__(self, line: Line, address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
         self.session = 0
@@ -151,6 +76,8 @@ class Dialogue:
         """The last one."""
         self.status_at: float | None = None
         """When [s] it was read."""
+        self.arming = (0, -math.inf)
+        """Stops and disarms before Arm was requested, and until when [s] it may go out."""
         self.armed_latch: int | None = None
         """That of the reply to the last Arm."""
         self.reported_at: dict[ReportKind, float] = {}
@@ -160,6 +87,8 @@ class Dialogue:
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
+        self.known = UNREACHED
+        """What it may play by what is known beside its statuses and what fed it."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -210,55 +139,50 @@ class Dialogue:
         """
         if priority is None:
             priority = Priority.SILENCE if is_silence(layers) else Priority.SET
+        staged: Staged
+
+        def make() -> list[Values]:
+            nonlocal staged
+            staged, messages = self._admit(token, layers, now=now)
+            return messages
+
         for _ in range(MAX_CONTRADICTIONS):
-            cuts: list[Values] = []
-            admitted: list[Staged] = []
-            make = partial(self._admit, token, layers, admitted, cuts, now=now)
-            taken = await self.line.submit(self, priority, "Set", {}, make=make, parts=cuts)
-            (staged,) = admitted
+            taken = await self.line.submit(self, priority, "Set", Later(make))
             if taken["token"] == token:
                 break
         else:
             problem = f"a set with token {token} must be taken, got token {taken['token']}"
-            raise FrameError(str(self.contradicted(problem)))  # no refusal: all are stopped
+            # No refusal: all are stopped.
+            raise FrameError(str(contradicted(self.name, problem)))
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
 
     def _admit(
-        self,
-        token: int,
-        layers: Sequence[Layer],
-        staged: list[Staged],
-        cuts: list[Values],
-        *,
-        now: bool,
-    ) -> Values:
-        """Have the ledger admit a set, cut it into parts and return the first.
-
-        Raises CommandRefused.
-        """
+        self, token: int, layers: Sequence[Layer], *, now: bool
+    ) -> tuple[Staged, list[Values]]:
+        """Have the ledger admit a set; returns its messages, too. Raises CommandRefused."""
         moment = self._time()
-        takes = self.exchange_time("Set")
         # Longest time from the admission of a set until it is committed.
-        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * takes)
+        attempts = ATTEMPTS * len(self.line.members)
+        delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
         admitted = self.ledger.admit(layers, moment, delay=delay)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
-        cuts += parts(stream, session=self.session, token=token, now=now)
+        messages = parts(stream, session=self.session, token=token, now=now)
         self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
-        staged.append(self._admitted)
-        return cuts[0]
+        return self._admitted, messages
 
-    def commit(self, token: int, *, start: JointStart | None = None) -> "asyncio.Future[Values]":
+    def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
 
         start: together with the commits of other lines. Or raises Preempted where a stop or
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        return self.line.submit(self, Priority.SET, "Commit", values, start=start)
+        later = Later(lambda: [values], start) if start is not None else values
+        return self.line.submit(self, Priority.SET, "Commit", later)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -285,6 +209,12 @@ class Dialogue:
                     f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
                     until=now,
                 )
+        if name == "Arm":
+            silences, until = self.arming
+            if self.silences != silences:
+                raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+            if self._time() > until:  # this machine slept: it is too late for whoever asked
+                raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
         if self._other_host_at > -math.inf:
             self.check_other_host()
         if self.silence_cause is not None:
@@ -293,7 +223,7 @@ class Dialogue:
                 "passed; nothing new is played until it replies"
             )
         if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
-            raise self.disarmed(self.status)
+            raise disarmed(self.name, self.status)
         return longer
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
@@ -314,9 +244,11 @@ class Dialogue:
             feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
             self.silences += 1
         admitted = self._admitted
-        if name in _SILENCING or name == "Arm":
+        if name == "Arm":
+            self._admitted, self.may_be_armed = None, True
+            self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
+        elif name in _SILENCING:
             self._admitted = None
-            self.may_be_armed = self.may_be_armed or name == "Arm"
             self.played_at = now if name == "Silence" else self.played_at
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
@@ -359,7 +291,7 @@ class Dialogue:
         ):
             self._confirm(reply["token"], now)
         if name == "Ping" and not is_enabled:
-            raise self.disarmed(reply)
+            raise disarmed(self.name, reply)
         if ledger is None or not self.session or name in ("Arm", "Clear") or not is_enabled:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
@@ -377,7 +309,7 @@ class Dialogue:
         if now - self._contradicted_at >= _SAME_MOMENT:
             self._contradictions, self._contradicted_at = self._contradictions + 1, now
             if self._contradictions >= MAX_CONTRADICTIONS:
-                raise self.contradicted(problem)
+                raise contradicted(self.name, problem)
 
     def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
         """Note what came without a request; an event is handed on."""
@@ -400,10 +332,43 @@ class Dialogue:
                 _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
             self.reported_at[kind] = now
 
+    def wire_ramp(self, ramp: float) -> int:
+        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
+        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
+        if math.isnan(ramp):
+            return _RAMP.to_wire(STOP_RAMP)
+        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
+
+    def is_silent(self, status: Values) -> bool:
+        """Whether a status has the levels of all channels, and all are zero."""
+        known = self.capabilities.get("channels")
+        return known == len(status["levels"]) and not any(status["levels"])
+
+    def what_may_play(self, cause: str = "") -> Stopped:
+        """Return until when it may play by all that is known of it.
+
+        cause: why no more is known, by default what ails its line. Over is what confirmed a stop,
+        and was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was
+        never fed is over once it has shown that it is silent. One that shows more after it was
+        confirmed, or its watchdog must have silenced it, is fed by another, or broken. A status
+        after the stop alone confirms it.
+        """
+        status, at, until = self.status, self.status_at, self.known.may_play_until
+        if not self.known.is_confirmed:
+            until = max(until, self.feeding.may_play_until)
+        if status is not None and at is not None:
+            is_armed = status["state"] == ENABLED
+            if self.is_silent(status) and not is_armed:  # and identified
+                until = at if until == math.inf else max(until, at)
+            elif (is_armed or any(status["levels"])) and at >= until:
+                until = math.inf
+        cause = cause or self.line.loss or self.silence_cause or ""
+        return Stopped(False, math.inf if until == -math.inf else until, cause)
+
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it, which must feed within the longest time."""
         if self._time() - self._other_host_at <= _WATCHDOG.high:
-            raise self._driven_by_another()
+            raise driven_by_another(self.name)
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier plays the set with this token, as it says."""
@@ -412,24 +377,3 @@ class Dialogue:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
-
-    def contradicted(self, problem: str) -> CommandRefused:
-        """Return the error of contradictions in a row."""
-        return CommandRefused(
-            f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
-            "broken channel, an exchanged cable or firmware, then clear and arm again"
-        )
-
-    def disarmed(self, status: Values) -> CommandRefused:
-        """Return the error of what plays or feeds, once a status shows that it is not armed."""
-        return CommandRefused(
-            f"amplifier {self.name} is no longer armed but in {name_of(STATES, status['state'])}, "
-            f"fault {name_of(FAULTS, status['fault'])}; "
-            "once the cause is gone, clear and arm again",
-            is_disarmed=True,
-        )
-
-    def _driven_by_another(self) -> WrongAmplifier:
-        return WrongAmplifier(
-            f"amplifier {self.name} is driven by another host; end that one first"
-        )

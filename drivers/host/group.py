@@ -5,8 +5,9 @@ import logging
 import math
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from enum import Enum, auto
 from functools import partial
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from drivers.errors import (
     CommandError,
@@ -18,28 +19,37 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
-from drivers.host.dialogue import Staged
+from drivers.host.feeding import Stopped
+from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
-from drivers.host.line import GRACE, Line
-from drivers.host.members import GroupState, Members, is_lost
-from drivers.host.stop import Stopped, what_may_play
+from drivers.host.joint_sets import JointSets, Played
+from drivers.host.members import Members, is_lost
+from drivers.host.silencing import Silencing
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
-from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED, QUANTITIES
-from drivers.protocol.timing import HEARTBEAT, STOP_RAMP, check_watchdog
+from drivers.protocol.timing import STOP_RAMP, check_watchdog
 from registry import clock
 
 _T = TypeVar("_T")
-_P = ParamSpec("_P")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
-_REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
-_MAX_STATUS_LOAD = 0.05  # of the line's time, for these
 _logger = logging.getLogger(__name__)
 
 
-class Group(Members):
+class GroupState(Enum):
+    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError.
+
+    STOPPED: disarmed by a stop, which is to be cleared before they are armed.
+    """
+
+    CLOSED = auto()
+    DISARMED = auto()
+    STOPPED = auto()
+    ARMED = auto()
+    LOST = auto()
+
+
+class Group:
     """Amplifiers by name, their lines open. A failure of one stops all; nothing arms by itself.
 
     A stop runs to completion even if its caller is cancelled. watchdog [s]: of armed amplifiers.
@@ -55,33 +65,43 @@ class Group(Members):
         restored: Callable[[], None] = lambda: None,
         draw: Callable[[int, int], int] = random.randint,
     ) -> None:
-        super().__init__(amplifiers, draw(_TOKEN.minimum, _TOKEN.maximum))
-        self._watchdog, self._restored = watchdog, restored
-        self._draw = draw
+        self.state = GroupState.CLOSED
+        self.members = Members(amplifiers)
+        """Which of them reply, and which are lost."""
+        self.amplifiers = self.members.amplifiers
+        self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
+        """What they play together."""
+        self._heartbeats = Heartbeats(self.members, self.sets, restored)
+        self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self._silencing: set[asyncio.Future[Any]] = set()  # stops and disarms in progress
-        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
-        self._running_due: dict[str, float] = {}  # statuses just before a heartbeat
-        self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
-        self._gives_up_at = math.inf  # s; nothing is repeated later, since all is being closed
+        self.silencing = Silencing(self.amplifiers)
+        """Stops and disarms that go on."""
+        self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
-    def is_silencing(self) -> bool:
-        """Whether a stop or disarm goes on."""
-        return bool(self._silencing)
+    def is_open(self) -> bool:
+        """Whether all reply as far as is known: neither closed nor lost."""
+        return self.state not in (GroupState.CLOSED, GroupState.LOST)
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether layers may be played."""
+        return self.state is GroupState.ARMED
 
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
 
         Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
         """
-        before, self._gives_up_at = self.epoch, math.inf
-        await self.all([each.open() for each in self.amplifiers.values()])
+        members, before = self.members, self.members.epoch
+        members.gives_up_at = math.inf
+        await self._all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
+        self._heartbeats.follow()
         # Each amplifier says itself what it has latched before.
-        self.state = GroupState.DISARMED if self.epoch == before else GroupState.STOPPED
+        self.state = GroupState.DISARMED if members.epoch == before else GroupState.STOPPED
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
@@ -90,7 +110,7 @@ class Group(Members):
         that came first, nothing changes. Raises DriverError, LinkDegraded where one only does not
         reply for now.
         """
-        before = self.epoch
+        members, before = self.members, self.members.epoch
         async with self._arming:
             if not self.is_open:
                 raise CommandError(
@@ -99,21 +119,21 @@ class Group(Members):
                 )
             if self.state is GroupState.STOPPED:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if self._silencing:  # the result would depend on the order of frames
+            if self.silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
-            self.check_none_since(before)
+            members.check_none_since(before)
             amplifiers = [*self.amplifiers.values()]
             if self.is_armed:
-                statuses = await self._read(Priority.ARM)
-                self.check_none_since(before)
+                statuses = await self.statuses(Priority.ARM)
+                members.check_none_since(before)
                 if all(each["state"] == ENABLED for each in statuses.values()):
                     return
                 self._leave_armed()
-                before = self.epoch
-                await self._silenced(self._disarm, amplifiers, STOP_RAMP)
-                self.check_none_since(before)
+                before = members.epoch
+                await self.silencing.start(self._disarm, amplifiers, STOP_RAMP)
+                members.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
@@ -121,19 +141,19 @@ class Group(Members):
                 *[each.arm(session, self._watchdog) for each in amplifiers], return_exceptions=True
             )
             try:
-                self.checked(await asyncio.shield(arming))
-                self.check_none_since(before)
+                members.checked(await asyncio.shield(arming))
+                members.check_none_since(before)
             except BaseException as error:
-                self.note(error)
-                await self._silenced(self._disarm_armed, arming)
+                self._note(error)
+                await self.silencing.start(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
-                    self.check_none_since(before)
-                if self.is_degraded_only(error):
+                    members.check_none_since(before)
+                if members.is_degraded_only(error):
                     raise LinkDegraded(str(error)) from error
-                if self.lost_by:
-                    self.lose()
+                if members.lost_by:
+                    self._lose()
                 raise
-            self.is_set_incomplete = False
+            self.sets.is_incomplete = False
             self.state = GroupState.ARMED
 
     async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
@@ -141,98 +161,84 @@ class Group(Members):
         await arming
         disarmed = await asyncio.gather(
             *[
-                self._retried(each, partial(each.disarm, STOP_RAMP))
+                self.members.retried(each, partial(each.disarm, STOP_RAMP))
                 for each in self.amplifiers.values()
                 if each.may_be_armed
             ],
             return_exceptions=True,
         )
-        failures = [each for each in disarmed if isinstance(each, BaseException)]
-        if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
+        # One that is mute stops none.
+        if not all(isinstance(each, LinkError | None) for each in disarmed):
             await self.stop()
 
-    def beat(self) -> Coroutine[Any, Any, Sequence[Values | Staged]]:
+    def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
-        play its set. A watchdog that runs down, and starts anew with each heartbeat, shows that it
-        would silence the amplifier: so its status is read just before it is fed, five times a
-        second, and less often on a slow wire or where replies come late. On a shared line one that
-        has committed nothing since it was armed is fed by a silent set, so that all have committed
-        the same: the line feeds them together by that.
+        play its set.
         """
-        return self._exchange(self._beat)
+        return self._exchange(self._heartbeats.beat)
 
-    def _beat(self) -> Awaitable[Sequence[Values | Staged]]:
-        for each in self.amplifiers.values():  # before the others are waited for: they stop then
-            if (each.silence_cause or each.line.loss) and is_lost(each):
-                raise LinkTimeout(each.line.loss or each.silence_cause)
-        first: dict[Line, int] = {}
-        running = self._read_running()
-        feeding: list[Awaitable[Values | Staged]] = []
-        order = self.by_need
-        for line in {each.line for each in self.amplifiers.values() if each.line.late > GRACE}:
-            # A late line feeds all again ahead of each: after that the last one's status tells.
-            of_line = [name for name in order if self.amplifiers[name].line is line]
-            next_read = min(of_line, key=lambda name: self._running_due.get(name, 0.0))
-            order.remove(next_read)
-            order.append(next_read)
-        for name in order:
-            each = self.amplifiers[name]
-            if each.silence_cause is None:
-                if name in running:
-                    feeding.append(self._read_and_feed(each, self.epoch, running[name]))
-                elif not each.committed and len(each.line.members) > 1:
-                    token = first[each.line] = first.get(each.line) or self._first_token(each.line)
-                    layers, priority = [Layer(0)], Priority.HEARTBEAT
-                    feeding.append(each.stage(token, layers, now=True, priority=priority))
-                else:
-                    feeding.append(each.ping())
-            elif name not in self._readings or self._readings[name].done():
-                read = partial(each.read_status, Priority.READING)
-                self._readings[name] = asyncio.ensure_future(self._retried(each, read))
-                self._readings[name].add_done_callback(self._has_replied)
-        return self.all(feeding)
+    def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Coroutine[Any, Any, Played]:
+        """Play layers on the amplifiers of these names, all from one moment on.
 
-    def _read_running(self) -> dict[str, "asyncio.Future[Values]"]:
-        """Read statuses that show how a watchdog runs down, before any of their line are fed.
-
-        On a line that is slow or late of one alone, so that none waits for long; of none where one
-        may reply again, which is to be heard before.
+        Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
+        that is no longer armed does not refuse a set: it stops all.
+        Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
+        one does not reply: then it is unknown whether the set plays. What else fails stops all
+        amplifiers before it is raised.
         """
-        busy = {each.line for each in self.amplifiers.values() if each.silence_cause is not None}
-        running: dict[str, asyncio.Future[Values]] = {}
-        for name in self.by_need:
-            each = self.amplifiers[name]
-            now, line = each.line.time(), each.line
-            is_due = line not in busy and now >= self._running_due.get(name, 0.0)
-            is_first = not each.committed and len(line.members) > 1  # it is fed by a set
-            if is_due and not is_first and each.feeding.tells(now):
-                pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
-                self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
-                all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
-                if line.late > GRACE or all_of_line > HEARTBEAT:
-                    busy.add(line)
-                running[name] = each.read_status(Priority.HEARTBEAT)
-        return running
+        return self._exchange(partial(self.sets.play, layers))
 
-    def _has_replied(self, reading: "asyncio.Future[Values]") -> None:
-        _seen(reading)
-        if not reading.cancelled() and reading.exception() is None:
-            self._restored()
+    async def silence(self, ramp: float) -> float:
+        """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
 
-    def _first_token(self, line: Line) -> int:
-        """Return the token that one of a line has committed, or else a new one."""
-        committed = max(each.committed for each in line.members.values())
-        self.token = self.token if committed else token_after(self.token)
-        return committed or self.token
+        Returns when [s] the last request went out. Raises as `apply`.
+        """
+        await self._exchange(partial(self.sets.silence, ramp))
+        return self.members.last_sent_at
 
-    async def _read_and_feed(
-        self, amplifier: Amplifier, before: int, reading: "asyncio.Future[Values]"
-    ) -> Values:
-        await reading
-        self.check_none_since(before)
-        return await amplifier.ping()
+    def abort_exchange(self) -> None:
+        """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
+
+        What was not sent is not sent any more; a request on the wire is waited for at most 8 ms.
+        """
+        if self._limit is not None and not self._limit.expired():
+            self._limit.reschedule(clock.now())
+
+    async def _exchange(self, exchange: Callable[[], Awaitable[_T | DriverError]]) -> _T:
+        """Run an exchange of the control loop; any unexplained failure stops all amplifiers.
+
+        An error that it returns stops none.
+        """
+        if not self.is_armed:
+            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
+        members, before = self.members, self.members.epoch
+        limit = asyncio.timeout(None)
+        try:
+            try:
+                async with limit as self._limit:
+                    done = await exchange()
+            finally:
+                self._limit = None
+        except Exception as error:
+            self._note(error)
+            has_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST
+            if limit.expired() and isinstance(error, TimeoutError | Preempted) and not has_lost:
+                raise Preempted("given up, since silence comes first") from error
+            if members.is_degraded_only(error):
+                raise LinkDegraded(str(error)) from error
+            is_explained = members.epoch != before and self.state is not GroupState.LOST
+            if is_explained and isinstance(error, DriverError):
+                raise Preempted("a stop or disarm came first") from error
+            replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
+            await self.stop(waits_for=replying)
+            if has_lost:  # also where it was degraded when this began
+                raise LinkTimeout(next(iter(members.lost_by.values()), str(error))) from error
+            raise
+        if isinstance(done, DriverError):
+            raise done
+        return done
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.
@@ -240,11 +246,12 @@ class Group(Members):
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self._silenced(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.silencing.start(self._disarm, [*self.amplifiers.values()], ramp)
 
-    async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
+    async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
+        retried = self.members.retried
         try:
-            await self.all([self._retried(each, partial(each.disarm, ramp)) for each in members])
+            await self._all([retried(each, partial(each.disarm, ramp)) for each in amplifiers])
         except BaseException:
             await self.stop()
             raise
@@ -254,81 +261,45 @@ class Group(Members):
     ) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
         """Stop every amplifier along a ramp [s], lost ones too; latched until `clear`.
 
-        The requests are queued when this returns; those of one line get a broadcast first, so that
-        none waits for the reply of another. Await it for what became of each, by name: of those of
-        some names, None for all. It goes on to its end if its caller is cancelled.
+        The requests are queued when this returns. Await it for what became of each, by name: of
+        those of some names, None for all. It goes on to its end if its caller is cancelled.
         """
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        for line in {each.line for each in self.amplifiers.values()}:
-            if len(line.members) > 1:
-                try:
-                    self._broadcast(line, ramp)
-                except Exception:  # each amplifier is stopped by itself as well
-                    _logger.exception("%s: the broadcast of a stop failed", line.name)
-        stops: dict[str, asyncio.Future[Stopped]] = {}
-        for name, amplifier in self.amplifiers.items():
-            try:
-                stops[name] = amplifier.stop(ramp)
-            except Exception as error:  # the others are stopped all the same
-                stops[name] = asyncio.get_running_loop().create_future()
-                stops[name].set_exception(error)
-        names = [*stops] if waits_for is None else waits_for
-        return self._silenced(self._outcomes, {name: stops[name] for name in names})
-
-    def _broadcast(self, line: Line, ramp: float) -> None:
-        """Request a stop of all amplifiers of a line, unless one is queued."""
-        queued = self._broadcasts.get(line)
-        if queued is None or queued.done():
-            first = next(iter(self.amplifiers.values()))
-            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
-            sent.add_done_callback(_seen)
-            self._broadcasts[line] = sent
-
-    async def _outcomes(
-        self, stops: Mapping[str, "asyncio.Future[Stopped]"]
-    ) -> Mapping[str, Stopped]:
-        outcomes: dict[str, Stopped] = {}
-        for name, result in zip(
-            stops, await asyncio.gather(*stops.values(), return_exceptions=True), strict=True
-        ):
-            if isinstance(result, BaseException):
-                result = what_may_play(self.amplifiers[name], f"{type(result).__name__}: {result}")
-            outcomes[name] = result
-        return outcomes
+        stops = self.silencing.stop(ramp)
+        names = stops if waits_for is None else waits_for
+        outcomes = self.silencing.outcomes
+        return self.silencing.start(outcomes, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
         Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
-        if self._silencing:
+        if self.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
-        before = self.epoch
+        before = self.members.epoch
         try:
-            await self.all([each.clear() for each in self.amplifiers.values()])
+            await self._all([each.clear() for each in self.amplifiers.values()])
         except LinkError:
             await self.stop()
             raise
         except CommandRefused as error:
-            if self.epoch != before:  # the stop of now is another one
+            if self.members.epoch != before:  # the stop of now is another one
                 raise Preempted("a stop came first; find the cause, then clear again") from error
             raise
-        if self.epoch == before and self.state is GroupState.STOPPED:
+        if self.members.epoch == before and self.state is GroupState.STOPPED:
             self.state = GroupState.DISARMED
 
-    async def statuses(self) -> dict[str, Values]:
+    async def statuses(self, priority: Priority = Priority.OTHER) -> dict[str, Values]:
         """Read the status of every amplifier, by name; again while one does not reply.
 
         Raises LinkError once that one is lost.
         """
-        return await self._read(Priority.OTHER)
-
-    async def _read(self, priority: Priority) -> dict[str, Values]:
-        amplifiers = self.amplifiers.values()
-        statuses = await self.all(
-            [self._retried(each, partial(each.read_status, priority)) for each in amplifiers]
+        amplifiers, retried = self.amplifiers.values(), self.members.retried
+        statuses = await self._all(
+            [retried(each, partial(each.read_status, priority)) for each in amplifiers]
         )
         return dict(zip(self.amplifiers, statuses, strict=True))
 
@@ -341,67 +312,46 @@ class Group(Members):
         self._leave_armed()
         self.state = GroupState.CLOSED
         # Of one that does not reply by then a stop is all that is left.
-        self._gives_up_at = min(self._gives_up_at, now + CONFIRM_TIMEOUT)
+        self.members.gives_up_at = min(self.members.gives_up_at, now + CONFIRM_TIMEOUT)
         async with self._closing:
-            members = [
+            amplifiers = [
                 each
                 for each in self.amplifiers.values()
                 if each.may_be_armed
                 and (
                     is_armed
                     or not is_lost(each)
-                    or (each.line.loss is None and what_may_play(each).may_play_until > now)
+                    or (each.line.loss is None and each.what_may_play().may_play_until > now)
                 )
             ]
             try:
-                if members:
-                    await self._silenced(self._disarm, members, ramp)
+                if amplifiers:
+                    await self.silencing.start(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
-            if self._silencing:  # a line is closed once what stops on it has ended
-                await asyncio.wait({*self._silencing})
-
-    async def _retried(self, amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
-        """Repeat a request until it is answered, the amplifier is lost, or all is being closed."""
-        while True:
-            try:
-                return await request()
-            except LinkTimeout:
-                if is_lost(amplifier) or clock.now() > self._gives_up_at:
-                    raise
-                await asyncio.sleep(_REPEAT_INTERVAL)
-
-    def _silenced(
-        self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
-    ) -> Coroutine[Any, Any, _T]:
-        """Begin a stop or disarm; nothing arms until it ends, whoever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
-        self._silencing.add(task)
-        task.add_done_callback(self._silencing.discard)
-        return _to_completion(task)
+            await self.silencing.ended()  # only then is a line closed
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
-        self.epoch += 1
+        self.members.epoch += 1
         if self.is_armed:
             self.state = GroupState.DISARMED
 
+    def _lose(self) -> None:
+        """Enter the state LOST, in which nothing is played."""
+        if self.state is not GroupState.CLOSED:
+            self.state = GroupState.LOST
 
-def _seen(sent: "asyncio.Future[Values]") -> None:
-    """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
-    if not sent.cancelled():
-        sent.exception()
+    def _note(self, error: BaseException) -> None:
+        """Note an error of a request: it may show that an amplifier is lost."""
+        if isinstance(error, LinkError) and not self.members.is_degraded_only(error):
+            error.lost = tuple(self.members.lost_by)
+            self._lose()
 
-
-async def _to_completion(task: "asyncio.Future[_T]") -> _T:
-    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
-    cancellation = None
-    while not task.done():
+    async def _all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
+        """Await all requests to their ends, then raise the most severe error, noted."""
         try:
-            await asyncio.wait({task})
-        except asyncio.CancelledError as error:
-            cancellation = error
-    if cancellation is not None:
-        task.exception()  # retrieved: what has failed is said by the amplifiers
-        raise cancellation
-    return task.result()
+            return await self.members.all(requests)
+        except LinkError as error:
+            self._note(error)
+            raise

@@ -6,26 +6,22 @@ operating system sends bytes. Times [s] are of the event loop's clock.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from operator import attrgetter
-from typing import TYPE_CHECKING, NamedTuple, final
+from operator import itemgetter
+from typing import NamedTuple, Protocol, TypeAlias, final
 
+from drivers.counters import LinkStatistics
 from drivers.errors import CommandRefused, Preempted
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
-
-if TYPE_CHECKING:
-    from drivers.host.dialogue import Dialogue
+from drivers.wires.wire import Event, OtherHost, Several
 
 _SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
 
-
-class _Ready(NamedTuple):
-    takes: float
-    result: "asyncio.Future[Values]"
-    send: Callable[[], None]
+Release: TypeAlias = Callable[[Exception | None], None]
+"""Sends a commit that was held, or fails it with an error."""
 
 
 @final
@@ -38,27 +34,24 @@ class JointStart:
 
     def __init__(self, count: int, until: float) -> None:
         self._count, self._until = count, until
-        self._ready: list[_Ready] = []
+        self._ready: list[tuple[float, Release]] = []  # how long each takes to arrive
         self._failure: Exception | None = None
         self._arrival = 0.0
         self._looked_at = 0.0
         self._loop = asyncio.get_running_loop()
         self._timer = self._loop.call_at(until, self._give_up)
 
-    def arrive(
-        self, takes: float, result: "asyncio.Future[Values]", send: Callable[[], None]
-    ) -> None:
+    def arrive(self, takes: float, release: Release) -> None:
         """Note that a line is free for a commit, which takes a time [s] to arrive.
 
-        result: of the commit. send: called once, when it is to be sent, or its result has an error;
-        calls `fail` where that does not succeed.
+        release: called once; calls `fail` where that does not succeed.
         """
-        self._ready.append(_Ready(takes, result, send))
+        self._ready.append((takes, release))
         if self._failure is not None:
             self._keep_back(self._failure)
         elif len(self._ready) == self._count:
-            self._ready.sort(key=attrgetter("takes"))
-            self._arrival = self._loop.time() + self._ready[-1].takes
+            self._ready.sort(key=itemgetter(0))
+            self._arrival = self._loop.time() + self._ready[-1][0]
             if self._arrival > self._until:
                 self._give_up()
                 return
@@ -74,23 +67,20 @@ class JointStart:
         self._keep_back(CommandRefused(text, until=self._loop.time()))
 
     def _keep_back(self, error: Exception) -> None:
-        """Send none that waits or comes later: each has the first error of them as its result."""
+        """Send none that waits or comes later: each fails with the first error of them."""
         self._timer.cancel()
         self._failure = self._failure or error
         ready, self._ready = self._ready, []
-        for each in ready:
-            if not each.result.done():
-                each.result.set_exception(self._failure)
-                each.result.exception()  # retrieved, where nobody waits for it
-            each.send()  # nothing, but its line is held no longer
+        for _, release in ready:
+            release(self._failure)
 
     def _send_due(self) -> None:
         now = self._loop.time()
-        while self._ready and self._arrival - self._ready[-1].takes <= now:
-            self._ready.pop().send()
+        while self._ready and self._arrival - self._ready[-1][0] <= now:
+            self._ready.pop()[1](None)
         if not self._ready:
             return
-        due = self._arrival - self._ready[-1].takes
+        due = self._arrival - self._ready[-1][0]
         if now == self._looked_at or due - now > 2 * _SLACK:  # virtual time: its timers are exact
             self._loop.call_at(due if now == self._looked_at else due - _SLACK, self._send_due)
         else:
@@ -121,29 +111,64 @@ _SUPERSEDED = {
 }
 
 
+class Later(NamedTuple):
+    """What a request says, known once its turn has come.
+
+    make: called once, then; returns the values of its messages, or raises CommandRefused. start:
+    where it goes out together with commits of other lines.
+    """
+
+    make: Callable[[], list[Values]]
+    start: JointStart | None = None
+
+
+class Member(Protocol):
+    """An amplifier on a line, which is told of what is sent to it and what comes from it."""
+
+    name: str
+    address: int
+    counts: LinkStatistics
+    silence_cause: str | None
+    """Why it counts as mute: it did not reply to a request."""
+
+    def exchange_time(self, name: str) -> float:
+        """Return how long the longest request of a name and its reply take on the wire [s]."""
+
+    def next_request(self, name: str, values: Values, priority: Priority) -> float:
+        """Return how much later its reply may come [s]; raises where it must not go out."""
+
+    def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that is sent now and arrives at a time [s]."""
+
+    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
+        """Note the reply to a request that was sent at a time [s]."""
+
+    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
+        """Note what came without a request."""
+
+
 @dataclass(eq=False, slots=True)
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    make: values of each attempt, in its turn; raises CommandRefused. parts: values of
-    the messages of a request, those without a reply, where there are several: known once `make`
-    has returned the first. attempts: left. start: of a commit that goes out together with those of
-    other lines, until it was sent: is_held for them, then is_released. started_at [s]: when it went
-    out behind what was sent before. longer: than on a fast wire
-    its reply may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an
-    earlier attempt.
+    values: of the message on the line, or next. later: until its turn has come; parts: what it made
+    that has no reply yet. attempts: left. start: of a commit that goes out together
+    with those of other lines, until it was sent: is_held for them, then is_released. started_at
+    [s]: when it went out behind what was sent before. longer: than on a fast wire its reply may
+    take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
+    attempt.
     """
 
-    member: "Dialogue | None"
+    member: Member | None
     priority: Priority
     name: str
     values: Values
-    make: Callable[[], Values] | None
     timeout: float
     queued_at: float
     result: "asyncio.Future[Values]"
+    later: Later | None = None
     start: JointStart | None = None
-    parts: list[Values] | None = None
+    parts: Sequence[Values] = ()
     attempts: int = ATTEMPTS
     is_held: bool = False
     is_released: bool = False
@@ -166,7 +191,7 @@ class Job:
         is_minor = Priority.HEARTBEAT < self.priority < Priority.READING
         return is_minor and now - self.queued_at > MAX_WAIT
 
-    def is_superseded_by(self, priority: Priority, member: "Dialogue | None") -> bool:
+    def is_superseded_by(self, priority: Priority, member: Member | None) -> bool:
         """Whether a request for an amplifier, None for all, makes it obsolete."""
         return self.priority in _SUPERSEDED.get(priority, ()) and member in (self.member, None)
 
@@ -209,11 +234,3 @@ class JobQueue:
             ready = [job for job in self.jobs if job.not_before <= now or job.is_stop_class]
             first = min(ready, key=lambda job: self._rank(job, now), default=None)
         return None if first is None or first.not_before > now else first
-
-    def superseded_by(self, priority: Priority, member: "Dialogue | None") -> list[Job]:
-        """Return the jobs that a request for an amplifier, None for all, makes obsolete."""
-        return [job for job in self.jobs if job.is_superseded_by(priority, member)]
-
-    def supersedes(self, job: Job) -> bool:
-        """Whether one that waits makes a job obsolete."""
-        return any(job.is_superseded_by(other.priority, other.member) for other in self.jobs)

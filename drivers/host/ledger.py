@@ -118,8 +118,7 @@ class Ledger:
             self._first_sent = token, now
         before: Vibration | None = None
         if is_vibrating(*layers):
-            is_timed = not self._budget.is_unlimited
-            lasts = max(map(_lasts, layers)) if is_timed else 0.0
+            lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
             before = self._budget.sent(now, lasts=lasts)
         self.doubt = Doubt(token, layers, self._first_sent[1], before)
 

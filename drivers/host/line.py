@@ -6,23 +6,20 @@ against what really went out before. Times [s] are of the event loop's clock.
 """
 
 import asyncio
+import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 from drivers import trace
-from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
-from drivers.host.jobs import Job, JobQueue, JointStart, Priority
+from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
+from drivers.host.failures import no_reply, refused_by_amplifier
+from drivers.host.jobs import Job, JobQueue, Later, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
-from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import BROADCAST
-from drivers.protocol.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
+from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.trace import Direction
 from drivers.wires.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
-
-if TYPE_CHECKING:
-    from drivers.host.dialogue import Dialogue
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
@@ -34,66 +31,66 @@ MAX_LATE = 0.032
 An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
-_UNFED = 1.5 * HEARTBEAT  # s; beside a set to each, longest time between feedings of one
-_OF_LOOP = (Priority.HEARTBEAT, Priority.SET)
 _DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
-_NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
-_REMEDIES = {"WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew"}
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
 class Line:
-    """A line, open from its construction until it is lost or closed.
+    """A line of a port that takes what is received to `received`, and a loss to `lose`.
 
-    What its port receives goes to `received`, a loss to `lose`. boot_time [s]: for which Hello is
-    repeated until an amplifier has replied, since its board may restart when its port is opened.
+    boot_time [s]: for which Hello is repeated once it is open, until an amplifier has replied: its
+    board may restart when its port is opened.
     """
 
-    def __init__(self, wire: Wire, port: OpenPort, name: str, *, boot_time: float = 0.0) -> None:
+    def __init__(self, wire: Wire, name: str, *, boot_time: float = 0.0) -> None:
         self.wire = wire
         self.name = name
         self.loss: str | None = None
-        self.members: dict[int, Dialogue] = {}
+        self.members: dict[int, Member] = {}
         self.seen: Callable[[str, int, str, object], None] | None = None
         """Called with each message: out, in, event or none; address, name, content. Must return."""
-        self._port = port
+        self.ahead: Callable[[str, Priority], Later | None] | None = None
+        """Called with each request to one amplifier: what to commit on all of the line ahead."""
         self._queue = JobQueue()
         self._current: Job | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
         self.time = self._loop.time
         """The clock of the line [s]."""
-        self._boot_time, self._boots_until = boot_time, self.time() + boot_time
+        self._boot_time, self._boots_until = boot_time, -math.inf
         self._is_pumping = False
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
         self.late = 0.0
         """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
 
+    def open(self, port: OpenPort) -> None:
+        """Send by a port that is open."""
+        self._port = port
+        self._boots_until = self.time() + self._boot_time
+
     def submit(
         self,
-        member: "Dialogue | None",
+        member: Member | None,
         priority: Priority,
         name: str,
-        values: Values,
+        values: Values | Later,
         *,
-        make: Callable[[], Values] | None = None,
         timeout: float = REPLY_TIMEOUT,
-        start: JointStart | None = None,
-        parts: list[Values] | None = None,
     ) -> "asyncio.Future[Values]":
-        """Queue a request of an amplifier; the future has the values of its reply.
+        """Queue a request of an amplifier; the future has the values of its last reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
-        it was sent. make: values of each attempt, made when its turn has come; raises
-        CommandRefused. start: with the commits of other lines. parts: as of `Job`; the future has
-        the values of the last reply.
+        it was sent.
         """
-        future = self._loop.create_future()
-        now = self.time()
-        job = Job(member, priority, name, values, make, timeout, now, future, start, parts)
+        future, now = self._loop.create_future(), self.time()
+        later: Later | None = None
+        if isinstance(values, Later):
+            later, values = values, {}
+        start = None if later is None else later.start
+        job = Job(member, priority, name, values, timeout, now, future, later, start)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -102,8 +99,9 @@ class Line:
         if self._current is None and not (self._queue.jobs or self._is_pumping or start):
             self._start(job)
             return future
-        for queued in self._queue.superseded_by(priority, member) if self._queue.jobs else ():
-            self._fail(queued, Preempted(SUPERSEDED))
+        for queued in [*self._queue.jobs]:
+            if queued.is_superseded_by(priority, member):
+                self._fail(queued, Preempted(SUPERSEDED))
         self._queue.add(job)
         if self._current is not None:
             self._preempt(self._current)
@@ -141,6 +139,7 @@ class Line:
             if not isinstance(arrival, Reply):
                 self._refused(job, member, arrival)
                 continue
+            self._boots_until = -math.inf
             try:
                 member.note_reply(job.name, job.values, arrival.values, job.sent_at)
             except Exception as error:  # whatever it is, no caller may wait for ever
@@ -148,11 +147,12 @@ class Line:
                 continue
             if job.result.done():  # its caller has gone
                 continue
-            if job.parts is None or len(job.parts) == 1:
+            if len(job.parts) <= 1:
                 job.result.set_result(arrival.values)
                 continue
-            del job.parts[0]
-            job.attempts, job.queued_at, job.had_no_reply = ATTEMPTS, self.time(), False
+            job.parts = job.parts[1:]
+            job.values, job.attempts = job.parts[0], ATTEMPTS
+            job.queued_at, job.had_no_reply = self.time(), False
             if self._queue.jobs:
                 self._queue_again(job)
             else:
@@ -186,7 +186,8 @@ class Line:
                     # The line is kept for a commit until all others are free.
                     job.is_held = True
                     takes = self.wire.transit(_COMMIT_WORDS)
-                    job.start.arrive(takes, job.result, partial(self._release, job))
+                    job.start.arrive(takes, partial(self._release, job))
+                    continue  # it may have failed at once
                 if job.start is not None and not job.is_released:
                     break
                 self._queue.take(job, self.time())
@@ -197,9 +198,11 @@ class Line:
         finally:
             self._is_pumping = False
 
-    def _release(self, job: Job) -> None:
-        """Send a commit that was held, unless its result is known by now."""
+    def _release(self, job: Job, error: Exception | None) -> None:
+        """Send a commit that was held, or fail it."""
         job.is_released = True
+        if error is not None:
+            self._fail(job, error)
         self.pump()
 
     def _start(self, job: Job, rest: bytes = b"") -> None:
@@ -211,17 +214,17 @@ class Line:
         address = BROADCAST if member is None else member.address
         try:
             if not rest:
-                # A status shows how a watchdog runs down only if none was fed before it.
-                is_reading = job.name == "GetStatus" and job.priority is Priority.HEARTBEAT
-                is_one = member is not None and job.start is None
-                if is_one and job.priority in _OF_LOOP and not is_reading:
-                    self._feed_all()
+                if self.ahead is not None and member is not None and job.start is None:
+                    ahead = self.ahead(job.name, job.priority)
+                    if ahead is not None:
+                        now, result = self.time(), self._loop.create_future()
+                        beat = Priority.HEARTBEAT
+                        self._start(Job(None, beat, "Commit", {}, 0.0, now, result, ahead))
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
-                if job.parts:
+                if job.later is not None:
+                    job.parts, job.later = job.later.make(), None
                     job.values = job.parts[0]
-                elif job.make is not None:
-                    job.values = job.make()
                 if member is not None:
                     job.longer = member.next_request(job.name, job.values, job.priority)
                 if self.seen is not None:
@@ -266,44 +269,11 @@ class Line:
         if self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
 
-    def _feed_all(self) -> None:
-        """Feed all amplifiers of the line ahead of a request of the control loop to one.
-
-        Where one was surely fed long ago: each exchange on a line whose replies come late may take
-        a third of a watchdog. By a broadcast Commit of the newest token: it changes nothing on
-        those that have committed it, and the others may have their commit now.
-        """
-        members = [*self.members.values()]
-        if len(members) == 1:
-            return
-        limit = HEARTBEAT
-        if self.late <= GRACE:
-            limit = _UNFED + sum(each.exchange_time("Set") for each in members)
-        if self.time() - min(each.feeding.since for each in members) <= limit:
-            return
-        session, token = members[0].session, 0
-        for each in members:
-            if each.committed and is_newer_token(each.committed, token):
-                token = each.committed
-
-        def make() -> Values:
-            values = {"session": session, "token": token}
-            for each in members:
-                name = "Ping" if each.committed == token else "Commit"
-                each.next_request(name, values, Priority.SET)
-            return values
-
-        if token and all(each.session == session for each in members):
-            result = self._loop.create_future()
-            self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, make, 0.0, self.time(), result))
-
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
-        if job.is_stop_class:
-            return False
-        return any(other.is_stop_class for other in self._queue.jobs)
+        return not job.is_stop_class and any(other.is_stop_class for other in self._queue.jobs)
 
-    def _refused(self, job: Job, member: "Dialogue", arrival: Nak | Broken) -> None:
+    def _refused(self, job: Job, member: Member, arrival: Nak | Broken) -> None:
         """End the request that was on the line with an error, or repeat it to a busy amplifier."""
         if isinstance(arrival, Broken):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
@@ -312,26 +282,18 @@ class Line:
         if arrival.code == "BUSY" and job.attempts > 0:
             self._repeat(job, member, pause=BUSY_PAUSE)
             return
-        channel = "" if arrival.channel is None else f", channel {arrival.channel}"
-        refusal = CommandRefused(
-            f"{self.name}: the amplifier refused the request: {arrival.code}{channel}"
-            + _REMEDIES.get(arrival.code, ""),
-            channel=arrival.channel,
-            may_play=job.had_no_reply,
-            is_disarmed=arrival.code in _NOT_ARMED,
-        )
-        self._fail(job, refusal)
+        self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
 
     def _queue_again(self, job: Job) -> bool:
         """Queue a request again, unless another one of its amplifier comes before it."""
-        if self._queue.supersedes(job):
+        if any(job.is_superseded_by(other.priority, other.member) for other in self._queue.jobs):
             self._fail(job, Preempted(SUPERSEDED))
             return False
         # Behind those of its priority, so that a mute amplifier does not keep others waiting.
         self._queue.add(job)
         return True
 
-    def _repeat(self, job: Job, member: "Dialogue", *, pause: float = 0.0) -> None:
+    def _repeat(self, job: Job, member: Member, *, pause: float = 0.0) -> None:
         """Send a request once more in its turn, after a pause [s]."""
         if self._queue_again(job):
             member.counts.retries += 1
@@ -415,25 +377,19 @@ class Line:
             return
         job.had_no_reply = True
         member.counts.timeouts += 1
-        is_first = job.name == "Hello" and not any(each.status for each in self.members.values())
+        is_first = job.name == "Hello" and self._boots_until > -math.inf
         if job.attempts > 0 or (is_first and self.time() < self._boots_until):
             self._repeat(job, member)
             return
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
-        before = member.counts.last_round_trip or 0.0
-        if not remark and before > job.timeout:
-            remark = (
-                f"the reply before took {1e3 * before:.0f} ms: check what delays frames on the way"
-            )
-        came = f", but {remark}" if remark else "; check that the amplifier is switched on"
-        cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms{came}"
-        if is_first and self._boot_time:
-            cause += (
-                f". A board that restarts when its port is opened must reply within "
-                f"{self._boot_time:g} s; set one that takes longer not to restart"
-            )
-        member.silence_cause = cause
-        self._fail(job, LinkTimeout(cause))
+        member.silence_cause = no_reply(
+            self.name,
+            job.timeout,
+            remark,
+            before=member.counts.last_round_trip or 0.0,
+            boot_time=self._boot_time if is_first else 0.0,
+        )
+        self._fail(job, LinkTimeout(member.silence_cause))
 
 
 def _trace(job: Job, result: "asyncio.Future[Values]") -> None:

@@ -91,10 +91,12 @@ async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
     if not has_feature(amplifier.capabilities, "electrical"):
         return []
-    rows = (await amplifier.request("GetMeasured", {}, Priority.READING))["channels"]
-    voltages = [_Q["channel_voltage"].from_wire(row["channel_voltage"]) for row in rows]
-    currents = [_Q["channel_current"].from_wire(row["channel_current"]) for row in rows]
-    return list(zip(voltages, currents, strict=True))
+    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
+    voltage, current = _Q["channel_voltage"].from_wire, _Q["channel_current"].from_wire
+    return [
+        (voltage(row["channel_voltage"]), current(row["channel_current"]))
+        for row in measured["channels"]
+    ]
 
 
 async def start_reading(
@@ -145,10 +147,9 @@ async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
         found = await _same_reading(amplifier, started, 0)
     count = (await amplifier.request("GetSensors", {"first": 0}, Priority.READING))["all"]
     sensors = found.sensors
-    while len(sensors) < count:
+    more = sensors
+    while more and len(sensors) < count:
         more = (await _same_reading(amplifier, started, len(sensors))).sensors
-        if not more:
-            break
         sensors += more
     if len(sensors) != count:
         raise FrameError(f"reading must have all {count} sensors, got {len(sensors)}; {_VIOLATION}")

@@ -1,76 +1,19 @@
-"""One stop of one amplifier: its request goes out first, then its silence is confirmed.
-
-Here alone is known what an amplifier may still play, for whoever stops it or asks for its status.
-"""
+"""One stop of one amplifier: its request goes out first, then its silence is confirmed."""
 
 import asyncio
 import contextlib
-import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
-from drivers.host.jobs import Priority
+from drivers.host.dialogue import Dialogue
+from drivers.host.feeding import Stopped
+from drivers.host.jobs import Later, Priority
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
-from drivers.protocol.table import ENABLED, LATCHED, QUANTITIES
+from drivers.protocol.table import LATCHED, QUANTITIES
 from drivers.protocol.timing import ATTEMPTS
 from registry import clock
 
-if TYPE_CHECKING:
-    from drivers.host.amplifier import Amplifier
-
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP = QUANTITIES["ramp"]
-
-
-@dataclass(frozen=True, slots=True)
-class Stopped:
-    """What an amplifier may play: confirmed silent, or until when [s] it may play, and why.
-
-    may_play_until: infinite where nothing is known to silence it.
-    """
-
-    is_confirmed: bool
-    may_play_until: float
-    cause: str = ""
-
-    def rows(self, now: float) -> dict[str, Any]:
-        """Return it in words at a time [s]: `silence`, `may_play_for_s` and `cause`."""
-        left = self.may_play_until - now
-        silence = "may_play" if left > 0 else "watchdog_elapsed"
-        is_bounded = not self.is_confirmed and left < math.inf
-        return {
-            "silence": "confirmed_silent" if self.is_confirmed else silence,
-            "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
-            "cause": self.cause,
-        }
-
-
-UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
-"""What is known of an amplifier before its first reply."""
-
-
-def what_may_play(amplifier: "Amplifier", cause: str = "") -> Stopped:
-    """Return until when an amplifier may play by all that is known of it.
-
-    cause: why no more is known, by default what ails its line. Over is what confirmed a stop, and
-    was sent neither Clear nor Arm since. Else the watchdog ends what was fed, and what was never
-    fed is over once it has shown that it is silent. One that shows more after it was confirmed, or
-    its watchdog must have silenced it, is fed by another, or broken. A status after the stop alone
-    confirms it.
-    """
-    known, status, at = amplifier.known, amplifier.status, amplifier.status_at
-    cause = cause or amplifier.line.loss or amplifier.silence_cause or ""
-    until = known.may_play_until
-    if not known.is_confirmed:
-        until = max(until, amplifier.feeding.may_play_until)
-    if status is not None and at is not None:
-        is_armed = status["state"] == ENABLED
-        if amplifier.is_silent(status) and not is_armed:  # and identified
-            until = at if until == math.inf else max(until, at)
-        elif (is_armed or any(status["levels"])) and at >= until:
-            until = math.inf
-    return Stopped(False, math.inf if until == -math.inf else until, cause)
 
 
 class Stop:
@@ -81,7 +24,7 @@ class Stop:
     the levels of all channels at zero: another one may be old, kept on its way.
     """
 
-    def __init__(self, amplifier: "Amplifier", ramp: float, timeout: float) -> None:
+    def __init__(self, amplifier: Dialogue, ramp: float, timeout: float) -> None:
         self.is_sent = False
         """Whether its first request has gone out: what comes later needs a stop of its own."""
         self._amplifier = amplifier
@@ -101,18 +44,16 @@ class Stop:
     def _request(self) -> "asyncio.Future[Values]":
         amplifier = self._amplifier
         self._latch = amplifier.latch
-        return amplifier.line.submit(
-            amplifier, Priority.STOP, "Stop", self._values, make=self._sent
-        )
+        return amplifier.line.submit(amplifier, Priority.STOP, "Stop", Later(self._sent))
 
-    def _sent(self) -> Values:
+    def _sent(self) -> list[Values]:
         """Return the values of the request, which goes out now."""
         if not self.is_sent:
             self.is_sent = True
             self._ends = clock.now() + self._timeout
             if self._limit is not None:
                 self._limit.reschedule(self._ends)
-        return self._values
+        return [self._values]
 
     async def _confirm(self) -> Stopped:
         amplifier, cause = self._amplifier, ""
@@ -136,7 +77,7 @@ class Stop:
                     await asyncio.sleep(pause)
         except TimeoutError:
             cause = cause or f"silence was not reported within {self._timeout:g} s"
-        return what_may_play(amplifier, amplifier.line.loss or cause)
+        return amplifier.what_may_play(amplifier.line.loss or cause)
 
 
 def is_stopping(status: Values, before: int | None) -> bool:

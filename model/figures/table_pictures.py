@@ -20,6 +20,7 @@ from model.finger.perception import FELT_DB_SL, sensation_level
 from model.table.contrast_map import ContrastMap
 from model.table.overview import Overview
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells
@@ -140,7 +141,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
     figure = Figure(figsize=(6.6, 5), layout="compressed")
     axes = figure.subplots()
     try:
-        pattern = table.query(question)
+        pattern = find_pattern(table, question)
     except InputError:  # weak rig or small plate
         axes.set_title("The table has no answer to the three fingers of this picture")
         axes.axis("off")

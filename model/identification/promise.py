@@ -9,6 +9,7 @@ from model.ensemble.measures import PERCENTILE
 from model.identification.identify import Identification
 from model.table.build import build_table
 from model.table.exact_plates import draw_plates, felt_on
+from model.table.pattern_query import find_pattern
 from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.table.random_contacts import MIN_DISTANCE, random_contacts
 
@@ -63,7 +64,7 @@ def expected_contrast(
             )
             each = []
             for table in (written, identified):
-                drive = table.query(question).excitation
+                drive = find_pattern(table, question).excitation
                 contrast = felt_on(identified, question, drive, plates).contrast
                 assert contrast is not None  # noqa: S101  there are quiet fingers
                 each.append(20 * np.log10(contrast))

@@ -2,7 +2,7 @@
 
 from array import array
 from ctypes import addressof
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
 from model.arrays import Complex64Array
@@ -36,12 +36,10 @@ from model.table.contents import (
 from model.table.contents_numpy import choose_by_numpy
 from model.table.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
 from model.table.raster_kernel import given_raster
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable
 
 
-def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
+def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""
     streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
     starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
@@ -104,17 +102,17 @@ _Fingers: TypeAlias = tuple[Drawn, Drawn, Complex64Array]
 _Kept: TypeAlias = tuple[Plates, GivenRaster, Rules, dict[int, _Fingers]]
 """What kernels read of a table; and of so many fingers."""
 
-_kept: WeakKeyDictionary["LocalizationTable", _Kept] = WeakKeyDictionary()
+_kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
 
 
-def _with(table: "LocalizationTable", fingers: int) -> _Fingers:
+def _with(table: LocalizationTable, fingers: int) -> _Fingers:
     judging, promise = (
         draws_structure(table.on_eras, fingers, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
     )
     return judging, promise, table.attached.finger_stiffness(fingers)
 
 
-def _kept_of(table: "LocalizationTable") -> _Kept:
+def _kept_of(table: LocalizationTable) -> _Kept:
     """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
     uncertainty = table.uncertainty
     variance = uncertainty.gain_variance

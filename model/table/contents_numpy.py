@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +24,7 @@ from model.table.contents import (
 )
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
 from model.table.promised import promised
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable
 
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
@@ -44,7 +41,7 @@ class Candidates:
     weights: Complex64Array
 
 
-def choose_by_numpy(table: "LocalizationTable", contents: Contents) -> Tones:
+def choose_by_numpy(table: LocalizationTable, contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
     rows = contents.rows
@@ -171,7 +168,7 @@ def best_tone(wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatAr
 
 
 def best_combination(
-    table: "LocalizationTable",
+    table: LocalizationTable,
     contents: Contents,
     found: Candidates,
     own: FloatArray,

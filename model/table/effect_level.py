@@ -17,6 +17,7 @@ from model.structure.attachments import Fingertip, fingertip_loads
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.pulse_gains import PulseGains, PulseResponses, pulse_gains
 from model.table.question import SHAPED_FROM, Question
+from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
 from model.transients.knots import RISE
 from model.transients.loaded_ramps import (
@@ -90,7 +91,7 @@ class EffectLevels:
     ) -> PulseGains:
         """Levels over the duration [s] along a plain ramp [s], relative to steady ones."""
         table, part = self._table, _Part.of(duration)
-        tips = table.read_fingertips(question.contacts)
+        tips = read_fingertips(table, question.contacts)
         k, p, r = tips.fine.shape
         squares = np.zeros(())
         for frequency, bases in zip(*base_amplitudes(excitation, table.eras), strict=True):
@@ -119,7 +120,7 @@ class EffectLevels:
         At the few points of each fingertip by which drives are searched.
         """
         table, part = self._table, _Part.of(duration)
-        tips = table.read_fingertips(question.contacts)
+        tips = read_fingertips(table, question.contacts)
         k, p, r = tips.few.shape
         frequencies = table.frequencies[rows]
         values = [

@@ -23,6 +23,7 @@ from model.structure.attachments import (
 )
 from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.table.question import Point, Question
+from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 
@@ -91,7 +92,7 @@ def felt_on(
     """What the fingers of a question feel of an excitation on plates; powers of its tones add."""
     rows, power = powers_on(table, question, excitation, plates)
     sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
-    weights = table.read_fingertips(question.contacts).fine_weights
+    weights = read_fingertips(table, question.contacts).fine_weights
     (means,), (loudest,) = over_fingertips(sensed[None], weights)
     count = len(question.targets)
     level = means[:count].min(axis=0)
@@ -127,7 +128,7 @@ def touched(
     table: LocalizationTable, question: Question
 ) -> tuple[FloatArray, Sequence[FingertipLoad]]:
     """Shapes at the fine points of a question's fingers (k, p, r), and their loads."""
-    fine = table.read_fingertips(question.contacts).fine.astype(float)
+    fine = read_fingertips(table, question.contacts).fine.astype(float)
     return fine, fingertip_loads(table.fingertip, question.contacts, question.loads)
 
 

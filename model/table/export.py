@@ -27,6 +27,7 @@ from model.rig.sections import (
     PlateSection,
 )
 from model.table.file import FORMAT_VERSION
+from model.table.pattern_query import find_pattern
 from model.table.table import LocalizationTable
 from model.table.weak_cells import pair_questions
 
@@ -97,7 +98,7 @@ def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
     for question in chain.from_iterable(pair_questions(table)):
         at = chain.from_iterable(question.contacts)
         try:
-            pattern = table.query(question)
+            pattern = find_pattern(table, question)
         except InputError:
             yield [*at, *[""] * (len(parts) + 2)]
             continue

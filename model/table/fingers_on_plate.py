@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,8 @@ from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, outer
 from model.table.question import Point
 from model.table.raster import FingertipShapes
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.table.raster_kernel import read_fingertips
+from model.table.table import LocalizationTable
 
 MAX_FINGERS_BY_POINT = 4
 """Quiet fingers up to which the points of each are looked at one by one in a search."""
@@ -32,14 +30,14 @@ MAX_VARIANCE_FINE = 0.005
 class FingersOnPlate:
     """The plate of a table with k fingers on it, and the shapes under these."""
 
-    table: "LocalizationTable"
+    table: LocalizationTable
     tips: FingertipShapes
     touched: TouchedPlate
 
     @classmethod
     def of(
         cls,
-        table: "LocalizationTable",
+        table: LocalizationTable,
         places: Sequence[Point],
         loads: tuple[float, ...],
         *,
@@ -50,7 +48,7 @@ class FingersOnPlate:
         loads: of each relative to the rig's fingertip, empty for 1.
         """
         if by_kernel:
-            tips = table.read_fingertips(places)
+            tips = read_fingertips(table, places)
             return cls(table, tips, touch(table.on_eras, tips.few[:, 0], loads))
         tips = table.raster.fingertips(np.array(places), table.shapes)
         centres = tips.few[:, 0]

@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,11 +33,9 @@ from model.table.fingers_on_plate import (
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.promised import figures, promised
 from model.table.pulse_gains import OverEffect
-from model.table.question import Question
+from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.table.short_effects import best_over_effect, forms_during, forms_over
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.table.table import EFFECT_DURATIONS, LocalizationTable
 
 MAX_DURING_EFFECT, MAX_ALONE = 3, 4
 """Candidates of a short effect, and as many at their frequencies; without a quiet finger."""
@@ -65,9 +62,17 @@ class UnreachableLevel(InputError):
 
 
 def find_pattern(
-    table: "LocalizationTable", question: Question, over_effect: OverEffect | None
+    table: LocalizationTable, question: Question, over_effect: OverEffect | None = None
 ) -> Pattern:
-    """Find the pattern of a question as `LocalizationTable.query`."""
+    """Find the best pattern in a drive mode among those that reach a level at the targets.
+
+    Of the highest felt contrast that nine of ten plates within the rig's uncertainty give, the
+    fingers' load on the plate; with no quiet finger contrast is to the plate beyond 50 mm, root
+    mean square. The pattern is turned down to the level, which nine of ten plates reach where
+    possible. over_effect: gains of drives over the duration of a short effect, which then
+    decide with the steady measures; None where the steady vibration counts. Raises InputError
+    for contacts off the plate and for a level that cannot be reached.
+    """
     question.check_on(table.plate)
     drive_mode = question.drive_mode_on(table.drive_mode)
     contents = _contents(table, question)
@@ -95,7 +100,23 @@ def find_pattern(
     return replace(pattern, contrast_db=nominal, robust_contrast_db=least)
 
 
-def _contents(table: "LocalizationTable", question: Question) -> Contents:
+def prepare_patterns(
+    table: LocalizationTable, drive_mode: str | None = None, *, with_ringing: bool = True
+) -> None:
+    """Compute ahead what the first question to a table in a drive mode needs.
+
+    with_ringing: of short effects, too, which takes the longest.
+    """
+    centre = (table.plate.length / 2, table.plate.width / 2)
+    for quiet in ((), ((0.0, 0.0),)):
+        question = Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, drive_mode=drive_mode)
+        find_pattern(table, question)
+    if (drive_mode or table.drive_mode) != "switched":
+        for duration in EFFECT_DURATIONS if with_ringing else ():
+            table.ringing(duration)
+
+
+def _contents(table: LocalizationTable, question: Question) -> Contents:
     """A question as an only content. Raises InputError for frequencies that a table lacks."""
     low, high = question.frequencies
     playable = np.flatnonzero((table.frequencies >= low) & (table.frequencies <= high))
@@ -210,7 +231,7 @@ def _tones(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]
 
 
 def _pattern(
-    table: "LocalizationTable",
+    table: LocalizationTable,
     question: Question,
     drive_mode: str,
     contents: Contents,

@@ -18,6 +18,7 @@ from model.errors import InputError
 from model.finger.perception import decibels, sensation_level
 from model.table.exact_plates import amplitudes_on, draw_plates
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern
 from model.table.question import Point, Question
 from model.table.random_contacts import are_apart
 from model.table.table import LocalizationTable
@@ -117,7 +118,7 @@ def promises(
         names = _drawn(rng, sensors, others=1 + number % _MAX_OTHERS)
         target, *quiet = (sensors[name] for name in names)
         question = Question((target,), tuple(quiet))
-        pattern = _at_level(weightless.query(question), table, level)
+        pattern = _at_level(find_pattern(weightless, question), table, level)
         yield _promise(weightless, names, question, pattern, rng)
 
 

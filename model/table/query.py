@@ -16,6 +16,7 @@ from model.finger.perception import STRONG_DB_SL
 from model.table.answer import answer
 from model.table.concentration import with_concentration
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.question import Question
 from model.table.request import APART_HZ, Finger, Request
 from model.table.table import LocalizationTable
@@ -100,7 +101,7 @@ def query_table(
     the whole plate.
     """
     started = time.perf_counter()
-    pattern = table.query(question)
+    pattern = find_pattern(table, question)
     if question.envelopes:
         pattern = timing.with_envelopes(question, pattern)
     elapsed = time.perf_counter() - started
@@ -252,7 +253,7 @@ def _envelopes_as_json(
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
     """Answer one question, of the keys of a batch's line. Raises InputError."""
     asked, timing = _parsed(values, {}), Timing(table)
-    table.prepare(UNRESTRICTED if asked.own else asked.mode, with_ringing=False)
+    prepare_patterns(table, UNRESTRICTED if asked.own else asked.mode, with_ringing=False)
     if not asked.own:  # contents of their own have no envelopes
         timing.prepare(table.frequencies.tolist())
     return _answer_to(table, asked, timing)
@@ -267,7 +268,7 @@ def query_batch(
 
     defaults: of keys that lines leave out.
     """
-    table.prepare(with_ringing=False)
+    prepare_patterns(table, with_ringing=False)
     timing = Timing(table)
     timing.prepare(table.frequencies.tolist())
     for number, line in enumerate(lines, start=1):

@@ -1,14 +1,13 @@
-"""Shapes under fingertips by a kernel in C: `model.table.raster` with `model.finger.fingertip`."""
+"""Shapes under fingertips, by a kernel in C or else by `model.table.raster`."""
 
 from array import array
 from collections.abc import Sequence
 from ctypes import c_void_p
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from model.compiled.kernels import Kernels, run
+from model.compiled.kernels import kernels, run
 from model.compiled.structures import GivenRaster
 from model.finger.fingertip import (
     FINE_POINTS,
@@ -19,17 +18,16 @@ from model.finger.fingertip import (
 )
 from model.table.question import Point
 from model.table.raster import FingertipShapes
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable
 
 _FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
 
 
-def fingertips_by(
-    by: Kernels, table: "LocalizationTable", places: Sequence[Point]
-) -> FingertipShapes:
+def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
     """Shapes at fingertips centred at places [m] of a table's plate."""
+    by = kernels()
+    if by is None:
+        return table.raster.fingertips(np.array(places), table.shapes)
     on, k = given_raster(table), len(places)
     at = array("d", [coordinate for place in places for coordinate in place])
     sizes = (k, _FEW, on.r), (k, _FINE, on.r), (k, _FEW), (k, _FINE)
@@ -39,7 +37,7 @@ def fingertips_by(
     return FingertipShapes(*found)
 
 
-def given_raster(table: "LocalizationTable") -> GivenRaster:
+def given_raster(table: LocalizationTable) -> GivenRaster:
     """The raster of a table as kernels read it, kept with it."""
     kept = _kept.get(table)
     if kept is not None:
@@ -56,4 +54,4 @@ def given_raster(table: "LocalizationTable") -> GivenRaster:
     return _kept.setdefault(table, found)
 
 
-_kept: WeakKeyDictionary["LocalizationTable", GivenRaster] = WeakKeyDictionary()
+_kept: WeakKeyDictionary[LocalizationTable, GivenRaster] = WeakKeyDictionary()

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.compiled.kernels import kernels
 from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
@@ -30,12 +29,8 @@ from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loa
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, SAME_FREQUENCY
-from model.table.pattern import Pattern
-from model.table.pattern_query import find_pattern
-from model.table.pulse_gains import OverEffect
-from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import FingertipShapes, Raster
-from model.table.raster_kernel import fingertips_by
+from model.table.question import Point
+from model.table.raster import Raster
 from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -123,32 +118,6 @@ class LocalizationTable:
         """Number of `switched` patterns of one or two ERAs."""
         eras, f = len(self.eras), len(self.frequencies)
         return eras * f + math.comb(eras, 2) * f**2
-
-    def query(self, question: Question, over_effect: OverEffect | None = None) -> Pattern:
-        """Find the best pattern in a drive mode among those that reach a level at the targets.
-
-        Of the highest felt contrast that nine of ten plates within the rig's uncertainty give, the
-        fingers' load on the plate; with no quiet finger contrast is to the plate beyond 50 mm, root
-        mean square. The pattern is turned down to the level, which nine of ten plates reach where
-        possible. over_effect: gains of drives over the duration of a short effect, which then
-        decide with the steady measures; None where the steady vibration counts. Raises InputError
-        for contacts off the plate and for a level that cannot be reached.
-        """
-        return find_pattern(self, question, over_effect)
-
-    def prepare(self, drive_mode: str | None = None, *, with_ringing: bool = True) -> None:
-        """Compute ahead what the first query in a drive mode needs.
-
-        with_ringing: of short effects, too, which takes the longest.
-        """
-        centre = (self.plate.length / 2, self.plate.width / 2)
-        for quiet in ((), ((0.0, 0.0),)):
-            self.query(
-                Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, drive_mode=drive_mode)
-            )
-        if (drive_mode or self.drive_mode) != "switched":
-            for duration in EFFECT_DURATIONS if with_ringing else ():
-                self.ringing(duration)
 
     def inherit_ringing(self, other: "LocalizationTable") -> None:
         """Take what is prepared of ringing from a table of nearly the same plate."""
@@ -309,13 +278,6 @@ class LocalizationTable:
         """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         return PlateOnEras.of(self.attached, *sorted(counts))
-
-    def read_fingertips(self, places: Sequence[Point]) -> FingertipShapes:
-        """Shapes at fingertips centred at places [m] of the plate."""
-        by = kernels()
-        if by is None:
-            return self.raster.fingertips(np.array(places), self.shapes)
-        return fingertips_by(by, self, places)
 
     @cached_property
     def error_power(self) -> Float32Array:

@@ -8,6 +8,7 @@ from model.arrays import FloatArray
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
+from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
@@ -88,5 +89,5 @@ class Timing:
 
 def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
     """Weights (k, p) of few points under fingertips, and their shapes (k, p, r)."""
-    tips = table.read_fingertips(places)
+    tips = read_fingertips(table, places)
     return tips.few_weights.astype(float), tips.few.astype(float)

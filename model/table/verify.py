@@ -33,6 +33,7 @@ from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import fingertip_loads, footprints_of
 from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.table.random_contacts import random_contacts
 from model.table.table import LocalizationTable
@@ -364,7 +365,7 @@ def _random_answer(
         with contextlib.suppress(InputError):
             contacts = random_contacts(rng, count, table.plate, tries=1)
             question = Question(contacts[:1], contacts[1:])
-            return question, table.query(question)
+            return question, find_pattern(table, question)
     length, width = table.plate.length, table.plate.width
     raise InputError(
         f"no random contacts on this plate of {length:g} x {width:g} m have an answer at 20 dB "

@@ -22,6 +22,7 @@ from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
+from model.table.pattern_query import find_pattern
 from model.table.question import Point, Question
 from model.table.random_contacts import MIN_DISTANCE
 from model.table.table import LocalizationTable
@@ -176,7 +177,7 @@ def ask_once(table: LocalizationTable) -> Ask:
 def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
     """Promised and nominal felt contrast [dB], None where the level is not reached."""
     try:
-        found = table.query(question)
+        found = find_pattern(table, question)
     except InputError:
         return None
     promised, nominal = found.robust_felt_contrast_db, found.felt_contrast_db

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import clock
 from sim.amplifier.contract import Amplifier
-from sim.bench.sensing import REACH, Sensing, ToneReader
+from sim.bench.sensing import REACH, Probe, Sensing
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
 from sim.plant.imperfections import Imperfections, PlateErrors, realised
@@ -42,22 +42,6 @@ _MAX_SHAPES = 16  # sets of points
 
 Voices: TypeAlias = tuple[Voice, ...]
 """What a channel plays."""
-
-
-class Probe(Protocol):
-    """A listener to the plate at fixed points, by their reduced shapes (p, r)."""
-
-    @property
-    def shapes(self) -> FloatArray:
-        """Shapes at its points."""
-        ...
-
-    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Take samples: times (n,) [s], one at least, accelerations (n, p) [m/s²].
-
-        Calls are contiguous.
-        """
-        ...
 
 
 class Bench:
@@ -236,11 +220,6 @@ class Bench:
     def place_sensors(self, sensors: Sequence[Accelerometer]) -> None:
         """Replace the sensors of the first amplifier beside those at its ERAs."""
         self._sensing[0].place(sensors)
-
-    def forget_reader(self, reader: ToneReader) -> None:
-        """Pass no more samples on to a reader."""
-        if reader in self._probes:
-            self._probes.remove(reader)
 
     def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, final
+from typing import Protocol, final
 
 import numpy as np
 
@@ -28,8 +28,32 @@ from model.arrays import FloatArray
 from sim.amplifier.contract import Amplifier
 from sim.plant.accelerometer import Accelerometer, positions, readings
 
-if TYPE_CHECKING:
-    from sim.bench.bench import Bench
+
+class Probe(Protocol):
+    """A listener to the plate at fixed points, by their reduced shapes (p, r)."""
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Shapes at its points."""
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Take samples: times (n,) [s], one at least, accelerations (n, p) [m/s²].
+
+        Calls are contiguous.
+        """
+
+
+class SampledPlate(Protocol):
+    """A plate in the time domain, sampled at a rate [Hz] while probes listen to it."""
+
+    sample_rate: float
+
+    @property
+    def probes(self) -> list[Probe]:
+        """The listeners, which have all samples up to the present time."""
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Reduced shapes (p, r) at points (p, 2) [m]."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +67,14 @@ class Measurement:
 
 @final
 class ToneReader:
-    """Reads tones at sensors of a bench from `start` [s] on, until its window has ended.
+    """Reads tones at sensors of a plate from `start` [s] on, until its window has ended.
 
     origin [s]: where t begins; token: of what plays. offset: t at the start [s].
     """
 
     def __init__(
         self,
-        bench: "Bench",
+        plate: SampledPlate,
         measurement: Measurement,
         sensors: Sequence[Accelerometer],
         *,
@@ -64,7 +88,7 @@ class ToneReader:
         self.offset = 0.0 if origin is None else start - origin
         self.token = token
         self.is_disturbed = False
-        self._bench = bench
+        self._plate = plate
         self._sensors = tuple(sensors)
         self._start = start
         self._rng = rng
@@ -77,12 +101,12 @@ class ToneReader:
     @property
     def shapes(self) -> FloatArray:
         """Shapes at its sensors."""
-        return self._bench.shapes_at(positions(self._sensors))
+        return self._plate.shapes_at(positions(self._sensors))
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Take samples: times (n,) [s], accelerations (n, s) [m/s²]."""
         inside = (times > self._start) & (times <= self.end)
-        rate = self._bench.sample_rate
+        rate = self._plate.sample_rate
         read = readings(self._sensors, accelerations[inside], sample_rate=rate, rng=self._rng)
         angles = 2 * math.pi * np.outer(times[inside] - self._start, self.measurement.frequencies)
         columns = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
@@ -90,7 +114,7 @@ class ToneReader:
         self._right += columns.T @ read
         self._is_overloaded |= (np.abs(read) >= self._reach).any(axis=0)
         if times[-1] + 1 / rate > self.end:
-            self._bench.forget_reader(self)
+            self._plate.probes.remove(self)
 
     def tones(self) -> list[tuple[bool, list[complex]]]:
         """Of each sensor: whether it was overloaded, and the phasors of its tones."""
@@ -117,9 +141,9 @@ class Sensing:
     """The sensors of an amplifier that plays on a plate; feet: those at its ERAs."""
 
     def __init__(
-        self, bench: "Bench", amplifier: Amplifier, feet: Sequence[Accelerometer], *, seed: int
+        self, plate: SampledPlate, amplifier: Amplifier, feet: Sequence[Accelerometer], *, seed: int
     ) -> None:
-        self._bench = bench
+        self._plate = plate
         self._amplifier = amplifier
         self._feet = tuple(feet)
         self._others: tuple[Accelerometer, ...] = ()
@@ -147,8 +171,8 @@ class Sensing:
     def forget(self) -> None:
         """Forget the reading, as without supply."""
         reader, self.reader = self.reader, None
-        if reader is not None:
-            self._bench.forget_reader(reader)
+        if reader is not None and reader in self._plate.probes:
+            self._plate.probes.remove(reader)
 
     @property
     def sensors(self) -> tuple[Accelerometer, ...]:
@@ -157,7 +181,7 @@ class Sensing:
 
     @property
     def _frequency_max(self) -> float:
-        nyquist = self._bench.sample_rate / 2
+        nyquist = self._plate.sample_rate / 2
         return _Q["frequency"].quantise(min(_BELOW_NYQUIST * nyquist, _FREQUENCY_MAX))
 
     def _listed(self, first: int) -> Values:
@@ -200,7 +224,7 @@ class Sensing:
         self.forget()
         token = self._amplifier.token
         self.reader = ToneReader(
-            self._bench,
+            self._plate,
             measurement,
             self.sensors,
             start=now,
@@ -208,7 +232,7 @@ class Sensing:
             token=token,
             rng=self._rng,
         )
-        self._bench.probes.append(self.reader)
+        self._plate.probes.append(self.reader)
 
     def _reading(self, first: int, now: float) -> Values:
         """Report the reading at a time [s], its sensors from one on, as many as fit."""

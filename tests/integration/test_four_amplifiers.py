@@ -20,7 +20,7 @@ from controller.diagnosis.tone_player import TonePlayer
 from daemon_bench import READY, daemon_at, far_end, until_state
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
-from drivers.host.members import GroupState
+from drivers.host.group import GroupState
 from drivers.judge.asking import opened
 from drivers.opening import Lines
 from long_form import in_turn, shortly

@@ -26,6 +26,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.build import build_table
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -102,7 +103,7 @@ def patterns_match_table(played: Played, truth: Truth) -> None:
     for heard in _touched(played):
         assert len(heard.patterns) == 1, heard.situation
         (reported,) = heard.patterns
-        wanted = truth.table.query(truth.asked(heard.situation)).excitation
+        wanted = find_pattern(truth.table, truth.asked(heard.situation)).excitation
         assert reported["drive"].keys() == wanted.keys()
         for name, tone in wanted.items():
             got = reported["drive"][name]
@@ -173,7 +174,7 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     timing = Timing(truth.table)
     first, *_ = _touched(played)
     question = truth.asked(first.situation)
-    pattern = timing.with_envelopes(question, truth.table.query(question), ending=False)
+    pattern = timing.with_envelopes(question, find_pattern(truth.table, question), ending=False)
     assert pattern.onset is not None
     if truth.onset_knots is not None:
         onset = {name: _sampled(each, truth.onset_knots) for name, each in pattern.onset.items()}

@@ -26,12 +26,9 @@ from virtual_loop import in_virtual_time
 
 def line_to(device: AmplifierDevice) -> Line:
     """The host's line to a device of this process."""
-    lines: list[Line] = []
-    port = MemoryPort(
-        [device], lambda data: lines[0].received(data), lambda why: lines[0].lose(why)
-    )
-    lines.append(Line(SerialWire(0, sequence=0), port, "main"))
-    return lines[0]
+    line = Line(SerialWire(0, sequence=0), "main")
+    line.open(MemoryPort([device], line.received, line.lose))
+    return line
 
 
 @in_virtual_time

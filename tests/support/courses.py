@@ -140,7 +140,7 @@ class Acted(Taken, Chain):
     @property
     def degraded(self) -> list[str]:
         """Amplifiers that do not reply but may play."""
-        return [*self.controller.group.degraded]
+        return [*self.controller.group.members.degraded]
 
     @property
     def is_armed(self) -> bool:

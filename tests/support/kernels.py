@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from model.compiled.kernels import processor_features, versions
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 
 ROOT = Path(__file__).parents[2]
@@ -107,7 +108,7 @@ def answers() -> list[Answer]:
                 question = Question(
                     (target,), tuple(others[:quiet]), level_db_sl=10.0, drive_mode=drive_mode
                 )
-                pattern = smooth_table().query(question)
+                pattern = find_pattern(smooth_table(), question)
                 tones = sorted({tone.frequency for tone in pattern.excitation.values()})
                 found.append(Answer(tuple(tones), pattern.robust_contrast_db))
     return found

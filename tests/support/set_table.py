@@ -1,10 +1,16 @@
-"""A table whose answers a test sets, its timing, and rigs for which nothing has to be solved."""
+"""A table whose answers a test sets, its timing, and rigs for which nothing has to be solved.
+
+The control loop asks a table that has `query` by that, once this is imported, and any other as it
+does without.
+"""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
+from controller.play import decision, table_query
 from model.arrays import FloatArray, IntArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
@@ -12,6 +18,7 @@ from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.table.effect_level import DriveLimits, RaisedPattern
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.pulse_gains import PulseResponses
 from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.vibration.excitation import Excitation
@@ -73,6 +80,18 @@ class SetTable:
     ) -> tuple[FloatArray, FloatArray]:
         """1 m/s² everywhere."""
         return np.array([110.0]), np.ones((1, len(points)))
+
+
+def _query(table: object, question: Question, over_effect: object = None) -> Pattern:
+    return getattr(table, "query", partial(find_pattern, table))(question, over_effect)
+
+
+def _prepare(table: object, drive_mode: str | None) -> None:
+    getattr(table, "prepare", partial(prepare_patterns, table))(drive_mode)
+
+
+decision.find_pattern = table_query.find_pattern = _query
+decision.prepare_patterns = _prepare
 
 
 class SetLevels:

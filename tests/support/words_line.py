@@ -121,7 +121,8 @@ class MemoryLine:
         self._sending = self._handling = ""
         self._due: dict[str, float] = {}  # s; of what was handed over last, by who takes it
         self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
-        self.line = Line(self.kind.wire(), self, "line")
+        self.line = Line(self.kind.wire(), "line")
+        self.line.open(self)
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)
             for address, each in enumerate(self.far, 1)

@@ -28,6 +28,7 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
@@ -211,7 +212,7 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
         await player.group.arm()
         for target, quiet in FINGERS:
             sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
-            pattern = table.query(Question((target,), (quiet,), level_db_sl=35.0))
+            pattern = find_pattern(table, Question((target,), (quiet,), level_db_sl=35.0))
             plays = await player.play(pattern.excitation)
             for _ in range(30):
                 await asyncio.sleep(0.05)

@@ -10,7 +10,7 @@ import pytest
 from chain import Chain
 from controller.play.loop import Controller
 from drivers.errors import LinkError
-from drivers.host.members import GroupState
+from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from model.errors import InputError

@@ -21,7 +21,7 @@ from controller.play.playing import PlayedContent
 from controller.play.routing import PlateSet
 from controller.touch.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
 from model.arrays import Complex64Array
 from model.errors import InputError
@@ -135,7 +135,7 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
         layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
         group, count = fingers.controller.group, len(fingers.committed)
         with monkeypatch.context() as patched:
-            patched.setattr(type(group), "degraded", ("main",))
+            patched.setattr(type(group.members), "degraded", ("main",))
             fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
             await fingers.hold(0.03)  # what plays is unknown by now
             del fingers.at[1]

@@ -15,7 +15,7 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.touch.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.members import Played
+from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table

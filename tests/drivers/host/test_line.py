@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
-from drivers.host.jobs import Job, JobQueue, Priority
+from drivers.host.jobs import Job, Priority
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_bus.canopen import CanFrame
@@ -230,9 +230,7 @@ async def test_error_of_a_port_that_takes_nothing_names_what_to_check(
 
 async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:
     """Of requests that wait; what reads goes on waiting."""
-    queue = JobQueue()
-    for priority in Priority:
-        result = asyncio.get_running_loop().create_future()
-        queue.add(Job(None, priority, "", {}, None, 0.03, 0.0, result))
-    obsolete = {job.priority for job in queue.superseded_by(Priority.STOP, None)}
+    result = asyncio.get_running_loop().create_future()
+    waiting = [Job(None, priority, "", {}, 0.03, 0.0, result) for priority in Priority]
+    obsolete = {job.priority for job in waiting if job.is_superseded_by(Priority.STOP, None)}
     assert obsolete == {Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR}

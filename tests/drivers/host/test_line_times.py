@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.errors import DriverError, LinkTimeout
-from drivers.host.dialogue import SILENCING
+from drivers.host.feeding import SILENCING
 from drivers.host.group import Group
 from drivers.playing.contents import Layer
 from drivers.protocol.sets import Envelope
@@ -217,7 +217,7 @@ async def test_port_that_takes_nothing_leaves_an_amplifier_degraded(
         blocked.setattr(end, "write", block)
         with pytest.raises(LinkTimeout, match="write blocked"):
             await group.beat()
-        assert group.degraded == ("a",)
+        assert group.members.degraded == ("a",)
     write, count = end.write, 0
 
     def block_the_read(data: bytes) -> None:
@@ -228,12 +228,12 @@ async def test_port_that_takes_nothing_leaves_an_amplifier_degraded(
         write(data)
 
     await group.amplifiers["a"].read_status()
-    assert not group.degraded
+    assert not group.members.degraded
     with monkeypatch.context() as blocked:
         blocked.setattr(end, "write", block_the_read)
         with pytest.raises(LinkTimeout, match="write blocked"):
             await group.amplifiers["a"].read_status()
-        assert group.degraded == ("a",)
+        assert group.members.degraded == ("a",)
         assert end.line.loss is None
     assert (await group.stop())["a"].is_confirmed
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from courses import Taken, courses, follow
+from drivers.host.feeding import Stopped
 from drivers.host.group import Group
-from drivers.host.stop import Stopped
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.table import STATES
@@ -207,7 +207,7 @@ class OnLines(Taken):
 
     async def waits_for_the_loss(self) -> None:
         """Wait until an amplifier is lost, for the host."""
-        await asyncio.sleep(self.group.lost_from - self.lines[0].loop.time())
+        await asyncio.sleep(self.group.members.lost_from - self.lines[0].loop.time())
 
 
 @asynccontextmanager

@@ -23,6 +23,7 @@ from model.rig.layouts import (
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
@@ -115,7 +116,7 @@ def test_era_without_amplifier_supports_as_one_at_rest() -> None:
         atol=0.02 * np.abs(fields(rig)).max(),
     )
     question = Question(((0.1, 0.06),), ((0.22, 0.16),), level_db_sl=10.0, drive_mode="phased")
-    assert set(table.query(question).excitation) <= {"SW", "SE"}
+    assert set(find_pattern(table, question).excitation) <= {"SW", "SE"}
 
 
 GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))

@@ -14,9 +14,11 @@ from model.table.answer import answer
 from model.table.contents_kernel import choose_tones
 from model.table.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
+from model.table.pattern_query import find_pattern, prepare_patterns
 from model.table.promised import felt_amplitudes, loudest_power
 from model.table.query import answer_as_json
 from model.table.question import Question
+from model.table.raster_kernel import read_fingertips
 from model.table.request import Finger, Request
 from paper_table import contact_sets, smooth_table
 
@@ -28,7 +30,7 @@ def given(table, found, quiet, plates):
     """Contrast of each finger (fingers, d) as amplitudes, contents first, on exact plates."""
     layers = found.layers
     question = Question(tuple(each.request.at for each in layers), tuple(quiet))
-    tips = table.read_fingertips(question.contacts)
+    tips = read_fingertips(table, question.contacts)
     count, points = tips.fine_weights.shape
     powers = []
     for layer in layers:
@@ -101,10 +103,11 @@ def test_one_content_is_the_answer_of_the_table():
     """The same drive as of `query` with the others quiet; draws of errors have another phase."""
     table = smooth_table()
     found = answer(table, [Request(NEAR, (60, 300), 15.0)], [Finger(FAR), Finger(THIRD)])
-    pattern = table.query(
+    pattern = find_pattern(
+        table,
         Question(
             (NEAR,), (FAR, THIRD), level_db_sl=15.0, drive_mode="phased", frequencies=(60, 300)
-        )
+        ),
     )
     (layer,) = found.layers
     assert layer.promised_contrast_db == pytest.approx(pattern.robust_felt_contrast_db, abs=0.1)
@@ -288,7 +291,7 @@ def test_twenty_fingers_take_little_memory(without_kernels):
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()
     table = smooth_table()
-    table.prepare(with_ringing=False)
+    prepare_patterns(table, with_ringing=False)
     tracemalloc.start()
     answer(table, [Request(at, content="a", level_db_sl=90.0) for at in TWENTY])
     assert tracemalloc.get_traced_memory()[1] < 50e6

@@ -10,6 +10,7 @@ from model.arrays import lattice
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import is_beyond
 from model.table.concentration import cell_centres, concentration_of, with_concentration
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from paper_table import smooth_rig, smooth_table
 
@@ -56,7 +57,7 @@ def test_with_concentration_agrees_with_points_counted_one_by_one():
     table = smooth_table()
     places = ((0.09, 0.08), (0.24, 0.14))
     question = Question(places, drive_mode="phased")
-    pattern = with_concentration(table, question, table.query(question))
+    pattern = with_concentration(table, question, find_pattern(table, question))
     points = lattice(*(np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width)))
     frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
     energy = ((amplitudes / frequencies[:, None]) ** 2).sum(axis=0)
@@ -72,4 +73,4 @@ def test_with_concentration_agrees_with_points_counted_one_by_one():
     assert found.area_above_half == pytest.approx((peak > felt / 2).mean() * AREA, rel=0.02)
     assert found.energy_share_near == pytest.approx(energy[near].sum() / energy.sum(), abs=0.01)
     question = Question(places[:1], places[1:], drive_mode="phased")
-    assert with_concentration(table, question, table.query(question)).concentration is None
+    assert with_concentration(table, question, find_pattern(table, question)).concentration is None

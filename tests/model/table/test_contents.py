@@ -17,6 +17,7 @@ from model.table.contents import KEPT, MISSING, Contents, Stream
 from model.table.contents_kernel import choose_tones
 from model.table.contents_numpy import choose_by_numpy, ranked, worst_ratios
 from model.table.fingers_on_plate import FingersOnPlate
+from model.table.pattern_query import find_pattern
 from model.table.promised import share_stroke
 from model.table.question import Question
 from model.table.table import LocalizationTable
@@ -158,7 +159,7 @@ def test_answers_lose_little(monkeypatch: pytest.MonkeyPatch) -> None:
     of, lost = table(), []
     all_kept = replace(of)  # that keeps no rules yet
     monkeypatch.setattr(contents_kernel, "KEPT", len(of.frequencies))
-    all_kept.query(Question((PLACES[0],), (PLACES[1],)))
+    find_pattern(all_kept, Question((PLACES[0],), (PLACES[1],)))
     monkeypatch.undo()
     for at in range(4):
         for more in (1, 2, 4):
@@ -190,8 +191,8 @@ def test_prepared_table_goes_to_another_process() -> None:
     """With what it has computed ahead; its answers are the same there."""
     of = table()
     question = Question((PLACES[0],), (PLACES[1],))
-    pattern = of.query(question)
-    assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation
+    pattern = find_pattern(of, question)
+    assert find_pattern(pickle.loads(pickle.dumps(of)), question).excitation == pattern.excitation
 
 
 def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:

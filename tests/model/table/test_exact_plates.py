@@ -15,6 +15,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import FingertipLoad
 from model.table.build import build_table
 from model.table.exact_plates import Plates, draw_plates, felt_on
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.vibration.excitation import base_amplitudes
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
@@ -80,7 +81,7 @@ def test_felt_on_agrees_with_the_direct_solve(targets, mode):
     """Thicker, softer, damped otherwise, misdriven, other fingers on it: within 0.15 dB."""
     places = (TARGET, *QUIET)
     question = Question(places[:targets], places[targets:], drive_mode=mode)
-    pattern = smooth_table().query(question)
+    pattern = find_pattern(smooth_table(), question)
     contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
     solved = [directly(smooth_rig(), pattern, number, targets=targets) for number in range(3)]
@@ -96,7 +97,7 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     """
     loads = (2.5, 0.4, 1.0)
     question = Question((TARGET,), QUIET, drive_mode="phased", loads=loads)
-    pattern = smooth_table().query(question)
+    pattern = find_pattern(smooth_table(), question)
     contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
     solved = [directly(smooth_rig(), pattern, number, pressed=loads) for number in range(3)]
@@ -114,7 +115,7 @@ def test_discretisation_error_enters_the_contrast_of_plates():
     """
     question = Question((TARGET,), QUIET[:1], drive_mode="phased")
     table = smooth_table()
-    excitation = table.query(question).excitation
+    excitation = find_pattern(table, question).excitation
     plates = replace(
         draw_plates(
             np.random.default_rng(0), Uncertainty.none(), count=3, era_count=4, contact_count=2
@@ -170,7 +171,7 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
     for number, places in enumerate(contact_sets(16, fingers=4, seed=41)):
         count = 1 + number % 3
         question = Question((places[0],), tuple(places[1 : 1 + count]), drive_mode=mode)
-        pattern = table.query(question)
+        pattern = find_pattern(table, question)
         plates = draw_plates(
             rng, table.uncertainty, count=200, era_count=4, contact_count=1 + count
         )
@@ -213,7 +214,7 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
             question = Question(
                 (places[0],), tuple(places[1:]), drive_mode="phased", envelopes=True
             )
-            pattern = table.query(question)
+            pattern = find_pattern(table, question)
             plates = draw_plates(rng, known, count=100, era_count=4, contact_count=1 + quiet)
             contrast = felt_on(table, question, pattern.excitation, plates).contrast
             found.append(20 * np.log10(np.percentile(contrast, percent)))
@@ -227,7 +228,7 @@ def test_promise_holds_where_the_thickness_moves_resonances(places: int) -> None
     table = replace(smooth_table(), uncertainty=uncertainty)
     target, *quiet = contact_sets(places + 1, fingers=2 + places % 2, seed=11)[-1]
     question = Question((target,), tuple(quiet))
-    pattern = table.query(question)
+    pattern = find_pattern(table, question)
     plates = draw_plates(
         np.random.default_rng(3), uncertainty, count=600, era_count=4, contact_count=1 + len(quiet)
     )

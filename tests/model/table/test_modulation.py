@@ -12,6 +12,7 @@ from model.table.build import build_table
 from model.table.exact_plates import draw_plates, powers_on
 from model.table.modulation import with_gains
 from model.table.question import Question
+from model.table.raster_kernel import read_fingertips
 from model.table.request import Finger, Request
 from paper_table import contact_sets, smooth_rig
 
@@ -24,7 +25,7 @@ def table():
 
 def powers(table, tones, places, plates):
     """Power above threshold of a drive of one frequency at fingers: (fingers, points, d)."""
-    tips = table.read_fingertips(places)
+    tips = read_fingertips(table, places)
     rows, power = powers_on(table, Question(tuple(places)), tones, plates)
     sensed = power[0] / detection_threshold(table.frequencies[rows]) ** 2
     return sensed.reshape(*tips.fine_weights.shape, -1), tips.fine_weights

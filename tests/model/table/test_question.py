@@ -11,7 +11,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern
-from model.table.pattern_query import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel, find_pattern
 from model.table.question import Question
 from paper_table import FREQUENCIES, contact_sets, smooth_table
 
@@ -59,7 +59,7 @@ def test_question_refuses_what_no_table_can_answer(arguments):
 def test_query_refuses_what_table_or_amplifiers_lack(question):
     """Contacts off the plate; modes and frequencies that cannot be driven."""
     with pytest.raises(InputError):
-        smooth_table().query(question)
+        find_pattern(smooth_table(), question)
 
 
 @pytest.mark.parametrize(
@@ -73,22 +73,22 @@ def test_query_refuses_what_table_or_amplifiers_lack(question):
 def test_query_names_a_level_that_is_reached_when_too_loud(question, is_exhaustive):
     """The error says whether the level it names is the highest, and that level has a pattern."""
     with pytest.raises(UnreachableLevel) as refusal:
-        smooth_table().query(replace(question, level_db_sl=120.0))
+        find_pattern(smooth_table(), replace(question, level_db_sl=120.0))
     assert refusal.value.is_exhaustive == is_exhaustive
     reachable = refusal.value.reachable_db_sl
     assert 20 < reachable < 120
-    assert smooth_table().query(replace(question, level_db_sl=reachable))
+    assert find_pattern(smooth_table(), replace(question, level_db_sl=reachable))
 
 
 def test_query_uses_frequencies_that_the_amplifiers_play():
     """With amplifiers from 150 to 250 Hz no tone lies outside, in any mode."""
     for mode in ("switched", "phased"):
-        pattern = smooth_table().query(
-            Question((TARGET,), QUIET, drive_mode=mode, frequencies=(150.0, 250.0))
+        pattern = find_pattern(
+            smooth_table(), Question((TARGET,), QUIET, drive_mode=mode, frequencies=(150.0, 250.0))
         )
         assert all(150 <= tone.frequency <= 250 for tone in pattern.excitation.values())
     only = float(FREQUENCIES[9])  # an amplifier's lowest and highest are among what it plays
-    pattern = smooth_table().query(Question((TARGET,), QUIET, frequencies=(only, only)))
+    pattern = find_pattern(smooth_table(), Question((TARGET,), QUIET, frequencies=(only, only)))
     assert {tone.frequency for tone in pattern.excitation.values()} == {only}
 
 
@@ -111,7 +111,9 @@ def test_pattern_derives_measures_from_levels():
 def test_query_gives_the_strongest_era_phase_zero():
     """No phase is absolute; the others are relative to the strongest."""
     for place, *quiet in contact_sets(4, fingers=3, seed=12):
-        pattern = smooth_table().query(Question((place,), tuple(quiet), drive_mode="phased"))
+        pattern = find_pattern(
+            smooth_table(), Question((place,), tuple(quiet), drive_mode="phased")
+        )
         strongest = max(pattern.excitation.values(), key=lambda tone: tone.amplitude)
         assert strongest.phase == 0.0
         assert sum(tone.phase == 0.0 for tone in pattern.excitation.values()) == 1
@@ -122,7 +124,7 @@ def test_query_reaches_the_level_at_both_targets():
     table = smooth_table()
     first, second, quiet = contact_sets(1, fingers=3, seed=9)[0]
     question = Question((first, second), (quiet,), drive_mode="phased", level_db_sl=15.0)
-    pattern = table.query(question)
+    pattern = find_pattern(table, question)
     levels = []
     for place in (first, second):
         points = fingertip_points(*place, table.plate)
@@ -141,9 +143,9 @@ def test_the_grid_of_summaries_decides_no_answer(mode):
     """A lone finger feels the same whatever it is."""
     table = smooth_table()
     question = Question((TARGET,), drive_mode=mode)
-    expected = table.query(question)
+    expected = find_pattern(table, question)
     for cells in ((1, 1), (2, 2), (6, 4), (30, 20)):
-        found = replace(table, grid=Grid(*cells)).query(question)
+        found = find_pattern(replace(table, grid=Grid(*cells)), question)
         assert found.excitation == expected.excitation
         assert found.surroundings_contrast_db == expected.surroundings_contrast_db
 
@@ -161,7 +163,7 @@ def test_query_without_quiet_fingers_contrasts_with_the_plate_around(targets, mo
     The plate around is that without fingers, which change it little.
     """
     table = smooth_table()
-    pattern = table.query(Question(targets, drive_mode=mode))
+    pattern = find_pattern(table, Question(targets, drive_mode=mode))
     centres = table.cell_centres
     far = centres[[min(math.dist(centre, each) for each in targets) > 0.05 for centre in centres]]
     frequencies, amplitudes = table.amplitudes(pattern.excitation, far)

@@ -21,8 +21,10 @@ from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from model.table.build import TableProblem, build_table
 from model.table.exact_plates import Plates, felt_on
 from model.table.live_table import table_following
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.table.raster import Raster
+from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable, default_drive_frequencies
 from model.vibration.excitation import Tone, tone_amplitudes
 from paper_plate import make_paper_rig
@@ -57,7 +59,9 @@ def test_query_predicts_what_the_direct_solver_finds(mode):
     """Level, contrast and the loudest quiet level, by the sparse direct solve with fingers on."""
     rig, table = smooth_rig(), smooth_table()
     target, *quiet = places = contact_sets(1, fingers=4, seed=2)[0]
-    pattern = table.query(Question((target,), tuple(quiet), level_db_sl=17.0, drive_mode=mode))
+    pattern = find_pattern(
+        table, Question((target,), tuple(quiet), level_db_sl=17.0, drive_mode=mode)
+    )
     points = np.concatenate([fingertip_points(*place, rig.plate) for place in places])
     matrices = assemble(rig.plate, rig.mesh)
 
@@ -82,7 +86,7 @@ def test_query_predicts_what_the_direct_solver_finds(mode):
 def test_query_scales_the_drive_with_the_level():
     """A softer level admits every pattern; 1 dB less is 0.89 of the stroke of the same ERAs."""
     loud, less, soft = (
-        smooth_table().query(Question(((0.1, 0.1),), ((0.2, 0.1),), level_db_sl=level))
+        find_pattern(smooth_table(), Question(((0.1, 0.1),), ((0.2, 0.1),), level_db_sl=level))
         for level in (20.0, 19.0, -20.0)
     )
     assert soft.robust_felt_contrast_db >= loud.robust_felt_contrast_db - 0.5
@@ -134,7 +138,7 @@ def test_read_fingertips_reads_the_points_and_weights_of_the_disc():
     """Reading x and y themselves gives back the points, also where edges cut a fingertip."""
     table = smooth_table()
     table = replace(table, shapes=table.raster.points.astype(np.float32))
-    tips = table.read_fingertips(CONTACTS)
+    tips = read_fingertips(table, CONTACTS)
     points = np.array([fingertip_points(x, y, table.plate) for x, y in CONTACTS])
     np.testing.assert_allclose(tips.fine, points, atol=1e-6)
     np.testing.assert_allclose(tips.few, points[:, [0, 9, 12, 15, 18]], atol=1e-6)
@@ -156,7 +160,7 @@ def test_read_fingertips_reads_waves_on_a_fine_raster_at_the_edges():
         (x, y) for x in [*along, *(length - along)] for y in (0.001, width / 2, width - 0.002)
     ]
     points = np.array([fingertip_points(x, y, table.plate) for x, y in places])
-    tips = table.read_fingertips(places)
+    tips = read_fingertips(table, places)
     np.testing.assert_allclose(tips.fine, np.cos(points @ waves.T), atol=1e-4)
     np.testing.assert_allclose(tips.few, np.cos(points[:, [0, 9, 12, 15, 18]] @ waves.T), atol=1e-4)
 
@@ -228,7 +232,7 @@ def test_same_rig_leaves_the_table_as_it_is(rig: Rig, table: LocalizationTable) 
     """A table that follows its own rig answers with the same pattern."""
     question = Question(((0.08, 0.06),), ((0.2, 0.15),), level_db_sl=0.0)
     same = table_following(table, rig)
-    assert same.query(question).excitation == table.query(question).excitation
+    assert find_pattern(same, question).excitation == find_pattern(table, question).excitation
     assert same.fingerprint == table.fingerprint
 
 

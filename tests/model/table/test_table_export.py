@@ -16,6 +16,7 @@ from model.structure.plate import AirGap, Laminate, Layer
 from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from small_table import FREQUENCIES, small_table, with_strokes
 
@@ -120,7 +121,7 @@ def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(dri
             (float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"]))
             for finger in ("target", "quiet")
         )
-        answer = table.query(Question((target,), (quiet,)))
+        answer = find_pattern(table, Question((target,), (quiet,)))
         assert float(row["robust_felt_contrast_db"]) == answer.robust_felt_contrast_db
         assert float(row["robust_level_db_sl"]) >= 20 - 1e-3
     weak = replace(with_strokes(table, 1e-6), grid=Grid(1, 2))

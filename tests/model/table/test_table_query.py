@@ -12,6 +12,7 @@ from model.cli import app
 from model.commands.table_cli import query
 from model.errors import InputError
 from model.table.file import save_table
+from model.table.pattern_query import find_pattern
 from model.table.query import query_batch
 from model.table.question import Question
 from paper_table import smooth_table
@@ -36,7 +37,7 @@ def test_a_line_of_a_batch_is_read_key_by_key():
     (found,) = query_batch(smooth_table(), [line])
     places = ((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),)
     question = Question(*places, 15.0, drive_mode="switched", loads=(1.0, 2.0, 0.5))
-    expected = smooth_table().query(question)
+    expected = find_pattern(smooth_table(), question)
     assert found["drive"] == smooth_table().drive_of(expected.excitation)
     assert found["robust_contrast_db"] == expected.robust_contrast_db
 

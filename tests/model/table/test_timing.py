@@ -10,6 +10,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.query import query_batch
 from model.table.question import Question
 from model.table.timing import Timing
@@ -45,9 +46,9 @@ def solved(rig):
 def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
     """Measures of ramps and envelopes agree; envelopes do better with the same excitation."""
     timing = Timing(table)
-    plain = timing.with_transient_measures(QUESTION, table.query(QUESTION))
+    plain = timing.with_transient_measures(QUESTION, find_pattern(table, QUESTION))
     shaped_pattern = timing.with_transient_measures(
-        QUESTION, timing.with_envelopes(QUESTION, table.query(QUESTION))
+        QUESTION, timing.with_envelopes(QUESTION, find_pattern(table, QUESTION))
     )
     assert plain.onset is plain.ending is None
     ramps = (
@@ -69,7 +70,7 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table,
 def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
     """Knots within a per mille of the largest, at an edge of the plate as well."""
     question = replace(QUESTION, quiet=quiet)
-    found = Timing(table).with_envelopes(question, table.query(question))
+    found = Timing(table).with_envelopes(question, find_pattern(table, question))
     shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
     onset = shaper.onset(found.excitation, targets=question.targets, quiet=quiet)
     largest = max(each.largest for each in onset.values())
@@ -82,7 +83,7 @@ def test_transient_measures_without_quiet_fingers(table):
     alone = Question(((0.09, 0.07),), drive_mode="phased")
     timing = Timing(table)
     pattern = timing.with_transient_measures(
-        alone, timing.with_envelopes(alone, table.query(alone))
+        alone, timing.with_envelopes(alone, find_pattern(table, alone))
     )
     assert pattern.transient_contrast_db is None
     assert pattern.residual_db < -20

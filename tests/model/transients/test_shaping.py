@@ -9,6 +9,7 @@ import pytest
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.table.build import build_table
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.knots import ONSET_KNOTS, steady_states
@@ -161,7 +162,7 @@ def test_onset_of_many_eras_is_as_good_as_of_few():
         question = Question(
             (target,), (quiet,), level_db_sl=20.0, envelopes=True, drive_mode="phased"
         )
-        excitation = table.query(question).excitation
+        excitation = find_pattern(table, question).excitation
         onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
         for era in table.eras:
             tone = excitation[era.name]

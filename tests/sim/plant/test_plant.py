@@ -20,6 +20,7 @@ from model.structure.attachments import Era, FingertipLoad
 from model.structure.plate import Material, Plate
 from model.table.build import build_table
 from model.table.pattern import Pattern
+from model.table.pattern_query import find_pattern
 from model.table.question import Question
 from model.table.timing import Timing
 from model.transients.base_motion import Term
@@ -143,7 +144,7 @@ def test_contrast_of_an_onset_behind_actuators_that_lag(
     for target, quiet in PAIRS:
         question = Question((target,), (quiet,), level_db_sl=15.0, envelopes=True)
         pattern = timing.with_envelopes(
-            question, table.query(question), onset=is_shaped, ending=False
+            question, find_pattern(table, question), onset=is_shaped, ending=False
         )
         predicted = timing.with_transient_measures(question, pattern).transient_contrast_db
         bases = driven_by(rig, pattern, times)

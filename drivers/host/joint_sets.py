@@ -1,0 +1,212 @@
+"""What amplifiers play together: a set is staged on all that it names, then committed on them.
+
+At one moment on all, or on none. A token is newer than another by less than half of 2^16 (RFC
+1982): an amplifier that was left out of 40 000 sets would take the next one for an older one. It
+commits one that changes nothing before.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from drivers.errors import CommandRefused, DriverError, Preempted
+from drivers.host.amplifier import Amplifier
+from drivers.host.dialogue import Staged
+from drivers.host.jobs import JointStart, Later, Priority
+from drivers.host.ledger import is_silence
+from drivers.host.line import Line
+from drivers.host.members import Members
+from drivers.playing.contents import Layer
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.table import LATCHED, STATES, name_of
+from drivers.protocol.timing import STOP_RAMP
+from registry import clock
+
+INTERVAL = 1 << 12
+"""Tokens after which the gaps are looked at again."""
+_MAX_GAP = 1 << 14
+_SPAN = 1 << 16
+
+
+@dataclass(frozen=True)
+class Played:
+    """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
+
+    sent_at [s]: when the last commit went out.
+    """
+
+    token: int
+    layers: Mapping[str, tuple[LayerSet, ...]]
+    sent_at: float
+
+
+class JointSets:
+    """The sets of the amplifiers of a group, under tokens from a first one on."""
+
+    def __init__(self, members: Members, token: int) -> None:
+        self._members = members
+        self.token = token
+        """Of the last set."""
+        self.is_incomplete = False
+        """Whether possibly only some amplifiers have committed the last set."""
+
+    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
+        """Stage and commit layers by amplifier; a refusal before the first commit is returned.
+
+        Preempted where a commit that was lost is too late to be repeated: then all are silent.
+        """
+        before = self._members.epoch
+        if self.token % INTERVAL == 0:
+            await self._close_gaps()
+        self.token = token = token_after(self.token)
+        is_silent = all(map(is_silence, layers.values()))
+        amplifiers: list[Amplifier] = []
+        staging: list[Awaitable[Staged]] = []
+        for each in self._members.by_need:
+            if each.name in layers:
+                amplifiers.append(each)
+                staging.append(each.stage(token, layers[each.name], now=is_silent))
+        results: list[Staged | BaseException]
+        if len(staging) == 1:  # as in `Members.all`
+            try:
+                results = [await staging[0]]
+            except DriverError as error:
+                results = [error]
+        else:
+            results = await asyncio.gather(*staging, return_exceptions=True)
+        refusals: dict[str, CommandRefused] = {}
+        has_failed = is_silent
+        for each, result in zip(amplifiers, results, strict=True):
+            if isinstance(result, CommandRefused) and not result.is_disarmed:
+                if not isinstance(result, Preempted):
+                    refusals[each.name] = result
+            elif isinstance(result, BaseException):
+                has_failed = True
+        if refusals and not has_failed:
+            return _merged(refusals)
+        staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        if not is_silent:
+            self._members.check_none_since(before)
+            self.is_incomplete = len(layers) > 1
+            began = clock.now()
+            try:
+                await self._commit(staged)
+            except CommandRefused as refusal:
+                if refusal.until is None or self._members.epoch != before:
+                    raise
+                # Too late for what the ledgers have admitted.
+                if any(each.played_at >= began for each in staged):
+                    await self.silence(STOP_RAMP)
+                    return Preempted(str(refusal))
+                self.is_incomplete = False
+                return refusal
+        self.is_incomplete = False
+        played: dict[str, tuple[LayerSet, ...]] = {}
+        reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
+        sent_at = -math.inf
+        for each, one in staged.items():
+            played[each.name], sent_at = one.layers, max(sent_at, each.played_at)
+            if not one.is_exact:
+                reading[each.name] = _achieved(each, one)
+        if reading:
+            achieved = await self._members.all([*reading.values()])
+            played.update(zip(reading, achieved, strict=True))
+        return Played(token, played, sent_at)
+
+    async def silence(self, ramp: float) -> None:
+        """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
+        # On a line that they share none waits for one that does not reply: that comes last.
+        amplifiers = self._members.by_need
+        amplifiers.sort(key=lambda each: each.silence_cause is not None)
+        await self._members.all([each.silence(ramp) for each in amplifiers])
+        self.is_incomplete = False
+
+    async def _commit(self, staged: Mapping[Amplifier, Staged]) -> None:
+        """Commit on every line at one moment, by one broadcast where amplifiers share it.
+
+        Raises CommandRefused where one does not play its set then.
+        """
+        token, until = self.token, math.inf
+        by_line: dict[Line, list[Amplifier]] = {}
+        for each, one in staged.items():
+            by_line.setdefault(each.line, []).append(each)
+            until = min(until, one.until)
+        start = JointStart(len(by_line), until=until) if len(by_line) > 1 else None
+        requests: dict[Amplifier, Awaitable[Values]] = {}
+        broadcasts: list[Awaitable[Values]] = []
+        for line, sharing in by_line.items():
+            if len(sharing) == 1:
+                requests[sharing[0]] = sharing[0].commit(token, start=start)
+                continue
+            later = Later(partial(_commit_of, sharing, token), start)
+            broadcasts.append(line.submit(None, Priority.SET, "Commit", later))
+            for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
+                requests[each] = each.ping()
+        # With the broadcasts: one that waits is not sent where this is given up.
+        statuses = await self._members.all([*requests.values(), *broadcasts])
+        for each, status in zip(requests, statuses, strict=False):
+            await _check_plays(each, status, token)
+
+    async def _close_gaps(self) -> None:
+        """Have amplifiers whose token is far behind commit a set that changes nothing."""
+        unchanged = []
+        for amplifier in self._members.amplifiers.values():
+            committed = amplifier.committed  # 0: any is newer
+            if committed > 0 and (self.token - committed) % _SPAN > _MAX_GAP:
+                unchanged += [(amplifier, layer) for layer in _unchanged(amplifier)]
+        if unchanged:
+            self.token = token_after(self.token)
+            sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
+            await asyncio.gather(*sets)
+
+
+def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
+    """Join refusals by amplifier; `until` is known only if all of them pass by themselves."""
+    known = [each.until for each in refusals.values() if each.until is not None]
+    return CommandRefused(
+        "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
+        channel=next(iter(refusals.values())).channel,
+        until=max(known) if len(known) == len(refusals) else None,
+    )
+
+
+def _commit_of(several: Sequence[Amplifier], token: int) -> list[Values]:
+    """Return the commit of all amplifiers of a line; raises unless each may have it now."""
+    values = {"session": several[0].session, "token": token}
+    for amplifier in several:
+        amplifier.next_request("Commit", values, Priority.SET)
+    return [values]
+
+
+async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
+    """Raise CommandRefused unless a status shows the token of a set, or does once it is repeated.
+
+    What its layers play is compared with every status.
+    """
+    if status["token"] != token and status["state"] not in LATCHED:
+        status = await amplifier.commit(token)
+    if status["token"] != token or status["state"] in LATCHED:
+        raise CommandRefused(
+            f"amplifier {amplifier.name}: token must be {token} while armed, got "
+            f"{status['token']} in state {name_of(STATES, status['state'])}"
+        )
+
+
+async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
+    """Read the layers of a set that plays, as the amplifier has achieved them."""
+    return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
+
+
+def _unchanged(amplifier: Amplifier) -> list[Layer]:
+    """Return a layer that is silent, or renewed without end; none if all end soon by themselves."""
+    playback = amplifier.ledger.playback
+    changing = {due[1] for due in playback.dues}  # end by themselves, or start what waits
+    for number in range(amplifier.capabilities["layers"]):
+        if number not in playback.tokens:
+            return [Layer(number)]
+        if number not in changing:
+            return [Layer(number, renew=True)]
+    return []

@@ -41,8 +41,8 @@ ENABLED = "OPERATION_ENABLED"
 IMPATIENT = """
 import sys
 from controller.cli.main import main
-from controller.gateway import bridge, connections
-connections.REQUEST_TIMEOUT = connections.UNREAD_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
+from controller.gateway import app, bridge, connections
+app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
 sys.exit(main())
 """
 """`era` with shorter timeouts of the gateway."""

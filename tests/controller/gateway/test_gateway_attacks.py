@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import httpx
 import pytest
 
-from controller.gateway.connections import MAX_FRAGMENTS
+from controller.gateway.frames import MAX_FRAGMENTS
 from gateway_bench import (
     ARM,
     TOKEN,
@@ -120,7 +120,7 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     "empty host": ({"host": [""]}, {421}),
     "two hosts": ({"host": ["HOST", "evil.example"]}, {400, 421}),
     "forwarded host": ({"host": ["evil.example"], "more": ["X-Forwarded-Host: HOST"]}, {421}),
-    "absolute target": ({"target": "http://evil.example/api/v1/arm"}, {404, 405}),
+    "absolute target": ({"target": "http://evil.example/api/v1/arm"}, {400}),
     # tokens
     "no token": ({"token": []}, {401}),
     "empty token": ({"token": [""]}, {401, 400}),
@@ -257,35 +257,37 @@ Misuse: TypeAlias = Callable[[RawWebSocket], None]
 
 REQUEST = b'{"jsonrpc": "2.0", "id": 1, "method": "arm", "params": ' + ARM + b"}"
 
-MISUSES: dict[str, tuple[Misuse, int]] = {
-    "binary": (lambda ws: ws.send(b"\x00\x01", first=0x82), 1003),
-    "too large": (lambda ws: ws.send(b" " * ((1 << 16) + 1)), 1009),
+FLOOD = {0, 1002}  # the gateway does not wait until the close frame is read
+
+MISUSES: dict[str, tuple[Misuse, set[int]]] = {
+    "binary": (lambda ws: ws.send(b"\x00\x01", first=0x82), {1003}),
+    "too large": (lambda ws: ws.send(b" " * ((1 << 16) + 1)), {1009}),
     "too large in fragments": (
         lambda ws: ws.connection.sendall(
             frame(b" " * 40_000, first=0x01) + frame(b" " * 40_000, first=0x80)
         ),
-        1009,
+        {1009},
     ),
     "fragments without end": (
         lambda ws: ws.connection.sendall(
             frame(b"", first=0x01) + frame(b"", first=0x00) * (2 * MAX_FRAGMENTS)
         ),
-        0,
+        FLOOD,
     ),
-    "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), 0),
-    "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), 0),
-    "invalid UTF-8": (lambda ws: ws.send(b"\xff\xfe"), 1007),
-    "two lines": (lambda ws: ws.send(REQUEST + b"\n" + REQUEST), 1003),
+    "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), FLOOD),
+    "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), FLOOD),
+    "invalid UTF-8": (lambda ws: ws.send(b"\xff\xfe"), {1007}),
+    "two lines": (lambda ws: ws.send(REQUEST + b"\n" + REQUEST), {1003}),
 }
 
 
 @pytest.mark.parametrize("name", MISUSES)
 def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: str) -> None:
     """With the close code of RFC 6455, or 0: without a close frame."""
-    misuse, code = MISUSES[name]
+    misuse, codes = MISUSES[name]
     with RawWebSocket(gateway) as ws:
         misuse(ws)
-        assert ws.close_code() == code
+        assert ws.close_code() in codes
 
 
 def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:

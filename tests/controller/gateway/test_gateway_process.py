@@ -11,11 +11,13 @@ from pathlib import Path
 from unittest.mock import AsyncMock
 
 import pytest
+from aiohttp import web
 
 from controller.gateway.app import Gateway
-from controller.gateway.serving import check_certificate, listen, serve
+from controller.gateway.connections import Acceptor
+from controller.gateway.serving import load_certificate, listen, serve
 from controller.gateway.settings import Settings, read_token
-from daemon_bench import PATIENCE
+from daemon_bench import PATIENCE, until
 from gateway_bench import (
     TOKEN,
     RawWebSocket,
@@ -140,17 +142,18 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> None:
     """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
-    accepted: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
     listening = listen(Settings(socket=tmp_path / "era.sock", host=host, port=0))
-    async with await asyncio.start_server(
-        lambda _, writer: accepted.put_nowait(writer), sock=listening
-    ):
-        _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
-        theirs = await accepted.get()
-        connection = theirs.get_extra_info("socket")
-        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-        for writer in (ours, theirs):
-            writer.close()
+    server = web.Server(AsyncMock())
+    accepting = asyncio.create_task(Acceptor(server, None).run(listening))
+    _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
+    await until(lambda: bool(server.connections))
+    theirs = server.connections[0].transport
+    assert theirs is not None
+    assert theirs.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    accepting.cancel()
+    await server.shutdown()
+    ours.close()
+    listening.close()
 
 
 def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
@@ -172,7 +175,7 @@ def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path,
     text.write_text("no certificate")
     for first, second in ((certificate, other), (certificate, locked), (text, text)):
         with pytest.raises(InputError, match=f"{first} and {second}.*without password"):
-            check_certificate(Settings(socket=tmp_path, certificate=first, key=second))
+            load_certificate(Settings(socket=tmp_path, certificate=first, key=second))
 
 
 def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
@@ -266,7 +269,7 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
         raise InputError("reached")
 
     monkeypatch.setattr("os.nice", forbidden)
-    monkeypatch.setattr("controller.gateway.serving.check_certificate", reached)
+    monkeypatch.setattr("controller.gateway.serving.load_certificate", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
 

@@ -5,7 +5,6 @@ import errno
 import os
 import signal
 import socket
-import ssl
 import subprocess
 from pathlib import Path
 from unittest.mock import AsyncMock
@@ -15,9 +14,10 @@ from aiohttp import web
 
 from controller.gateway.app import Gateway
 from controller.gateway.connections import Acceptor
-from controller.gateway.serving import load_certificate, listen, serve
+from controller.gateway.serving import listen, load_certificate, serve
 from controller.gateway.settings import Settings, read_token
 from daemon_bench import PATIENCE, until
+from gateway_attacks import make_certificate
 from gateway_bench import (
     TOKEN,
     RawWebSocket,
@@ -41,19 +41,7 @@ def openssl() -> str:
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A self-signed certificate of localhost, and its key."""
-    folder = tmp_path_factory.mktemp("tls")
-    certificate, key = folder / "panel.pem", folder / "panel.key"
-    subprocess.run(
-        [
-            *(openssl(), "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
-            *("-nodes", "-days", "1", "-subj", "/CN=localhost"),
-            *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
-            *("-keyout", str(key), "-out", str(certificate)),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    return certificate, key
+    return make_certificate(tmp_path_factory.mktemp("tls"))
 
 
 def test_gateway_exits_at_sigint_with_open_connections(
@@ -97,7 +85,7 @@ def test_gateway_serves_tls(
         assert gateway.url.startswith("https://localhost:")
         plain = f"POST /api/v1/stop HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
         assert raw(gateway, plain).status == 0
-        gateway.context = _Verified(certificate)
+        gateway.trust(certificate)
         wait_for_daemon(gateway)
         assert http(gateway).status == 200
         assert http(gateway, more=[f"Origin: https://{gateway.host}"]).status == 200
@@ -107,20 +95,6 @@ def test_gateway_serves_tls(
             connection.sendall(upgrade(gateway, origin=f"https://{gateway.host}"))
             assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")
             assert gateway.terminate() == 0
-
-
-class _Verified(ssl.SSLContext):
-    """Trusts one certificate, of localhost."""
-
-    def __new__(cls, certificate: Path) -> "_Verified":
-        return super().__new__(cls, ssl.PROTOCOL_TLS_CLIENT)
-
-    def __init__(self, certificate: Path) -> None:
-        self.load_verify_locations(certificate)
-
-    def wrap_socket(self, plain: socket.socket) -> ssl.SSLSocket:  # type: ignore[override]
-        """Wrap as a client of localhost."""
-        return super().wrap_socket(plain, server_hostname="localhost")
 
 
 def test_gateway_prints_an_ipv6_url_with_a_random_token(

@@ -18,7 +18,8 @@ from controller.gateway.bridge import KeptLink
 from controller.gateway.frames import FrameHeads
 
 CLIENT_TIMEOUT = 5.0  # s; for a handshake, a complete request, or reading a response
-MAX_WAITING = 128  # connections in a handshake, without a complete request, or unread: each
+MAX_WAITING = 128  # connections without a complete request, and as many unread
+MAX_HANDSHAKES = 96  # of TLS; each takes some 400 kB
 _SLICE = 1 << 12  # bytes of a connection in one turn of the event loop
 _ACCEPT_PAUSE = 0.01  # s; while there is no descriptor
 
@@ -40,13 +41,14 @@ _PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 class Deadlines:
     """What has to happen within a time, in a bounded number: the oldest expires for a new one."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int) -> None:
+        self._most = most
         self._all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = {}
 
     def start(self, key: Hashable, expire: Callable[[], object]) -> None:
         """Start the time of something, anew if it runs already; expire: called at its end."""
         self.cancel(key)
-        if len(self._all) >= MAX_WAITING:
+        if len(self._all) >= self._most:
             oldest, (expire_oldest, _) = next(iter(self._all.items()))
             self.cancel(oldest)
             expire_oldest()
@@ -177,9 +179,9 @@ class Acceptor:
         self, make_server: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None
     ) -> None:
         self.links: set[KeptLink] = set()
-        self.idle = Deadlines()
-        self.unread = Deadlines()
-        self._handshakes = Deadlines()
+        self.idle = Deadlines(MAX_WAITING)
+        self.unread = Deadlines(MAX_WAITING)
+        self._handshakes = Deadlines(MAX_HANDSHAKES)
         self._make_server = make_server
         self._tls = tls
 

@@ -517,6 +517,22 @@ def frame(payload: bytes, *, first: int = 0x81) -> bytes:
     return Frame(Opcode(first & 0x0F), payload, fin=bool(first & 0x80)).serialize(mask=True)
 
 
+def has_ended(connection: socket.socket) -> bool:
+    """Whether the other side has closed, without reading."""
+    try:
+        connection.send(b"")
+        return bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) or _is_reset(
+            connection
+        )
+    except OSError:
+        return True
+
+
+def _is_reset(connection: socket.socket) -> bool:
+    """By the kernel's state of the connection: 1 is established, see tcp_states.h of Linux."""
+    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 1
+
+
 UNCONFIRMED = {
     "main": AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="read"),
     "side": AmplifierSilence(silence="may_play", may_play_for_s=0.2, cause="no reply"),

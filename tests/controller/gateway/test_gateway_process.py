@@ -1,6 +1,7 @@
 """`era gateway` as a process: how it begins, what it refuses, TLS, and its end within a second."""
 
 import asyncio
+import contextlib
 import errno
 import os
 import signal
@@ -13,7 +14,7 @@ import pytest
 from aiohttp import web
 
 from controller.gateway.app import Gateway
-from controller.gateway.connections import Acceptor
+from controller.gateway.connections import MAX_HANDSHAKES, Acceptor
 from controller.gateway.serving import listen, load_certificate, serve
 from controller.gateway.settings import Settings, read_token
 from daemon_bench import PATIENCE, until
@@ -23,6 +24,7 @@ from gateway_bench import (
     RawWebSocket,
     ScriptedDaemon,
     gateway_process,
+    has_ended,
     http,
     raw,
     upgrade,
@@ -85,6 +87,14 @@ def test_gateway_serves_tls(
         assert gateway.url.startswith("https://localhost:")
         plain = f"POST /api/v1/stop HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
         assert raw(gateway, plain).status == 0
+        with contextlib.ExitStack() as stack:
+            half = [stack.enter_context(gateway.connect()) for _ in range(3 * MAX_HANDSHAKES)]
+            for each in half:
+                each.sendall(b"\x16\x03\x01\x02\x00\x01")  # the beginning of a handshake
+            wait_for(
+                lambda: sum(not has_ended(each) for each in half) <= MAX_HANDSHAKES,
+                timeout=PATIENCE / 6,
+            )
         gateway.trust(certificate)
         wait_for_daemon(gateway)
         assert http(gateway).status == 200

@@ -193,6 +193,31 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     assert lines[-1] == stop.encode()
 
 
+async def test_others_have_a_turn_after_each_frame(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames of a browser wait."""
+    path, read = busy_daemon
+    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.5)
+    opened = await link.DaemonLink.open(path, "browser")
+    monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+    browser = DeafBrowser()
+    for _ in range(100):
+        browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, "{}", ""))
+    bridging = asyncio.create_task(bridge.bridge(browser, "", path, None))  # type: ignore[arg-type]
+    turns = 0
+    async with asyncio.timeout(PATIENCE):
+        while not browser.frames.empty():
+            await asyncio.sleep(0)
+            turns += 1
+        browser.frames.put_nowait(LEFT)
+        await bridging
+        await read
+    opened.abort()
+    await asyncio.sleep(0)
+    assert turns >= 100
+
+
 class LeavingBrowser(DeafBrowser):
     """A WebSocket of a browser that leaves when it is sent its second frame."""
 

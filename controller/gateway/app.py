@@ -200,9 +200,13 @@ class Gateway:
 
     @web.middleware
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Check a request and write its response; only then its connection is idle again."""
-        connection = connection_of(request)
-        connection.begin_response()
+        """Check a request and write its response; only then its connection is idle again.
+
+        A client may have left meanwhile: its stop is carried out all the same.
+        """
+        connection = None if request.transport is None else connection_of(request)
+        if connection is not None:
+            connection.begin_response()
         try:
             self._access.check(request)
             response = await handler(request)
@@ -214,7 +218,8 @@ class Gateway:
             )
         await response.prepare(request)
         await response.write_eof()
-        connection.end_response()
+        if connection is not None:
+            connection.end_response()
         return response
 
     async def _file(self, request: web.Request) -> web.Response:
@@ -254,15 +259,13 @@ class Gateway:
 
     async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
         """The daemon's result, over the connection that this one keeps; raises RpcError."""
-        connection = connection_of(request)
-        name = f"http {connection.address}"
+        name = f"http {getattr(request.transport, 'address', request.remote)}"
         try:
             if method in SILENCING:  # over the own connection, from any client
                 return await self._silence(name, method, params)
             may_open = partial(self.may_connect, request.remote)
-            line = await connection.link.request(
-                self._daemon, name, method, params, may_open=may_open
-            )
+            kept = connection_of(request).link
+            line = await kept.request(self._daemon, name, method, params, may_open=may_open)
             return result_of(read_line(line))
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error

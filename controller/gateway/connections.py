@@ -20,7 +20,6 @@ from controller.gateway.frames import FrameHeads
 CLIENT_TIMEOUT = 5.0  # s; for a handshake, a complete request, or reading a response
 MAX_WAITING = 128  # connections without a complete request, and as many unread
 MAX_HANDSHAKES = 96  # of TLS; each takes some 400 kB
-_SLICE = 1 << 12  # bytes of a connection in one turn of the event loop
 _ACCEPT_PAUSE = 0.01  # s; while there is no descriptor
 
 _MALFORMED_BODY = json.dumps({"error": "the request is not valid HTTP/1.1"})
@@ -61,20 +60,18 @@ class Deadlines:
             self._all.pop(key)[1].cancel()
 
 
-class ClientConnection(asyncio.BufferedProtocol):
+class ClientConnection(asyncio.Protocol):
     """Stands between a transport and the web server's protocol, and is each of them to the other.
 
-    As a buffered protocol it takes no more than a slice in one turn of the event loop.
     link: the connection to the daemon that ends with this one.
     """
 
-    _transport: asyncio.Transport
+    _transport: Any = None
 
     def __init__(self, server: asyncio.Protocol, acceptor: "Acceptor") -> None:
         self.link = KeptLink(acceptor.links)
         self._server = server
         self._acceptor = acceptor
-        self._buffer = memoryview(bytearray(_SLICE))
         self._last = b""  # bytes received
         self._frames: FrameHeads | None = None
         self._is_answering = False
@@ -89,13 +86,8 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._acceptor.idle.start(self, transport.abort)
         self._server.connection_made(self)  # type: ignore[arg-type]
 
-    def get_buffer(self, sizehint: int) -> memoryview:
-        """Where the next bytes go."""
-        return self._buffer
-
-    def buffer_updated(self, nbytes: int) -> None:
-        """Hand them on, unless they are frames that are not allowed."""
-        data = bytes(self._buffer[:nbytes])
+    def data_received(self, data: bytes) -> None:
+        """Hand data on, unless they are frames that are not allowed."""
         self._last = (self._last + data)[-4:]
         if self._frames is None or self._frames.accept(data):
             self._server.data_received(data)

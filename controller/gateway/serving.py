@@ -22,6 +22,7 @@ from model.errors import InputError
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
 _SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
+_RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
 
@@ -105,7 +106,8 @@ def listen(settings: Settings) -> socket.socket:
             f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
             "(--listen)"
         ) from error
-    # Inherited by accepted connections; the system's default limit is some megabytes.
+    # Inherited by accepted connections; the system's default limits are some megabytes.
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
     listening.setblocking(False)
     return listening

@@ -456,7 +456,7 @@ class RawWebSocket:
         )
         self._protocol.key = _KEY
         self._events: list[Event] = []
-        origin = f"http://{gateway.host}"
+        origin = gateway.url.removesuffix("/")
         self.connection.sendall(upgrade(gateway, target=target, origin=origin))
         head = self._event()
         assert isinstance(head, Response), "no handshake"

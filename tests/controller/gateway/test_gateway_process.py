@@ -23,6 +23,7 @@ from gateway_bench import (
     TOKEN,
     RawWebSocket,
     ScriptedDaemon,
+    frame,
     gateway_process,
     has_ended,
     http,
@@ -76,6 +77,13 @@ def test_gateway_exits_at_sigint_with_open_connections(
         assert gateway.log() == ""
 
 
+STOP = (
+    b"POST /api/v1/stop HTTP/1.1\r\nHost: %s\r\nContent-Length: 0\r\nAuthorization: Bearer "
+    + TOKEN.encode()
+    + b"\r\n\r\n"
+)
+
+
 def test_gateway_serves_tls(
     daemon: ScriptedDaemon, tmp_path: Path, pair: tuple[Path, Path]
 ) -> None:
@@ -101,6 +109,15 @@ def test_gateway_serves_tls(
         assert http(gateway, more=[f"Origin: https://{gateway.host}"]).status == 200
         assert http(gateway, more=[f"Origin: http://{gateway.host}"]).status == 403
         assert raw(gateway, upgrade(gateway, origin=f"http://{gateway.host}")).status == 403
+        daemon.calls.clear()
+        for _ in range(20):  # clients that leave at once, and politely by TLS
+            with gateway.connect() as connection:
+                connection.sendall(STOP % gateway.host.encode())
+        for _ in range(3):
+            with RawWebSocket(gateway) as ws:
+                waiting = frame(b" " * 60_000 + b"{}") + frame(b'{"jsonrpc":"2.0","method":"stop"}')
+                ws.connection.sendall(waiting)
+        wait_for(lambda: daemon.methods.count("stop") == 23)
         with gateway.connect() as connection:
             connection.sendall(upgrade(gateway, origin=f"https://{gateway.host}"))
             assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")

@@ -13,6 +13,7 @@ from controller.gateway.settings import Settings
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
+_PORT = re.compile(r":[0-9]+\Z")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 HEADERS = {
@@ -93,10 +94,7 @@ class Access:
 
     def _is_allowed_host(self, host: str) -> bool:
         """Whether a Host header names this gateway, with any port (a proxy may have another)."""
-        name, colon, port = host.rpartition(":")
-        if not colon or not port.isdecimal():
-            name = host
-        return name.lower() in self._settings.allowed_names
+        return _PORT.sub("", host).lower() in self._settings.allowed_names
 
     def _is_allowed_origin(self, origins: list[str], host: str) -> bool:
         """Whether an Origin is the gateway's own or an allowed one."""
@@ -105,9 +103,8 @@ class Access:
 
     def _needs_token(self, path: str) -> bool:
         """Whether a path needs the token, unlike the page and the OpenAPI description."""
-        if path == "/metrics":
-            return not self._settings.is_loopback
-        return path.startswith("/api/") and path != "/api/v1/openapi.json"
+        is_method = path.startswith("/api/") and path != "/api/v1/openapi.json"
+        return is_method or (path == "/metrics" and not self._settings.is_loopback)
 
     def _has_token(self, request: web.Request) -> bool:
         tokens = [

@@ -290,11 +290,11 @@ class Gateway:
             max_msg_size=MAX_BODY + 1,  # the first that is refused
             timeout=_CLOSE_TIMEOUT,
         )
+        if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
+            raise web.HTTPForbidden(text="too many clients")
         is_valid = SUBPROTOCOL in map(str.strip, protocols) and socket.can_prepare(request)
         if not (is_valid and connection.upgrade()):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
-        if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
-            raise web.HTTPForbidden(text="too many clients")
         self._sessions.add(request.task)  # before the first await, so that the limit holds
         try:
             await socket.prepare(request)

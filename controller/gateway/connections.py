@@ -148,9 +148,9 @@ class ClientConnection(asyncio.Protocol):
         return f"{peer[0]}:{peer[1]}"
 
     def upgrade(self) -> bool:
-        """Expect frames; whether none has come too early, before it was accepted."""
-        self._frames = FrameHeads()
-        return self._last == b"\r\n\r\n"
+        """Expect frames, unless some came too early, before this was accepted; whether it does."""
+        self._frames = FrameHeads() if self._last == b"\r\n\r\n" else None
+        return self._frames is not None
 
 
 def connection_of(request: web.Request) -> ClientConnection:

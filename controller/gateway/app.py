@@ -145,6 +145,7 @@ _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 _HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
 _CLOSE_TIMEOUT = 1.0  # s; for a browser to close its side
+_MAX_FILES = 4  # in one turn of the event loop
 _PAGE = Path(__file__).parent / "page"
 
 
@@ -166,6 +167,7 @@ class Gateway:
         self._reading = asyncio.Lock()
         self._read_at = -math.inf  # s; when the metrics were read
         self._exposition = b""
+        self._file_places = asyncio.Semaphore(_MAX_FILES)
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
         self._files["openapi.json"] = json.dumps(openapi()).encode()
         self.app = web.Application(middlewares=[self._answer], client_max_size=MAX_BODY)
@@ -227,6 +229,8 @@ class Gateway:
         name = request.match_info["file"] or "index.html"
         if name not in self._files:
             raise web.HTTPNotFound
+        async with self._file_places:  # of many requests at once some go out in each turn
+            await asyncio.sleep(0)
         media, _ = mimetypes.guess_type(name)
         return web.Response(body=self._files[name], content_type=media, charset="utf-8")
 

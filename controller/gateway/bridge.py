@@ -18,7 +18,8 @@ from controller.api.methods import SILENCING
 from controller.gateway.field import DrawnField
 
 SEND_TIMEOUT = 5.0  # s; for one frame
-_LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
+_LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for
+# all of them
 
 NO_DAEMON = 4001  # one of those for private use; the page connects again
 
@@ -67,12 +68,16 @@ async def _to_daemon(socket: web.WebSocketResponse, link: DaemonLink) -> None:
 
 async def _silence(socket: web.WebSocketResponse, link: DaemonLink) -> None:
     """Send the daemon what may silence of the frames that still wait, whoever else is at an end."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + _LAST_FRAMES
     with contextlib.suppress(TimeoutError):  # there is no further one
-        async with asyncio.timeout(_LAST_FRAMES):
+        async with asyncio.timeout(_LAST_FRAME) as limit:
             async for message in socket:
                 line = message.data.encode() if message.type is WSMsgType.TEXT else b""
                 if link.is_open and b"\n" not in line and _method_of(line) in SILENCING:
                     link.write(line + b"\n")
+                await asyncio.sleep(0)
+                limit.reschedule(min(end, loop.time() + _LAST_FRAME))
 
 
 def _method_of(line: bytes) -> str:

@@ -68,9 +68,8 @@ class ClientConnection(asyncio.Protocol):
 
     _transport: Any = None
 
-    def __init__(self, server: asyncio.Protocol, acceptor: "Acceptor") -> None:
+    def __init__(self, acceptor: "Acceptor") -> None:
         self.link = KeptLink(acceptor.links)
-        self._server = server
         self._acceptor = acceptor
         self._last = b""  # bytes received
         self._frames: FrameHeads | None = None
@@ -83,6 +82,7 @@ class ClientConnection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept it as idle."""
         self._transport = transport
+        self._server = self._acceptor.make_server()  # only now, for a handshake may never end
         self._acceptor.idle.start(self, transport.abort)
         self._server.connection_made(self)  # type: ignore[arg-type]
 
@@ -174,7 +174,7 @@ class Acceptor:
         self.idle = Deadlines(MAX_WAITING)
         self.unread = Deadlines(MAX_WAITING)
         self._handshakes = Deadlines(MAX_HANDSHAKES)
-        self._make_server = make_server
+        self.make_server = make_server
         self._tls = tls
 
     async def run(self, listening: socket.socket) -> None:
@@ -193,10 +193,24 @@ class Acceptor:
     async def _admit(self, accepted: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         try:
+            if self._tls is not None:
+                await _first_byte(accepted)  # a silent connection takes no memory for TLS
             await loop.connect_accepted_socket(
-                lambda: ClientConnection(self._make_server(), self), accepted, ssl=self._tls
+                lambda: ClientConnection(self), accepted, ssl=self._tls
             )
         except (OSError, asyncio.CancelledError):
             accepted.close()
         finally:
             self._handshakes.cancel(asyncio.current_task())
+
+
+async def _first_byte(accepted: socket.socket) -> None:
+    """Wait until a client sends something, which is left to be read; raises OSError at its end."""
+    loop, has_come = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(accepted, has_come.set)
+    try:
+        await has_come.wait()
+    finally:
+        loop.remove_reader(accepted)
+    if not accepted.recv(1, socket.MSG_PEEK):
+        raise ConnectionResetError

@@ -17,12 +17,14 @@ from controller.api.admission import allow_many_descriptors
 from controller.gateway.app import Gateway
 from controller.gateway.connections import CLIENT_TIMEOUT, Acceptor
 from controller.gateway.settings import Settings
+from drivers.garbage_collection import no_long_collections
 from model.errors import InputError
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
 _SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
 _RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
+_QUEUE = 512  # connections that wait to be accepted
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
 
@@ -59,7 +61,8 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     own = asyncio.gather(gateway.run(), Acceptor(runner.server, tls).run(listening))
     own.add_done_callback(lambda _: over.set())
     announce(listening.getsockname()[1])
-    await over.wait()
+    with no_long_collections():  # of connections that a storm leaves, nothing else is visited
+        await over.wait()
     listening.close()
     await runner.cleanup()
     own.cancel()
@@ -98,7 +101,10 @@ def listen(settings: Settings) -> socket.socket:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         listening = socket.create_server(
-            (settings.host, settings.port), family=family, dualstack_ipv6=family == socket.AF_INET6
+            (settings.host, settings.port),
+            family=family,
+            backlog=_QUEUE,
+            dualstack_ipv6=family == socket.AF_INET6,
         )
     except OSError as error:
         raise InputError(

@@ -167,7 +167,7 @@ class Gateway:
         self._reading = asyncio.Lock()
         self._read_at = -math.inf  # s; when the metrics were read
         self._exposition = b""
-        self._file_places = asyncio.Semaphore(_MAX_FILES)
+        self._file_permits = asyncio.Semaphore(_MAX_FILES)
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
         self._files["openapi.json"] = json.dumps(openapi()).encode()
         self.app = web.Application(middlewares=[self._answer], client_max_size=MAX_BODY)
@@ -208,7 +208,7 @@ class Gateway:
         """
         connection = None if request.transport is None else connection_of(request)
         if connection is not None:
-            connection.begin_response()
+            connection.start_response()
         try:
             self._access.check(request)
             response = await handler(request)
@@ -229,7 +229,7 @@ class Gateway:
         name = request.match_info["file"] or "index.html"
         if name not in self._files:
             raise web.HTTPNotFound
-        async with self._file_places:  # of many requests at once some go out in each turn
+        async with self._file_permits:  # of many requests at once some go out in each turn
             await asyncio.sleep(0)
         media, _ = mimetypes.guess_type(name)
         return web.Response(body=self._files[name], content_type=media, charset="utf-8")
@@ -326,8 +326,8 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
-    is_asking = request.headers.get("Expect", "").lower() == "100-continue"
-    if is_asking and request.version >= HttpVersion11:
+    has_expectation = request.headers.get("Expect", "").lower() == "100-continue"
+    if has_expectation and request.version >= HttpVersion11:
         connection_of(request).write(b"HTTP/1.1 100 Continue\r\n\r\n")
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):

@@ -40,14 +40,14 @@ _PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 class Deadlines:
     """What has to happen within a time, in a bounded number: the oldest expires for a new one."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
         self._all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = {}
 
     def start(self, key: Hashable, expire: Callable[[], object]) -> None:
         """Start the time of something, anew if it runs already; expire: called at its end."""
         self.cancel(key)
-        if len(self._all) >= self._most:
+        if len(self._all) >= self._limit:
             oldest, (expire_oldest, _) = next(iter(self._all.items()))
             self.cancel(oldest)
             expire_oldest()
@@ -130,7 +130,7 @@ class ClientConnection(asyncio.Protocol):
         self._transport.close()
         self._acceptor.unread.start(self, self._transport.abort)
 
-    def begin_response(self) -> None:
+    def start_response(self) -> None:
         """Let through what the server writes: it is to a request that it has handed on."""
         self._acceptor.idle.cancel(self)
         self._is_answering = True

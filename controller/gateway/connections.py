@@ -88,7 +88,7 @@ class ClientConnection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand data on, unless they are frames that are not allowed."""
-        self._last = (self._last + data)[-4:]
+        self._last = (self._last + data[-4:])[-4:]
         if self._frames is None or self._frames.accept(data):
             self._server.data_received(data)
         else:

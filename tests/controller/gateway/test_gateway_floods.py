@@ -39,7 +39,7 @@ def attacked(daemon: Path, tmp_path: Path) -> Iterator[tuple[GatewayProcess, Pat
 def test_stops_get_through_an_attack(attacked: tuple[GatewayProcess, Path], name: str) -> None:
     """Each is carried out, and the gateway takes less than half a second of a processor meanwhile.
 
-    On a machine with nothing beside it that is their time; on a busy one other programs add theirs.
+    Other programs do not lengthen that, unlike the duration on a busy machine.
     """
     gateway, certificate = attacked
     outcome = attack(gateway, name, certificate, seconds=6.0)

@@ -25,13 +25,13 @@ class EngineHook(BuildHookInterface):  # type: ignore[type-arg]
         sys.path.insert(0, self.root)
         try:
             from model.compiled.kernels import compile_kernels
-            from sim.soft_amp.library import ENGINE, compile_engine
+            from sim.desk.soft_amp.library import ENGINE, compile_engine
         finally:
             sys.path.pop(0)
         self._folder = tempfile.TemporaryDirectory(prefix="era-engine-")
         folder = Path(self._folder.name)
         compile_engine(folder / ENGINE)
-        made = {"sim/soft_amp": [folder / ENGINE], "model/compiled": compile_kernels(folder)}
+        made = {"sim/desk/soft_amp": [folder / ENGINE], "model/compiled": compile_kernels(folder)}
         for where, paths in made.items():
             for path in paths:
                 build_data["force_include"][str(path)] = f"{where}/{path.name}"

@@ -9,12 +9,12 @@ import sys
 from collections import Counter
 from types import FrameType
 
-from drivers import clock
-from drivers.contents import Layer, Tone
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
+from drivers.playing.contents import Layer, Tone
+from drivers.wires.serial_line.host import SerialWire
+from registry import clock
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.errors import LinkError
-from drivers.hardware import Port
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
+from drivers.ports.port import Port
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits

@@ -45,7 +45,7 @@ from model.table.table import LocalizationTable as LocalizationTable
 from model.vibration.excitation import Tone as Tone
 from model.vibration.maps import PlateMap as PlateMap
 from registry.limits import GuardLimits as GuardLimits
-from sim.plant.playback import Playback as Playback
+from sim.plant.excited_plate import Playback as Playback
 
 _HOMES: dict[str, str]
 __all__: list[str]

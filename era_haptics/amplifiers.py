@@ -1,8 +1,8 @@
 """Amplifiers of a rig for scripts: opened by the rig's URLs and limits."""
 
-from controller.loop.plate_set import route
+from controller.play.routing import route
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.contents import Tone
+from drivers.playing.contents import Tone
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
 from model.arguments import shown

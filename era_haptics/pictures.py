@@ -20,8 +20,8 @@ from model.figures.table_pictures import (
 from model.table.contrast_map import ContrastMap
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
+from sim.plant.excited_plate import Playback
 from sim.plant.fingers import Record
-from sim.plant.playback import Playback
 
 
 def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") -> Figure:

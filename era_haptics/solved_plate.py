@@ -20,8 +20,8 @@ from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from model.vibration.maps import PlateMap, plate_map
+from sim.plant.excited_plate import Playback, play
 from sim.plant.imperfections import Imperfections, draw_imperfections
-from sim.plant.playback import Playback, play
 
 
 class SolvedPlate:

@@ -10,13 +10,13 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
-from sim.measure_cli import measure
-from sim.soft_amp_cli import port_option, soft_amp
+from sim.desk.measure_cli import measure
+from sim.desk.soft_amp_cli import port_option, soft_amp
 from sim.witness_cli import witness
 
 if TYPE_CHECKING:
     from sim.control.context import SimulationContext
-    from sim.far_ends.wires import Wire
+    from sim.far_ends.opening import Wire
     from sim.plant.accelerometer import Accelerometer
     from sim.process.simulation import Simulation
     from sim.process.view import PlateView
@@ -117,9 +117,9 @@ def sim(
     with exit_on_signal():
         from model.config.points import parse_point
         from model.rig.file import load_rig
-        from sim.far_ends.wires import Wire, assign_wires, links_of
+        from sim.far_ends.opening import Wire, assign_wires, links_of
         from sim.faults.fault_window import FaultFile, load_faults
-        from sim.firmware.bench import find_firmware
+        from sim.firmware.processes import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
         from sim.transport.pseudo_terminal import links_by_amplifier

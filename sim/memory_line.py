@@ -15,14 +15,14 @@ from pathlib import Path
 from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
-from drivers import clock
 from drivers.errors import CommandError, LinkError
-from drivers.host.serial_wire import SerialWire
 from drivers.urls import AmplifierUrl
 from drivers.wires.address import WireAddress
+from drivers.wires.serial_line.host import SerialWire
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from registry import clock
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext

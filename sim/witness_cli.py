@@ -14,10 +14,10 @@ import typer
 
 from model.counting import counted
 from model.errors import InputError
-from model.files.regular_file import regular_file
+from registry.regular_file import regular_file
 
 if TYPE_CHECKING:
-    from sim.witness.witness import Witness
+    from drivers.judge.watching.witness import Witness
     from sim.witness_relay import WireEndpoint
 
 
@@ -52,7 +52,7 @@ def witness(
     Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C. Exit
     status 1 on violations.
     """
-    from sim.witness.witness import Witness
+    from drivers.judge.watching.witness import Witness
     from sim.witness_relay import parse_endpoint
 
     limits: dict[str, Any] = {
@@ -168,7 +168,7 @@ def _capture(path: Path | None) -> Iterator[Callable[[str], None]]:
 
 def _replay(path: Path, checker: "Witness") -> float:
     """Check a capture; returns its end [s]."""
-    from sim.witness.capture import read_capture
+    from drivers.judge.watching.capture import read_capture
 
     end = None
     for end, wire, direction, data in read_capture(path, wires=checker.wires):

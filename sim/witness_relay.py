@@ -11,15 +11,15 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
-from drivers import clock
 from drivers.errors import CommandError, LinkError
+from drivers.judge.watching.capture import Direction
+from drivers.judge.watching.witness import Witness
 from drivers.ports.serial_port import open_port
 from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError
+from registry import clock
 from sim.transport.pseudo_terminal import make_terminal
-from sim.witness.capture import Direction
-from sim.witness.witness import Witness
 
 _KINDS = {
     **dict.fromkeys(("serial", "serial+tcp"), "serial"),

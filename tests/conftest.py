@@ -20,12 +20,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-from drivers import garbage_collection  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.table.table_cache import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
+from registry import garbage_collection
 
 SLOWEST = (
     "test_dashboard.py",

@@ -15,16 +15,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers import clock
-from drivers.contents import Layer, Tone
 from drivers.errors import DriverError, LinkDegraded
-from drivers.garbage_collection import no_long_collections
 from drivers.host.amplifier import Amplifier
-from drivers.host.timing import HEARTBEAT, loss_detection_time
+from drivers.playing.contents import Layer, Tone
+from drivers.protocol.timing import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig
+from registry import clock
+from registry.garbage_collection import no_long_collections
 from rig_on_wire import WIRES, HostedRig, rig_on_wire
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import in_virtual_time
 

@@ -15,12 +15,12 @@ from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.sources.contacts import Contact, ContactKey
-from controller.sources.touch import open_source
-from controller.sources.tuio import TuioSource
+from controller.touch.contacts import Contact, ContactKey
+from controller.touch.frames import open_source
+from controller.touch.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
-from drivers.wires.serial_line import SerialAddress
+from drivers.wires.serial_line.address import SerialAddress
 from model.errors import InputError
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text

@@ -57,7 +57,7 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
         recordings
         | {"model/data/paper_plate.yaml"}
         | {
-            f"sim/soft_amp/{path.relative_to(ROOT).as_posix()}"
+            f"sim/desk/soft_amp/{path.relative_to(ROOT).as_posix()}"
             for folder in ("core", "wire", "ports/sound")
             for path in (ROOT / "firmware" / folder).iterdir()
         }
@@ -125,14 +125,14 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     assert platform in set(platform_tags())
     with zipfile.ZipFile(ours) as archive, zipfile.ZipFile(wheel) as plain:
         assert set(archive.namelist()) - set(plain.namelist()) == {
-            "sim/soft_amp/engine.so",
+            "sim/desk/soft_amp/engine.so",
             *(f"model/compiled/{version.file}" for version in versions()),
         }
         archive.extractall(tmp_path / "installed")
     done = subprocess.run(
         [
             *(sys.executable, "-c"),
-            "from sim.soft_amp.library import library as found; print(found()._name)",
+            "from sim.desk.soft_amp.library import library as found; print(found()._name)",
         ],
         env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "", "CC": "no-such-compiler"},
         cwd=tmp_path,

@@ -21,8 +21,8 @@ from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import ONSET_RAMP
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
+from sim.plant.excited_plate import play
 from sim.plant.imperfections import draw_imperfections
-from sim.plant.playback import play
 
 LEVEL_TOLERANCE_DB = 0.5
 DURATION = 1.5  # s; the slowest mode has settled then

@@ -6,8 +6,8 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import Float32Array
-from sim.libjack import JackClient
-from sim.measuring.sound_card import SoundCard, activate
+from sim.desk.libjack import JackClient
+from sim.desk.measuring.sound_card import SoundCard, activate
 
 AUDIBLE = 1e-6
 _START = 20.0  # s

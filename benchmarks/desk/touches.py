@@ -15,7 +15,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
-from sim.measuring.sound_card import open_card
+from sim.desk.measuring.sound_card import open_card
 
 _START = 180.0  # s; on a busy machine
 _REPEAT = 0.05  # s; a contact that is not confirmed is lifted

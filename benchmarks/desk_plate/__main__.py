@@ -68,7 +68,7 @@ def desk_plate(
     from benchmarks.desk_plate.sensing import Converters
     from benchmarks.desk_plate.truth import MESH, draw_truth
     from model.rig.file import load_rig
-    from sim.libjack import JackClient
+    from sim.desk.libjack import JackClient
     from sim.sensors.sensor_file import read_sensors
 
     rig = load_rig(rig_file)

@@ -18,18 +18,18 @@ from typing import Any
 
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.loop.loop import Controller
-from controller.loop.observer import Observer
-from controller.sources.touch import Touch, TouchFrame
-from drivers import clock
+from controller.play.loop import Controller
+from controller.play.observer import Observer
+from controller.touch.frames import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
+from drivers.wires.serial_line.host import SerialWire
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table_cache import cached_table
 from model.table.timing import Timing
+from registry import clock
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.codec.serial_line.frame import Frame, FrameReader, frame_length, unpack_words
 from drivers.protocol.sets import Assembly, unpack_layers
 from drivers.protocol.table import MAX_WORDS, MESSAGES, read_request
+from drivers.wires.serial_line.frames import Frame, FrameReader, frame_length, unpack_words
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -16,11 +16,11 @@ from collections.abc import Iterator
 
 from pythonosc.osc_packet import OscPacket
 
-from drivers.codec.serial_line.frame import Frame, encode_frame, pack_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
-from drivers.wires.serial_line import SerialAddress
+from drivers.wires.serial_line.address import SerialAddress
+from drivers.wires.serial_line.frames import Frame, encode_frame, pack_words
 
 SETS, CHANNELS = 100, 4
 SESSION = 1

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.playback import Voice
+from drivers.playing.playback import Voice
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig

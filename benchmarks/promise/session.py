@@ -21,13 +21,13 @@ import numpy as np
 from benchmarks.promise.cases import CASES, CHANGES, JOINS, LEAVES, LEVEL_DB_SL, MOVES, Case, Point
 from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
-from controller.loop.content import Prediction
-from controller.loop.intent import HapticIntent, Target
-from controller.loop.observer import Applied
-from drivers import clock
+from controller.play.content import Prediction
+from controller.play.intent import HapticIntent, Target
+from controller.play.observer import Applied
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.table.timing import Timing
-from sim.far_ends.wires import Wire
+from registry import clock
+from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the chain

@@ -22,7 +22,7 @@ from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.place import credentials_of
-from controller.api.rate_limit import Rates
+from controller.process.rate_limit import Rates
 
 MAX_CONNECTIONS = 32  # for all methods
 RESERVE = 8  # further ones, for the methods in reserve alone

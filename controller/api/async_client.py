@@ -39,7 +39,7 @@ from controller.api.methods import (
 )
 from controller.api.place import find_socket
 from controller.api.schema import Empty, Message, Topic, headline
-from drivers.pauses import pauses
+from registry.pauses import pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s

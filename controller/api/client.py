@@ -17,7 +17,7 @@ from controller.api.calls import Calls
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
 from controller.api.jsonrpc import RpcError
 from controller.api.methods import DEFAULT_LEASE, METHODS, ArmResult
-from drivers.threads import LoopThread
+from registry.threads import LoopThread
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")

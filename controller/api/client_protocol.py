@@ -17,7 +17,8 @@ from controller.api.methods import METHODS
 from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
 from model.arguments import shown
-from model.errors import InputError, first_problem
+from model.errors import InputError
+from registry.wording import first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
 

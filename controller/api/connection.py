@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, InvalidRequest, RpcError, error_line
-from controller.api.rate_limit import RateLimiter
 from controller.api.schema import Topic
+from controller.process.rate_limit import RateLimiter
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses

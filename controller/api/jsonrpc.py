@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from controller.api.schema import AmplifierSilence, Message
-from model.errors import reworded
+from registry.wording import reworded
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
 MAX_OPENINGS = 80  # [ and { of a request: a touch frame has at most 67; bounds the depth too

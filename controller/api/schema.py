@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from controller.learning.learning_status import LearningState
+from controller.api.learning_status import LearningState
 from drivers.host.reports import ReportKind
 
 API_VERSION = "1.0"

@@ -30,10 +30,10 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
-from controller.sources.contacts import CONTACT_TIMEOUT
-from drivers import clock
+from controller.touch.contacts import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
+from registry import clock
 
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
 _RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)

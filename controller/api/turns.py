@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 
 from controller.api.connection import Connection
-from controller.api.rate_limit import RateLimiter
+from controller.process.rate_limit import RateLimiter
 
 MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients of either share
 SHARE = 0.25  # of the event loop's time, for those that touch, and for the others together

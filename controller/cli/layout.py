@@ -11,7 +11,7 @@ from model.counting import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controller.effects.layout_check import CheckedEffect
+    from controller.check.layout_check import CheckedEffect
     from model.arrays import FloatArray
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check a surface layout.")
@@ -39,9 +39,9 @@ def check(
     """
     import time
 
-    from controller.effects.layout_check import check_layout
+    from controller.check.layout_check import check_layout
+    from controller.check.layout_together import check_together, close_pairs, matrix_of
     from controller.effects.layout_file import load_layout
-    from controller.effects.layout_together import check_together, close_pairs, matrix_of
     from model.commands.options import progress_bar
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
@@ -58,7 +58,7 @@ def check(
     elapsed = time.perf_counter() - started
     files = []
     if picture is not None:
-        from controller.effects.check_picture import check_figure
+        from controller.check.picture import check_figure
         from model.figures import save_figure
 
         save_figure(check_figure(layout, table, checked, together), picture)
@@ -125,7 +125,7 @@ def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
 
 
 def _span(values: list[float]) -> str:
-    from controller.effects.layout_check import summary
+    from controller.check.layout_check import summary
 
     found = summary(values)
     return f"{found['min']:.1f} to {found['max']:.1f} (median {found['median']:.1f})"

@@ -21,8 +21,8 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
-from model.errors import reworded
 from registry.plugins import failed_plugin, failure_text
+from registry.wording import reworded
 
 COMMANDS = ("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli")
 """Modules with commands, by name: packages beside this one do not import each other."""

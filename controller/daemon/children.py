@@ -19,11 +19,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from controller.child import child_command, ended
 from controller.daemon.config import DaemonConfig, load_daemon_config
-from drivers import clock
-from drivers.pauses import Backoff
+from controller.process.child import child_command, ended
 from model.errors import InputError
+from registry import clock
+from registry.pauses import Backoff
 
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
-from controller.daemon.socket_lock import check_socket_path
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
-from controller.sources.touch import (
+from controller.process.socket_lock import check_socket_path
+from controller.touch.frames import (
     TouchCalibration,
     TouchSource,
     fitted,

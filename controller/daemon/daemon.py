@@ -9,30 +9,30 @@ from functools import partial
 
 from controller.api.schema import headline
 from controller.api.server import ApiServer
-from controller.daemon.api_service import ApiService
-from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway, read_in_child
 from controller.daemon.config import DaemonConfig, changed_keys, reload_problem
-from controller.daemon.dumps import FaultDumps
-from controller.daemon.log import LogThread
+from controller.daemon.inputs import TouchInputs
+from controller.daemon.messages import amplifier_statuses
+from controller.daemon.methods import ApiService
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
-from controller.daemon.states import ENERGISED, DaemonState, Operation
-from controller.daemon.supervisor import Supervisor
-from controller.daemon.touch_inputs import TouchInputs
 from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
-from controller.loop.loop import Controller
-from controller.loop.observer import Observer
-from drivers import clock
-from drivers.garbage_collection import no_long_collections, without_collections
+from controller.operation.dumps import FaultDumps
+from controller.operation.links import Supervisor
+from controller.operation.states import ENERGISED, DaemonState, Operation
+from controller.play.loop import Controller
+from controller.play.observer import Observer
+from controller.process.log import LogThread
+from controller.process.service_manager import ServiceManager
+from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
-from drivers.threads import DaemonThreads, in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
+from registry.garbage_collection import no_long_collections, without_collections
+from registry.threads import DaemonThreads, in_thread
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 

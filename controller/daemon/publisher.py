@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from controller.api.learning_status import LearningStatus
 from controller.api.schema import (
     STATE_WORDS,
     AmplifierStatus,
@@ -28,15 +29,14 @@ from controller.api.topics import (
     SilenceEvent,
     StateEvent,
 )
-from controller.daemon.api_views import PlateView, learning_summary, plate_event
-from controller.daemon.operation import LinkChange
-from controller.daemon.states import DaemonState, Operation
+from controller.daemon.messages import PlateView, learning_summary, plate_event
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.learning.learning_status import LearningStatus
-from controller.loop.observer import Applied, Observer, Silenced
-from controller.sources.contacts import Change, Contact, ContactKey
-from drivers import clock
+from controller.operation.operator import LinkChange
+from controller.operation.states import DaemonState, Operation
+from controller.play.observer import Applied, Observer, Silenced
+from controller.touch.contacts import Change, Contact, ContactKey
+from registry import clock
 
 _MAX_MESSAGE = 1000  # characters
 

@@ -14,12 +14,11 @@ from controller.api.admission import MIN_DESCRIPTORS, allow_many_descriptors
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.config_sections import loopback_address
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread, open_log_file, start_log
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
 from controller.gateway.settings import require_gateway
+from controller.process.log import LogThread, open_log_file, start_log
+from controller.process.service_manager import ServiceManager
+from controller.process.socket_lock import SocketLock
 from drivers.errors import DriverError
-from drivers.threads import leave_work
 from drivers.trace import tracing
 from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
@@ -28,6 +27,7 @@ from model.errors import InputError
 from model.table.file import load_table
 from model.table.table import LocalizationTable
 from model.table.table_cache import cached_table
+from registry.threads import leave_work
 
 _IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 _MIN_ADDRESS_SPACE = 512  # MB; with less, libraries that it needs wait for memory for ever

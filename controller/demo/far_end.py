@@ -18,11 +18,11 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.child import ended
 from controller.demo.touch_row import FingerVibration, Position
+from controller.process.child import ended
 from drivers.errors import LinkError
-from model.errors import first_problem
 from model.finger.perception import DEFAULT_THRESHOLD
+from registry.wording import first_problem
 
 WATCHDOG = 2.0
 """Watchdog [s] of simulated amplifiers, the longest of the protocol: their machine may be busy."""

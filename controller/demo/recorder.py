@@ -17,12 +17,12 @@ from controller.demo.touch_row import (
     peak_contrast_db,
     steady_contrast_db,
 )
-from controller.loop.content import HELD_BACK, Prediction
-from controller.loop.observer import Applied, Observer, Silenced
-from controller.loop.playing import PlayedContent
-from controller.sources.contacts import Change, Contact, ContactKey
-from drivers import clock
+from controller.play.content import HELD_BACK, Prediction
+from controller.play.observer import Applied, Observer, Silenced
+from controller.play.playing import PlayedContent
+from controller.touch.contacts import Change, Contact, ContactKey
 from model.transients.measures import ONSET_WINDOW
+from registry import clock
 
 STEADY_WINDOW = 0.25
 """Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.

@@ -15,21 +15,21 @@ from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread, start_log
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
-from controller.daemon.states import DaemonState
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
 from controller.effects.layout import BUZZ
-from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
-from drivers import clock
+from controller.operation.states import DaemonState
+from controller.process.log import LogThread, start_log
+from controller.process.service_manager import ServiceManager
+from controller.process.socket_lock import SocketLock
+from controller.touch.capture import RecordedDatagram, read_capture, replay_capture
 from drivers.errors import LinkError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+from registry import clock
 
 MIN_ERAS_FOR_THREE = 8
 """Number of ERAs from which three people have contents of their own, else two."""

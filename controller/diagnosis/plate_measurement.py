@@ -14,12 +14,11 @@ from controller.diagnosis.plate_sensors import (
     start_together,
 )
 from controller.diagnosis.tone_player import TonePlayer
-from controller.loop.plate_set import Drive
-from drivers import clock
+from controller.play.routing import Drive
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.sensors import Reading, measure_tones
-from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines
+from drivers.protocol.timing import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.choice import best_first, best_of
@@ -27,6 +26,7 @@ from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
+from registry import clock
 
 LEVEL = 0.1
 """Usual level of every tone, 20 dB below full stroke."""

@@ -7,8 +7,8 @@ confirm.
 import math
 from collections.abc import Callable, Mapping
 
-from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
-from controller.loop.plate_set import Drive, route, tones_by_era
+from controller.play.capabilities import PlaybackCapabilities, playback_capabilities
+from controller.play.routing import Drive, route, tones_by_era
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group

@@ -4,7 +4,7 @@ from typing import Annotated, Self, TypeAlias
 
 from pydantic import Strict, model_validator
 
-from controller.loop.intent import band_of_table
+from controller.play.intent import band_of_table
 from model.arrays import FloatArray
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY

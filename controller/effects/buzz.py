@@ -10,8 +10,8 @@ from controller.effects.effect import (
     Modulation,
     SteadyRun,
 )
-from controller.loop.intent import Pulse
-from controller.sources.contacts import Contact
+from controller.play.intent import Pulse
+from controller.touch.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
 

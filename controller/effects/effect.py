@@ -10,8 +10,8 @@ from pydantic import BeforeValidator
 
 from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
-from controller.loop.intent import Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.play.intent import Pulse, Target
+from controller.touch.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.errors import InputError

@@ -13,8 +13,8 @@ from controller.effects.effect import (
     NoSensation,
     Sensation,
 )
-from controller.loop.intent import Pulse
-from controller.sources.contacts import Contact
+from controller.play.intent import Pulse
+from controller.touch.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, TIME
 from model.finger.perception import STRONG_DB_SL

@@ -31,7 +31,6 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.methods import METHODS, SILENCING, Method
-from controller.api.rate_limit import RateLimiter, Rates
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
@@ -40,6 +39,7 @@ from controller.gateway.connections import CLIENT_TIMEOUT, connection_of
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
+from controller.process.rate_limit import RateLimiter, Rates
 
 HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
 """Methods available over HTTP: notifications need a WebSocket."""

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from controller.api.rate_limit import RateLimiter
+from controller.process.rate_limit import RateLimiter
 
 MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
 MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed

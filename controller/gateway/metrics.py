@@ -13,6 +13,7 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
+from controller.api.learning_status import LearningState
 from controller.api.methods import StatusResult
 from controller.api.schema import (
     AmplifierStatus,
@@ -20,7 +21,6 @@ from controller.api.schema import (
     LatencySummary,
     LearningSummary,
 )
-from controller.learning.learning_status import LearningState
 from drivers.host.reports import ReportKind
 
 _LINK_COUNTS = {

@@ -17,8 +17,8 @@ from controller.api.admission import allow_many_descriptors
 from controller.gateway.app import Gateway
 from controller.gateway.connections import CLIENT_TIMEOUT, Acceptor
 from controller.gateway.settings import Settings
-from drivers.garbage_collection import no_long_collections
 from model.errors import InputError
+from registry.garbage_collection import no_long_collections
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64

@@ -7,7 +7,7 @@ endings, whose shapes are taken over from the answers before until then.
 import asyncio
 
 from controller.learning.messages import Answers
-from controller.loop.loop import Controller
+from controller.play.loop import Controller
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing

@@ -11,11 +11,11 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from controller.child import child_command, ended
 from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
-from drivers import clock
-from drivers.pauses import Backoff
+from controller.process.child import child_command, ended
 from model.identification.settled import SettledPattern
+from registry import clock
+from registry.pauses import Backoff
 from registry.plugins import failure_text
 
 MAX_WAITING = 16

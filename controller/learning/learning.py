@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from controller.api.learning_status import BAD, LearningState, LearningStatus
 from controller.diagnosis.plate_sensors import PlateSensor, check_common_start, plate_sensors
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator_process import (
@@ -20,18 +21,17 @@ from controller.learning.estimator_process import (
     EstimatorProcess,
     EstimatorTimeouts,
 )
-from controller.learning.learning_status import BAD, LearningState, LearningStatus
 from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
 from controller.learning.settled_readings import SettledReadings
-from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer
-from controller.sources.contacts import Change, Contact
-from drivers import clock
+from controller.play.loop import Controller
+from controller.play.observer import Applied, Observer
+from controller.touch.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
 from registry.plugins import failure_text
 
 ROBUST_AFTER = 60.0

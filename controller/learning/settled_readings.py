@@ -15,15 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from controller.diagnosis.plate_sensors import PlateSensor
-from controller.loop.observer import Applied
-from controller.sources.contacts import Contact
-from drivers import clock
+from controller.play.observer import Applied
+from controller.touch.contacts import Contact
 from drivers.errors import DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.sensors import Reading, finish_reading, start_reading
 from model.identification.forward import RestingFinger
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
+from registry import clock
 
 WINDOW = 0.2  # s; of a reading, as in an identification
 READINGS = 4  # of one pattern, at most, where others are disturbed

@@ -25,15 +25,15 @@ from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from controller.daemon.config import file_of, is_daemon_document
 from controller.daemon.config_sections import DaemonSection
-from controller.daemon.dumps import DUMP_PATTERN
 from controller.effects.layout_file import LayoutSection
+from controller.operation.dumps import DUMP_PATTERN
 from drivers.errors import LinkError
 from drivers.protocol.records import Record, Rows
 from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.config.document import read_document
 from model.errors import InputError
-from model.files.regular_file import regular_file
 from model.rig.sections import RigSection
+from registry.regular_file import regular_file
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5

@@ -6,9 +6,9 @@ Frames are words: what a word means depends on the message. ASCII only, as DBC r
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.codec.can_bus.canopen import CANOPEN, cob_id
-from drivers.codec.can_bus.segments import REPLY, REQUEST, frames_of
 from drivers.protocol.table import EVENT, FAULTS, HELLO, MAX_WORDS, MESSAGES, NAK, STATES
+from drivers.wires.can_bus.canopen import CANOPEN, cob_id
+from drivers.wires.can_bus.frames import REPLY, REQUEST, frames_of
 
 _HOST, _AMPLIFIER = "Host", "Amplifier"
 _TYPES = {"Hello": HELLO, **{name: each.number for name, each in MESSAGES.items()}}

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.protocol.table import MESSAGES
+from drivers.wires.can_bus.canopen import CANOPEN, cob_id
 from word_names import word_names
 
 _TYPES = {"u8": 0x5, "u16": 0x6, "u32": 0x7, "text": 0x9}

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
-from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.table import (
     COMMAND,
@@ -33,6 +32,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     sensor_reading,
 )
+from drivers.wires.can_bus.canopen import CANOPEN
 from page_part import insert
 from sim.amplifier.state_table import TRANSITIONS
 from word_names import word_names

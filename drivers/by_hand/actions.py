@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from drivers import clock
 from drivers.by_hand.reaching import (
     capability_rows,
     fault_rows,
@@ -19,13 +18,12 @@ from drivers.by_hand.reaching import (
     status_rows,
     wire_rows,
 )
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.stop import Stopped
-from drivers.host.timing import BOOT_TIME, STOP_RAMP, check_watchdog
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import (
     COMMAND,
@@ -36,7 +34,9 @@ from drivers.protocol.table import (
     has_feature,
     name_of,
 )
+from drivers.protocol.timing import BOOT_TIME, STOP_RAMP, check_watchdog
 from drivers.urls import with_address
+from registry import clock
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s

@@ -22,18 +22,18 @@ from drivers.by_hand.reaching import (
     reached,
     status_rows,
 )
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.host.stop import Stopped
-from drivers.host.timing import HEARTBEAT
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED
-from drivers.threads import LoopThread
+from drivers.protocol.timing import HEARTBEAT
 from registry.limits import GuardLimits
+from registry.threads import LoopThread
 
 _RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
 

@@ -13,7 +13,7 @@ import typer
 from drivers.errors import CommandError, CommandRefused, DriverError, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.conformance import CheckResult
+    from drivers.judge.asking import CheckResult
 
 _T = TypeVar("_T")
 
@@ -219,7 +219,7 @@ def conformance(
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
-    from drivers.conformance import LEVEL, judge
+    from drivers.judge.asking import LEVEL, judge
 
     level = LEVEL if level is None else level
     show = (lambda result: None) if json_ else _show_result

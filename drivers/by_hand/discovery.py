@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from drivers.by_hand.places import Candidate, candidates, with_slcan
 from drivers.by_hand.reaching import identified
-from drivers.discovery.places import Candidate, candidates, with_slcan
 from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.protocol.records import Values
 

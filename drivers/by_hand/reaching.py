@@ -10,11 +10,9 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
-from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.reports import REPORTS, reports_of
-from drivers.host.timing import shortest_watchdog
 from drivers.opening import Lines
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.protocol.table import (
@@ -27,6 +25,8 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     name_of,
 )
+from drivers.protocol.timing import shortest_watchdog
+from registry import clock
 from registry.limits import GuardLimits
 
 _ENDS: Mapping[str, str] = {

@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.host.timing import (
+from drivers.protocol.table import QUANTITIES
+from drivers.protocol.timing import (
     MAX_LOSS_DETECTION_TIME,
     TAKEN_WORDS,
     check_watchdog,
     loss_detection_time,
 )
-from drivers.host.wire import request_words
-from drivers.protocol.table import QUANTITIES
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
+from drivers.wires.wire import request_words
 from registry.limits import GuardLimits
 
 COMMIT_SKEW = 0.001

@@ -6,15 +6,14 @@ from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
 
-from drivers import clock
+from drivers.counters import LinkStatistics
 from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
-from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.stop import UNREACHED, Stop, Stopped, what_may_play
-from drivers.host.timing import REPLY_TIMEOUT, STOP_RAMP
+from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
@@ -26,7 +25,8 @@ from drivers.protocol.table import (
     has_feature,
     name_of,
 )
-from drivers.statistics import LinkStatistics
+from drivers.protocol.timing import REPLY_TIMEOUT, STOP_RAMP
+from registry import clock
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms

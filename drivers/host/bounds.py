@@ -1,7 +1,7 @@
 """What a set may lead to at the worst: level, power and rise of a channel over all its layers.
 
 A set plays from an unknown moment in the next tenth of a second: the voices are those of
-`drivers.voices` after a commit that is that uncertain. Along a straight line in the complex plane a
+`drivers.playing.voices` after a commit that is that uncertain. Along a straight line in the complex plane a
 magnitude is a convex function of the way, so that sums are largest where each transition is at one
 of its points.
 """
@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from itertools import chain, pairwise, product, zip_longest
 from typing import NamedTuple
 
-from drivers.playback import Playback
+from drivers.playing.playback import Playback
+from drivers.playing.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
 
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 _SILENCE: Sequence[complex] = (0j,)

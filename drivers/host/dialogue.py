@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from drivers.contents import Layer
+from drivers.counters import LinkStatistics
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -26,8 +26,7 @@ from drivers.host.reports import (
     armed_problem,
     reports_of,
 )
-from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
-from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
 from drivers.protocol.table import (
@@ -39,7 +38,8 @@ from drivers.protocol.table import (
     STATES,
     name_of,
 )
-from drivers.statistics import LinkStatistics
+from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
+from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
 if TYPE_CHECKING:
     import asyncio

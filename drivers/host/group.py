@@ -8,8 +8,6 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
-from drivers import clock
-from drivers.contents import Layer
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -25,10 +23,12 @@ from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
 from drivers.host.members import GroupState, Members, is_lost
 from drivers.host.stop import Stopped, what_may_play
-from drivers.host.timing import HEARTBEAT, STOP_RAMP, check_watchdog
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED, QUANTITIES
+from drivers.protocol.timing import HEARTBEAT, STOP_RAMP, check_watchdog
+from registry import clock
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")

@@ -13,8 +13,8 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple, final
 
 from drivers.errors import CommandRefused, Preempted
-from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
+from drivers.protocol.timing import ATTEMPTS
 
 if TYPE_CHECKING:
     from drivers.host.dialogue import Dialogue

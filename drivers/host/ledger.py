@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.bounds import Bounds
 from drivers.host.limits import (
@@ -24,7 +23,8 @@ from drivers.host.limits import (
     refused,
     wire_limits,
 )
-from drivers.playback import Playback
+from drivers.playing.contents import Layer
+from drivers.playing.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
 from drivers.protocol.table import QUANTITIES, has_feature

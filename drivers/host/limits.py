@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from operator import index
 from typing import TypeAlias
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import KNOT, QUANTITIES

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
-from drivers.hardware import OpenPort
 from drivers.host.jobs import Job, JobQueue, JointStart, Priority
-from drivers.host.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
-from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
+from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import BROADCAST
+from drivers.protocol.timing import ATTEMPTS, HEARTBEAT, REPLY_TIMEOUT
 from drivers.trace import Direction
+from drivers.wires.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 
 if TYPE_CHECKING:
     from drivers.host.dialogue import Dialogue

@@ -13,8 +13,6 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any, TypeVar
 
-from drivers import clock
-from drivers.contents import Layer
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -29,10 +27,12 @@ from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.stop import Stopped
-from drivers.host.timing import STOP_RAMP
+from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, STATES, name_of
+from drivers.protocol.timing import STOP_RAMP
+from registry import clock
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""

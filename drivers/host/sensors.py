@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from drivers import clock
 from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
@@ -24,6 +23,7 @@ from drivers.protocol.table import (
     name_of,
     sensor_reading,
 )
+from registry import clock
 
 _MARGIN = 0.002  # s; of the amplifier's clock
 _MAX_OVERDUE = 2.0  # s; after the end of the window: an emulator stands still meanwhile

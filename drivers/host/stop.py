@@ -9,12 +9,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from drivers import clock
 from drivers.host.jobs import Priority
-from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import ENABLED, LATCHED, QUANTITIES
+from drivers.protocol.timing import ATTEMPTS
+from registry import clock
 
 if TYPE_CHECKING:
     from drivers.host.amplifier import Amplifier

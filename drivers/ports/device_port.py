@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from drivers.errors import LinkError
-from drivers.threads import close_in_thread
+from registry.threads import close_in_thread
 
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
 """Of a device that is gone; TypeError: of pyserial, closed during a read."""

@@ -16,11 +16,11 @@ from typing import final
 import serial
 
 from drivers.errors import LinkError, system_message
-from drivers.hardware import PORT_OPENER, Port
 from drivers.ports.device_port import DevicePort
+from drivers.ports.port import PORT_OPENER, Port
 from drivers.ports.tcp import open_connection
-from drivers.threads import in_thread
 from drivers.urls import Place
+from registry.threads import in_thread
 
 _READ_MAX = 4096
 _OPENING_FAILURES = (OSError, ValueError, termios.error)  # of pyserial

@@ -9,9 +9,9 @@ from functools import partial
 from typing import cast
 
 from drivers.errors import LinkError, LinkTimeout, system_message
-from drivers.hardware import Port
-from drivers.host.wire import NETWORK_DELAY
-from drivers.threads import in_thread
+from drivers.ports.port import Port
+from drivers.wires.wire import NETWORK_DELAY
+from registry.threads import in_thread
 
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
 _NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for

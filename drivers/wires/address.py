@@ -4,8 +4,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
 from drivers.errors import LinkError
-from drivers.hardware import Port
-from drivers.host.wire import Wire
+from drivers.ports.port import Port
+from drivers.wires.wire import Wire
 
 
 class WireAddress(ABC):

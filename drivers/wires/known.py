@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from drivers.errors import CommandError
 from drivers.wires.address import WireAddress
-from drivers.wires.can_bus import PythonCanAddress, SlcanAddress, SocketcandAddress
-from drivers.wires.modbus import ModbusAddress
-from drivers.wires.serial_line import SerialAddress
+from drivers.wires.can_bus.address import PythonCanAddress, SlcanAddress, SocketcandAddress
+from drivers.wires.modbus.address import ModbusAddress
+from drivers.wires.serial_line.address import SerialAddress
 from registry.plugins import PluginRegistry
 
 _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(

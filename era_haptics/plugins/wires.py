@@ -4,15 +4,15 @@ A wire has an address made of a URL, a port of bytes, and one of the three proto
 `CanWire` takes and gives frames as `pack_frames` and `unpack_frames` have them.
 """
 
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import CommandError, LinkError
-from drivers.hardware import Port
-from drivers.host.can_wire import CanWire
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import Wire
+from drivers.ports.port import Port
 from drivers.wires.address import WireAddress
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import Wire
 
 __all__ = [
     "CanFrame",

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.playback import Voice
+from drivers.playing.playback import Voice
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FEATURES, QUANTITIES, STATUS_FLAGS
 from sim.amplifier.contract import Amplifier

@@ -211,9 +211,9 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
 
     defaults: of keys that lines leave out.
     """
-    from model.files.regular_file import regular_file
     from model.table.file import load_table
     from model.table.query import query_batch
+    from registry.regular_file import regular_file
 
     table = load_table(table_file)
     has_failed = False

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from model.errors import InputError
-from model.files.regular_file import regular_file
+from registry.regular_file import regular_file
 
 MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50

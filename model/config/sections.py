@@ -13,8 +13,8 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 from model.config.document import MAX_PROBLEMS, ConfigError, Document, KeyPath, Problem, Value
 from model.config.units import Dimension, quantity, shown
 from model.counting import counted
-from model.errors import reworded
 from registry.suggestions import did_you_mean
+from registry.wording import reworded
 
 
 class Section(BaseModel):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arguments import shown
-from model.files.regular_file import regular_file
+from registry.regular_file import regular_file
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 

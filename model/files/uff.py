@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.files.regular_file import regular_file
+from registry.regular_file import regular_file
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types

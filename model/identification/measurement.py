@@ -160,7 +160,7 @@ class DeviceSettings:
     seed: int
 
 
-_MEASURER = "sim.measuring.plate_measurement:measure_plate"
+_MEASURER = "sim.desk.measuring.plate_measurement:measure_plate"
 """By name: this package does not import the one beside it."""
 
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.arguments import expect, expect_path, shown
 from model.drive_modes import DRIVE_MODES
-from model.errors import InputError, first_problem
+from model.errors import InputError
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.files.replacing import begins_with
 from model.finger.grid import Grid
@@ -28,6 +28,7 @@ from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Plate
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
+from registry.wording import first_problem
 
 FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"

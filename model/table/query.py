@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.arrays import nullable
 from model.drive_modes import UNRESTRICTED
-from model.errors import InputError, first_problem
+from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.table.answer import answer
 from model.table.concentration import with_concentration
@@ -21,6 +21,7 @@ from model.table.request import APART_HZ, Finger, Request
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.base_motion import Envelopes
+from registry.wording import first_problem
 
 _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 

@@ -43,7 +43,7 @@ class TableCheck(Protocol):
         """Raises InputError, LinkError."""
 
 
-_CHECK = "sim.measuring.table_check:check_table"
+_CHECK = "sim.desk.measuring.table_check:check_table"
 """By name: this package does not import the one beside it."""
 
 

@@ -2,7 +2,7 @@
 
 Requests and replies are the values of their records (`drivers.protocol.table`), integers of the
 wire. Events happen at their own time: a watchdog that expired between two calls expired when it was
-due, and what plays is a description in time (`drivers.playback`), not samples.
+due, and what plays is a description in time (`drivers.playing.playback`), not samples.
 
 Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
 where the sum of layers is limited.
@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from drivers.playback import Voice, playback_of
+from drivers.playing.playback import Voice, playback_of
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import (

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from drivers.playback import Playback
+from drivers.playing.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, FEATURES, NO_CHANNEL, QUANTITIES
 

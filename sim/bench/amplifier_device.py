@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
-from drivers import clock
 from drivers.protocol.records import Refusal, Values
+from registry import clock
 from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults.fault_window import Faults, FaultWindow

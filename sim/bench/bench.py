@@ -15,8 +15,7 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from drivers import clock
-from drivers.playback import Voice
+from drivers.playing.playback import Voice
 from drivers.protocol.records import Values
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
@@ -25,6 +24,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad, PointLoad, check_loads, footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
+from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.bench.sensing import REACH, Sensing, ToneReader
 from sim.plant.accelerometer import Accelerometer

@@ -4,7 +4,8 @@ from typing import Annotated, Any, Self, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from model.errors import InputError, first_problem
+from model.errors import InputError
+from registry.wording import first_problem
 
 Request: TypeAlias = dict[str, Any]
 

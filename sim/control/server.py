@@ -13,8 +13,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from drivers import clock
 from drivers.errors import LinkError
+from registry import clock
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 

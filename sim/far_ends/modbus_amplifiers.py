@@ -9,7 +9,9 @@ import math
 import struct
 from collections.abc import Mapping, Sequence
 
-from drivers.codec.modbus.adu import (
+from drivers.protocol.records import Refusal
+from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
+from drivers.wires.modbus.frames import (
     EXCEPTION,
     READS,
     RTU_MAX,
@@ -20,7 +22,7 @@ from drivers.codec.modbus.adu import (
     request_size,
     split_tcp,
 )
-from drivers.codec.modbus.registers import (
+from drivers.wires.modbus.registers import (
     AREA,
     BOX,
     IDENTITY,
@@ -28,8 +30,6 @@ from drivers.codec.modbus.registers import (
     REPLY,
     pack_identity,
 )
-from drivers.protocol.records import Refusal
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 FRAME_TIMEOUT = 0.02

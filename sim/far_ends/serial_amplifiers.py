@@ -6,16 +6,6 @@ On a shared line amplifiers have one address each, and send no events.
 from collections.abc import Mapping
 from contextlib import suppress
 
-from drivers.codec.serial_line.frame import (
-    NEUTRAL,
-    REPLY,
-    Frame,
-    FrameReader,
-    encode_frame,
-    pack_identity,
-    pack_words,
-    unpack_words,
-)
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
@@ -27,6 +17,16 @@ from drivers.protocol.table import (
     VERSION,
     nak_of,
     read_request,
+)
+from drivers.wires.serial_line.frames import (
+    NEUTRAL,
+    REPLY,
+    Frame,
+    FrameReader,
+    encode_frame,
+    pack_identity,
+    pack_words,
+    unpack_words,
 )
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 

@@ -22,7 +22,8 @@ from pydantic import ValidationError
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import RATIO, TIME
-from model.errors import InputError, first_problem
+from model.errors import InputError
+from registry.wording import first_problem
 
 FaultKind: TypeAlias = Literal[
     # of frames

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.playback import Voice
+from drivers.playing.playback import Voice
 from model.transients.base_motion import Term, along_lines, raised_cosine
 
 

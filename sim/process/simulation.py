@@ -11,16 +11,16 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from drivers import clock
-from drivers.garbage_collection import no_long_collections
 from model.rig.rig import Rig
+from registry import clock
+from registry.garbage_collection import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
-from sim.far_ends.wires import Wire, open_wires
+from sim.far_ends.opening import Wire, open_wires
 from sim.faults.fault_window import FaultFile
-from sim.firmware.bench import FirmwareBench, running
+from sim.firmware.processes import FirmwareBench, running
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections

@@ -15,7 +15,6 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.files.regular_file import regular_file
 from model.files.replacing import begins_with
 from model.files.uff import (
     ACCELERATION,
@@ -25,6 +24,7 @@ from model.files.uff import (
     Universal,
     write_universal,
 )
+from registry.regular_file import regular_file
 from sim.plant.fingers import fit_tones
 
 

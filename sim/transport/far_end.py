@@ -7,8 +7,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Self, TypeAlias, cast
 
-from drivers import clock
 from drivers.errors import LinkError
+from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import Faults

@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 
-from drivers import clock
+from registry import clock
 from sim.faults.fault_window import Faults, Toward
 
 _PIECE = 0.01  # s; of the wire's time, of what arrives at once

@@ -6,18 +6,18 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from controller.api.learning_status import LearningStatus
 from controller.api.schema import TouchInputStatus, headline
 from controller.api.topics import StateEvent
-from controller.daemon.api_views import learning_summary
 from controller.daemon.config_sections import (
     DaemonSection,
     DumpSection,
     LogSection,
     TouchSection,
 )
-from controller.daemon.states import DaemonState
+from controller.daemon.messages import learning_summary
 from controller.gateway.metrics import exposition
-from controller.learning.learning_status import LearningStatus
+from controller.operation.states import DaemonState
 from daemon_bench import running_daemon, until_state
 from model.config.sections import Section
 

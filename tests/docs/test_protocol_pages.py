@@ -8,15 +8,15 @@ import canopen
 import cantools
 import pytest
 
-from drivers.codec.can_bus.segments import unpack_frames
-from drivers.contents import Layer, Tone
-from drivers.host.can_wire import CanWire
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import More, Wire
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts, unpack_layers
 from drivers.protocol.table import MESSAGES, QUANTITIES
+from drivers.wires.can_bus.frames import unpack_frames
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import More, Wire
 from protocol_tables import FILES, PARTS, WRITER, written
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 import model
-from controller.sources.contacts import CONTACT_TIMEOUT
+from controller.touch.contacts import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
 from drivers.by_hand.rig_check import check_links
 from drivers.errors import CommandError
-from drivers.host.timing import BOOT_TIME
 from drivers.protocol.table import REACTION
+from drivers.protocol.timing import BOOT_TIME
 from drivers.wires.known import address_of
 from model.table.request import MIN_CONTRAST_DB
 from model.table.verify import MIN_KEPT_SHARE

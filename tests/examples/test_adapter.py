@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 import era_haptics
-from drivers import clock
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import FAULTS, STATES
 from model.arrays import FloatArray
+from registry import clock
 from registry.limits import GuardLimits
 
 RANGES = {"FREQ": (1e-6, 30e6), "VOLT": (0.002, 20.0), "VOLT:OFFS": (-10.0, 10.0)}
@@ -143,7 +143,7 @@ FULL = 5.0  # V
 PATIENCE = 60.0  # s
 HOST = """
 import asyncio, sys
-from drivers.contents import Layer, Tone
+from drivers.playing.contents import Layer, Tone
 from drivers.host.group import Group
 from drivers.opening import Lines
 from registry.limits import GuardLimits

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from drivers import opening
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError
 from drivers.host.group import Group
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -1,8 +1,8 @@
 """One conformance check of an amplifier on one wire, in virtual time.
 
 Run by the judge of planted faults only: the suite has all checks in turn in
-`tests/drivers/conformance`. Faults of a simulated amplifier are found on it; those of
-`drivers.playback`, which conformance asks what must be played, on the firmware, which does not.
+`tests/drivers/judge/asking`. Faults of a simulated amplifier are found on it; those of
+`drivers.playing.playback`, which conformance asks what must be played, on the firmware, which does not.
 """
 
 from functools import partial
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.conformance import CHECKS, Result, of_kind
+from drivers.judge.asking import CHECKS, Result, of_kind
 from firmware_programs import build_firmware
 from judged_line import KINDS, judged, plain
 from moved_firmware import FirmwareEnd

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from cobs import cobs
 
-from drivers.codec.can_bus.adapter_text import SLCAN
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import REQUEST, segments
-from drivers.codec.modbus.adu import framed
 from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import REQUEST, segments
+from drivers.wires.can_bus.text import SLCAN
+from drivers.wires.modbus.frames import framed
 from firmware_requests import RandomHost
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, request
 from mutation import damage

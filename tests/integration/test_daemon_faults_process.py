@@ -20,8 +20,8 @@ import pytest
 
 import patient_daemon
 from controller.api.async_client import AsyncClient
-from controller.loop.selection import GIVEN_UP
-from controller.sources.touch import Touch, TouchFrame
+from controller.play.selection import GIVEN_UP
+from controller.touch.frames import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon
 from daemon_process import (
     ERA,
@@ -97,7 +97,7 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
 async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
     """It has said so at both fingers by then, and one of them feels its own without an answer."""
     hangs = (
-        "import runpy, threading\nfrom controller.loop.choice import Chooser\n"
+        "import runpy, threading\nfrom controller.play.choice import Chooser\n"
         "choose = Chooser.choose\n"
         "def hang(chooser, requested, *more):\n"
         "    requested.takes_long and threading.Event().wait()\n"
@@ -131,7 +131,7 @@ async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
 async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None:
     """Its amplifiers are open by then; clients are served meanwhile."""
     hangs = (
-        "import runpy, threading\nfrom controller.loop.decision import Decider\n"
+        "import runpy, threading\nfrom controller.play.decision import Decider\n"
         "Decider.prepare = lambda decider: threading.Event().wait()\n"
         f"runpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
     )

@@ -18,21 +18,21 @@ import model
 from chain import Chain
 from controller.diagnosis.tone_player import TonePlayer
 from daemon_bench import READY, daemon_at, far_end, until_state
-from drivers import clock
 from drivers.by_hand import actions
-from drivers.conformance.opening import opened
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.members import GroupState
+from drivers.judge.asking.opening import opened
 from drivers.opening import Lines
 from long_form import in_turn, shortly
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
+from registry import clock
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from set_table import SetTable, make_rig
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 

@@ -21,11 +21,11 @@ from controller.demo.touch_row import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from daemon_bench import daemon_at, far_end, ready
-from drivers import clock
 from model.identification.learned_file import load_learned
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
+from registry import clock
 from rig_on_wire import FarSide
 from virtual_loop import VirtualLoop
 

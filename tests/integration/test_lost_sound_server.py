@@ -1,6 +1,6 @@
 """A sound server that is killed while the daemon plays through a software amplifier.
 
-Its short form has no daemon: tests/sim/soft_amp/test_soft_amp_sound.py.
+Its short form has no daemon: tests/sim/desk/soft_amp/test_soft_amp_sound.py.
 """
 
 import asyncio

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS
+from drivers.wires.serial_line.host import SerialWire
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from registry import clock
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import LIMITS, layer, make_bench
 from sim.bench.amplifier_device import AmplifierDevice

@@ -17,8 +17,11 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.by_hand.reaching import random_session
-from drivers.contents import Layer, Tone
+from drivers.judge.watching.capture import read_capture
+from drivers.judge.watching.config import parse_config
+from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import STATES
 from model.errors import InputError
 from model.rig.file import example_rig_path
@@ -26,10 +29,7 @@ from model.rig.rig import Rig
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from sim.cli import app
-from sim.far_ends.wires import Wire
-from sim.witness.capture import read_capture
-from sim.witness.config import parse_config
-from sim.witness.witness import Witness
+from sim.far_ends.opening import Wire
 from sim.witness_relay import parse_endpoint, relays
 from virtual_loop import in_virtual_time
 from witness_config import witness_config

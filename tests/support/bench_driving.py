@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 
-from drivers.contents import Tone
+from drivers.playing.contents import Tone
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import QUANTITIES
 from sim.bench.bench import Bench

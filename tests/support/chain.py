@@ -12,10 +12,10 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, Self, cast
 
-from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer, Silenced
-from controller.sources.touch import Touch, TouchFrame
-from drivers import clock
+from controller.play.loop import Controller
+from controller.play.observer import Applied, Observer, Silenced
+from controller.touch.frames import Touch, TouchFrame
+from drivers.judge.watching.witness import OperatorCommand
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
@@ -23,13 +23,13 @@ from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from plate_judge import STEP, WATCHDOG, PlateJudge
+from registry import clock
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.contract import Amplifier
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections
-from sim.witness.witness import OperatorCommand
 from sim.witness_relay import parse_endpoint
 from witness_config import LoopWitness
 

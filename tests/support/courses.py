@@ -17,11 +17,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from chain import Chain
-from drivers import clock, errors
+from drivers import errors
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
 from model.vibration.excitation import Tone
+from registry import clock
 from set_chain import FINGER, OTHER
 from sim.faults.fault_window import FaultKind
 from virtual_loop import run_virtual

@@ -22,15 +22,15 @@ from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
-from drivers import clock
+from controller.process.log import LogThread
+from controller.process.service_manager import ServiceManager
+from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from plate_judge import PlateJudge
+from registry import clock
 from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
 from small_table import small_table

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from model.arrays import Float32Array, FloatArray
-from sim.measuring.sound_card import SoundCard
+from sim.desk.measuring.sound_card import SoundCard
 
 BLOCK = 4800
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.contents import Layer, Tone
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 

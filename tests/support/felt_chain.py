@@ -13,23 +13,23 @@ from typing import Any
 import numpy as np
 
 from chain import Chain
-from controller.daemon.api_views import PlateView
+from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.loop.observer import Applied
-from drivers import clock
+from controller.play.observer import Applied
+from drivers.judge.watching.capture import Violation
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry import clock
 from sim.amplifier.readings import AmplifierSummary
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Felt
 from sim.plant.imperfections import draw_imperfections
 from sim.sensors.recorder import Accelerometers
 from sim.sensors.recording import Recording
-from sim.witness.capture import Violation
 from virtual_loop import run_virtual
 
 Place = tuple[float, float]

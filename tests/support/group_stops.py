@@ -27,10 +27,10 @@ from drivers.by_hand import actions
 from drivers.errors import DriverError
 from drivers.host.dialogue import SILENCING
 from drivers.host.stop import Stopped
-from drivers.host.timing import BOOT_TIME
+from drivers.protocol.timing import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow, Toward
 from virtual_loop import Stuck, VirtualLoop, run_virtual
 

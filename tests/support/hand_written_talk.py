@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import hand_written as hand
-from sim.witness.witness import Witness
+from drivers.judge.watching.witness import Witness
 
 TOOK = 0.001  # s; from a request to its reply
 HALF: dict[str, Any] = {"token": 5, "levels": (5000, 0), "tokens": (5, 0, 0, 0)}

@@ -7,9 +7,9 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
-from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
-from drivers.conformance.check import run_checks
-from drivers.conformance.opening import CLIENTS as BY_PROTOCOL
+from drivers.judge.asking import CHECKS, LEVEL, CheckResult, of_kind
+from drivers.judge.asking.check import run_checks
+from drivers.judge.asking.opening import CLIENTS as BY_PROTOCOL
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from virtual_loop import run_virtual

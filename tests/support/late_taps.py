@@ -20,14 +20,14 @@ from contextlib import suppress
 from dataclasses import replace
 
 from chain import Chain
-from controller.loop.intent import HapticIntent, Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.play.intent import HapticIntent, Pulse, Target
+from controller.touch.contacts import Contact, ContactKey
 from drivers.errors import DriverError
 from model.rig.rig import Channel
 from model.vibration.excitation import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
 

@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from drivers import clock
 from drivers.errors import LinkError
-from drivers.hardware import PORT_OPENER
+from drivers.ports.port import PORT_OPENER
+from registry import clock
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop
 

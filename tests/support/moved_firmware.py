@@ -10,19 +10,19 @@ import numpy as np
 from cobs import cobs
 
 import hand_written as hand
-from drivers import clock
-from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
-from drivers.codec.can_bus.segments import pack_frames, unpack_frames
-from drivers.codec.serial_line.frame import (
+from drivers.protocol.records import Record, Values
+from drivers.protocol.table import BY_NUMBER, EVENT, EVENT_RECORD, NAK, NAK_RECORD, VERSION
+from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.can_bus.text import SLCAN, TextReader
+from drivers.wires.serial_line.frames import (
     Frame,
     FrameReader,
     encode_frame,
     pack_words,
     unpack_words,
 )
-from drivers.protocol.records import Record, Values
-from drivers.protocol.table import BY_NUMBER, EVENT, EVENT_RECORD, NAK, NAK_RECORD, VERSION
 from model.arrays import FloatArray
+from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 

@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from chain import Chain
-from drivers import clock
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import STATES
+from registry import clock
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import VirtualLoop
 

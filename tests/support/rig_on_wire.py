@@ -7,21 +7,21 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import cast
 
-from drivers import clock
-from drivers.contents import Layer, Tone
 from drivers.errors import LinkDegraded, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.group import Group
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from memory_machine import MemoryMachine, live_in_memory
 from model.rig.rig import Channel, Rig
+from registry import clock
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import AmplifierSummary
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wires
+from sim.far_ends.opening import Wire, open_wires
 from sim.faults.fault_window import Faults
 from sim.plant.imperfections import Imperfections
 from virtual_loop import VirtualLoop
@@ -122,7 +122,7 @@ WIRES: Mapping[str, Wire] = {
     "can+socketcand": Wire("socketcand", unpluggable=True),
     "can+slcan": Wire("slcan", unpluggable=True),
 }
-"""Each is far end and host by one scheme; see `sim.far_ends.wires`."""
+"""Each is far end and host by one scheme; see `sim.far_ends.opening`."""
 
 SHARED_WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", shared=True),

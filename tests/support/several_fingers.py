@@ -16,9 +16,8 @@ from controller.effects.buzz import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.loop.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.loop.observer import Applied
-from drivers import clock
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.observer import Applied
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
@@ -27,8 +26,9 @@ from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_table import smooth_rig
+from registry import clock
 from rig_on_wire import after_each
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from virtual_loop import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
@@ -235,7 +235,7 @@ class Pressed:
         """
         with pytest.MonkeyPatch.context() as patched:
             if not self.is_shaped:
-                plain = "controller.loop.capabilities.envelope_support"
+                plain = "controller.play.capabilities.envelope_support"
                 patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
             return run_virtual(self._run(ways, held))
 

@@ -13,17 +13,17 @@ from typing import Any, TextIO
 
 from chain import Chain
 from controller.api.jsonrpc import RpcError
-from controller.daemon.states import DaemonEvent, DaemonState, Trigger
-from controller.daemon.supervisor import Supervisor
-from controller.loop.observer import Applied, Observer
-from controller.sources.touch import Touch, TouchFrame
-from drivers import clock
+from controller.operation.links import Supervisor
+from controller.operation.states import DaemonEvent, DaemonState, Trigger
+from controller.play.observer import Applied, Observer
+from controller.touch.frames import Touch, TouchFrame
 from drivers.errors import DriverError
 from model.rig.rig import Rig
 from model.table.timing import Timing
 from paper_plate import make_paper_rig
+from registry import clock
 from rig_on_wire import after_each, on_two_amplifiers
-from sim.far_ends.wires import Wire
+from sim.far_ends.opening import Wire
 from small_table import small_table
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual

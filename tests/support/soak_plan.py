@@ -52,7 +52,7 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 @dataclass(frozen=True)
 class Line:
-    """A wire: kind as `sim.far_ends.wires` has it, and speed [bit/s]."""
+    """A wire: kind as `sim.far_ends.opening` has it, and speed [bit/s]."""
 
     kind: str
     speed: int | None

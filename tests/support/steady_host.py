@@ -9,10 +9,10 @@ long as the protocol allows, since a busy machine may hold it up.
 import asyncio
 import sys
 
-from drivers.contents import Layer, Tone
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 

@@ -7,12 +7,12 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.daemon.states import DaemonEvent, DaemonState, Lease, Trigger
-from controller.daemon.supervisor import Supervisor
-from controller.loop.observer import Observer
+from controller.operation.links import Supervisor
+from controller.operation.states import DaemonEvent, DaemonState, Lease, Trigger
+from controller.play.observer import Observer
 from courses import Acted, Planted, Step
-from drivers import clock
 from drivers.errors import LinkError
+from registry import clock
 from set_chain import set_chain
 
 

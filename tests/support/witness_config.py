@@ -6,11 +6,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from typing import Any, get_args
 
-from controller.loop.loop import Controller
-from drivers import clock
+from controller.play.loop import Controller
+from drivers.judge.watching.witness import OperatorCommand, Witness
+from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.faults.fault_window import FaultWindow
-from sim.witness.witness import OperatorCommand, Witness
 from sim.witness_relay import parse_endpoint
 from virtual_loop import VirtualLoop
 

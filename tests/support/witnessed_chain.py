@@ -15,15 +15,15 @@ from typing import Any
 
 import hand_written as hand
 from chain import Chain
-from controller.sources.touch import Touch, TouchFrame
-from drivers import clock
+from controller.touch.frames import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
+from drivers.judge.watching.capture import Violation
+from drivers.judge.watching.witness import OperatorCommand
 from model.vibration.excitation import Excitation, Tone
+from registry import clock
 from registry.limits import GuardLimits
 from set_table import STROKE, SetTable, make_rig
-from sim.far_ends.wires import Wire
-from sim.witness.capture import Violation
-from sim.witness.witness import OperatorCommand
+from sim.far_ends.opening import Wire
 from virtual_loop import run_virtual
 
 SENSED_EVERY = 0.001  # s

@@ -11,8 +11,8 @@ from typing import Any
 
 import can
 
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import pack_frames, unpack_frames
 from model.rig.rig import Channel
 from registry.limits import GuardLimits
 from rig_on_wire import make_bench

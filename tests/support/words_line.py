@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
-from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
-from drivers.codec.serial_line.frame import FrameReader
-from drivers.contents import Layer, Tone
 from drivers.host.amplifier import Amplifier as Host
-from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import NETWORK_DELAY, Wire
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import BY_NUMBER, HELLO
+from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
+from drivers.wires.can_bus.frames import REQUEST, pack_frames, unpack_frames
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.frames import FrameReader
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import NETWORK_DELAY, Wire
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

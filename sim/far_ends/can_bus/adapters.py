@@ -7,9 +7,9 @@ effect; modes other than raw mode, extended identifiers, discovery by broadcast.
 
 import re
 
-from drivers import clock
-from drivers.codec.can_bus.adapter_text import SLCAN, SOCKETCAND
-from drivers.codec.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
+from registry import clock
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send
 

@@ -1,22 +1,12 @@
 """The amplifiers' side of a CAN bus, without I/O.
 
-Frames come and go packed (`drivers.codec.can_bus.segments`), those of a message together.
+Frames come and go packed (`drivers.wires.can_bus.frames`), those of a message together.
 """
 
 import struct
 from collections.abc import Mapping
 
-from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
-from drivers.codec.can_bus.segments import (
-    NODE_MAX,
-    REPLY,
-    REQUEST,
-    Assembler,
-    Message,
-    pack_frames,
-    segments,
-    unpack_frames,
-)
+from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BY_NUMBER,
@@ -31,7 +21,17 @@ from drivers.protocol.table import (
     name_of,
     read_request,
 )
-from drivers.statistics import WireCounters
+from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
+from drivers.wires.can_bus.frames import (
+    NODE_MAX,
+    REPLY,
+    REQUEST,
+    Assembler,
+    Message,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
 from sim.amplifier.contract import SILENCING_RAMP
 from sim.far_ends.can_bus.word_objects import ObjectServer
 from sim.transport.far_end import AmplifierPort, FarEnd, Send

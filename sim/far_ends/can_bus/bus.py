@@ -6,9 +6,9 @@ Not modelled: arbitration, retransmission, bus-off.
 import asyncio
 from collections.abc import Callable, Sequence
 
-from drivers import clock
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from registry import clock
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.transport.far_end import Served

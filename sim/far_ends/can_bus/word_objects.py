@@ -8,8 +8,8 @@ others are refused, since nothing longer than four bytes can be written.
 import struct
 import zlib
 
-from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from drivers.protocol.table import MESSAGES
+from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from sim.transport.far_end import AmplifierPort
 
 TOGGLE = 0x0503_0000

@@ -23,7 +23,7 @@ from controller.api.jsonrpc import (
 )
 from controller.api.methods import METHODS, ArmParams, SubscribeParams
 from controller.api.schema import Empty, Message
-from controller.daemon.api_service import ApiService
+from controller.daemon.methods import ApiService
 from page_part import insert
 
 

@@ -14,7 +14,8 @@ import serial
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
-from controller.daemon.states import (
+from controller.operation.links import Supervisor
+from controller.operation.states import (
     ENERGISED,
     DaemonEvent,
     DaemonState,
@@ -24,7 +25,6 @@ from controller.daemon.states import (
     check_lease,
     step,
 )
-from controller.daemon.supervisor import Supervisor
 from daemon_bench import (
     ENABLED,
     PATIENCE,

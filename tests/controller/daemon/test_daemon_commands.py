@@ -15,8 +15,8 @@ from controller.api.client_protocol import Notification
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.cli.shown import show_event
-from controller.daemon.log import LogThread
 from controller.daemon.run import run_daemon
+from controller.process.log import LogThread
 from daemon_bench import write_daemon
 from drivers.errors import CommandError
 from gateway_bench import UNCONFIRMED, ScriptedDaemon

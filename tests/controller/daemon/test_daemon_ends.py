@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from controller.api.async_client import AsyncClient
-from controller.loop.content import BEING_CHOSEN
-from controller.loop.intent import NO_CONTACTS
-from controller.loop.selection import GIVEN_UP
+from controller.play.content import BEING_CHOSEN
+from controller.play.intent import NO_CONTACTS
+from controller.play.selection import GIVEN_UP
 from daemon_bench import (
     ENABLED,
     READY,
@@ -25,8 +25,8 @@ from daemon_bench import (
     until_state,
 )
 from daemon_process import Journal, energised, silent_from
-from drivers import clock
 from drivers.host.amplifier import WATCHDOG
+from registry import clock
 from rig_files import TWO_AMPLIFIERS
 from several_fingers import answers_take
 from sim.faults.fault_window import FaultWindow

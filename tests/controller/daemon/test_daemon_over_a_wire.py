@@ -11,7 +11,7 @@ from controller.api.jsonrpc import ErrorCode
 from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
 from controller.gateway.settings import read_token
-from controller.loop.observer import Silenced
+from controller.play.observer import Silenced
 from daemon_bench import (
     ENABLED,
     READY,

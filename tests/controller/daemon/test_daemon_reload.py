@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from controller.child import child_command
 from controller.daemon.children import read_in_child
 from controller.daemon.config import (
     DaemonConfig,
@@ -18,6 +17,7 @@ from controller.daemon.config import (
     load_daemon_config,
     reload_problem,
 )
+from controller.process.child import child_command
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path

@@ -23,14 +23,14 @@ from controller.demo.touch_row import (
     peak_contrast_db,
     steady_contrast_db,
 )
-from controller.loop.content import Prediction, not_served
-from controller.loop.observer import Applied, Silenced
-from controller.sources.contacts import Change, Contact, ContactKey
+from controller.play.content import Prediction, not_served
+from controller.play.observer import Applied, Silenced
+from controller.touch.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
-from drivers import clock
 from drivers.errors import LinkError
 from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path
+from registry import clock
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 

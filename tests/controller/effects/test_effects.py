@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.daemon.api_views import effects_result
+from controller.daemon.messages import effects_result
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
@@ -20,7 +20,7 @@ from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.texture import Texture
-from controller.sources.contacts import Contact, ContactKey
+from controller.touch.contacts import Contact, ContactKey
 from model.config.shapes import Circle, Polygon, Rectangle
 
 

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import pytest
 
+from controller.api.learning_status import LearningState
 from controller.learning import learning as module
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator import Estimator
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
-from controller.learning.learning_status import LearningState
 from controller.learning.messages import (
     Answers,
     Estimate,
@@ -29,9 +29,9 @@ from controller.learning.messages import (
     Start,
     unpacked,
 )
-from controller.loop.loop import Controller
-from drivers.contents import Layer, Tone
+from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
+from drivers.playing.contents import Layer, Tone
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.learned_table import LearnedTable

@@ -8,9 +8,9 @@ import pytest
 
 from drivers.by_hand import actions
 from drivers.by_hand.discovery import identify_all
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import FEATURES
 from drivers.trace import tracing
 from drivers.urls import with_address

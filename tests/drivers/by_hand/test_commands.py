@@ -13,9 +13,9 @@ from typer.testing import CliRunner, Result
 
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.by_hand.cli import app
-from drivers.conformance import Report
-from drivers.contents import Tone
 from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.judge.asking import Report
+from drivers.playing.contents import Tone
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -186,7 +186,7 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
                 raise end
             return Report(url, 0.0, (), 1)
 
-        monkeypatch.setattr("drivers.conformance.judge", judged)
+        monkeypatch.setattr("drivers.judge.asking.judge", judged)
         result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")
         assert result.exit_code != 0
         assert f"{far.url(1)} is left in SWITCH_ON_DISABLED" in result.stderr
@@ -196,7 +196,7 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason stands with the port."""
     port = ListPortInfo("/dev/no-such-port")
-    monkeypatch.setattr("drivers.discovery.places.comports", lambda: [port])
+    monkeypatch.setattr("drivers.by_hand.places.comports", lambda: [port])
     result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout

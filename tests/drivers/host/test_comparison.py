@@ -4,10 +4,10 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused
-from drivers.expected.achieved import achieved_problem
 from drivers.host.sensors import read_measured
+from drivers.playing.contents import Layer, Tone
+from drivers.protocol.achieved import achieved_problem
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from sim.amplifier.readings import capabilities

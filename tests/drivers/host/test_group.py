@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Sequence
 
 import pytest
 
-from drivers.contents import Tone
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -18,10 +17,11 @@ from drivers.errors import (
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
-from drivers.host.wire import Broken
+from drivers.playing.contents import Tone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import MESSAGES, STATES
+from drivers.wires.wire import Broken
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, group_of, grouped, layer, tone, unaltered, with_group
 

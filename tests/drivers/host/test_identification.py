@@ -5,13 +5,13 @@ from collections.abc import Mapping
 
 import pytest
 
-from drivers.codec.serial_line.frame import REPLY, FrameReader, encode_frame
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier as Host
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import Reply
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import MESSAGES
+from drivers.wires.serial_line.frames import REPLY, FrameReader, encode_frame
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import Reply
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time, run_virtual

@@ -6,14 +6,14 @@ from itertools import combinations
 
 import pytest
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
-from drivers.host.can_wire import CanWire
 from drivers.host.jobs import JointStart
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import Wire
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import MESSAGES
+from drivers.wires.can_bus.host import CanWire
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import Wire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of
 

@@ -9,10 +9,10 @@ from types import EllipsisType
 
 import pytest
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.ledger import Ledger
-from drivers.playback import Playback
+from drivers.playing.contents import Layer, Tone
+from drivers.playing.playback import Playback
 from drivers.protocol.sets import Envelope
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities

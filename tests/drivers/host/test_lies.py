@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import pack_frames
-from drivers.contents import Layer, Tone
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import pack_frames
 from sim.far_ends import serial_amplifiers
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, Alter, MemoryLine, group_of, unaltered

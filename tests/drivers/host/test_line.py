@@ -7,15 +7,15 @@ from itertools import starmap
 
 import pytest
 
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import pack_frames
-from drivers.codec.serial_line.frame import Frame, encode_frame
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
 from drivers.host.jobs import Job, JobQueue, Priority
-from drivers.host.serial_wire import SerialWire
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Refusal, Values
+from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_bus.frames import pack_frames
+from drivers.wires.serial_line.frames import Frame, encode_frame
+from drivers.wires.serial_line.host import SerialWire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, grouped, unaltered
 

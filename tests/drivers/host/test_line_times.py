@@ -5,14 +5,14 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.contents import Layer
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
-from drivers.host.modbus_wire import ModbusWire
-from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import Wire
+from drivers.playing.contents import Layer
 from drivers.protocol.sets import Envelope
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.wire import Wire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of, grouped, layer, tone
 

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from courses import Taken, courses, follow
-from drivers.contents import Layer, Tone
 from drivers.host.group import Group
 from drivers.host.stop import Stopped
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.table import STATES
 from words_line import KINDS, MemoryLine, group_of, losing

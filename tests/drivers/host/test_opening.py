@@ -6,12 +6,12 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError, LinkTimeout
-from drivers.hardware import PORT_OPENER, Port
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
+from drivers.playing.contents import Layer, Tone
+from drivers.ports.port import PORT_OPENER, Port
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 from word_wires import WORD_WIRES

@@ -17,8 +17,8 @@ import pytest
 import serial
 
 from drivers.errors import LinkError, LinkTimeout
-from drivers.hardware import Port
 from drivers.ports import serial_port, tcp
+from drivers.ports.port import Port
 from drivers.ports.serial_port import SerialPort
 from drivers.ports.tcp import open_connection
 from drivers.urls import Place

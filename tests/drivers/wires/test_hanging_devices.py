@@ -11,11 +11,11 @@ from typing import Any
 import can
 import pytest
 
-from drivers import threads
-from drivers.hardware import Port
 from drivers.ports import serial_port
+from drivers.ports.port import Port
 from drivers.urls import Place
 from drivers.wires import bus_port
+from registry import threads
 
 
 class _Hanging:

@@ -11,7 +11,7 @@ import pytest
 
 from bench_driving import arm, keep_alive, play
 from benchmarks.direct_plate import direct_acceleration
-from drivers.contents import Tone
+from drivers.playing.contents import Tone
 from model.arrays import FloatArray
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from drivers import clock
 from drivers.host.sensors import measure_tones, read_sensors
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
@@ -15,6 +14,7 @@ from drivers.protocol.table import READING_STATES
 from model.fem.plate import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart
+from registry import clock
 from rig_on_wire import WIRES, layer, on_two_amplifiers, rig_on_wire
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer

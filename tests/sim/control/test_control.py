@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from bench_driving import play
-from drivers.contents import Tone
 from drivers.errors import LinkError
+from drivers.playing.contents import Tone
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.bench.bench import Bench

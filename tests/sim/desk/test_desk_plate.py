@@ -19,9 +19,9 @@ from model.identification.identify import identify
 from model.identification.measurement import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
-from sim.measuring.desk import Desk
-from sim.measuring.multisine import Multisine
-from sim.measuring.plate_measurement import measure_through
+from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.multisine import Multisine
+from sim.desk.measuring.plate_measurement import measure_through
 from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 RATE = 48_000.0

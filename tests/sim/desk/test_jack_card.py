@@ -17,9 +17,9 @@ from drivers.errors import LinkError
 from gateway_bench import wait_for
 from installed_program import ERA
 from model.errors import InputError
-from sim.measuring.sound_card import SoundCard, open_card
-from sim.soft_amp.output import open_output
-from sim.soft_amp.settings import Protocol, Settings
+from sim.desk.measuring.sound_card import SoundCard, open_card
+from sim.desk.soft_amp.output import open_output
+from sim.desk.soft_amp.settings import Protocol, Settings
 from sound_card import JackServer, capture_on, jack_server
 
 pytestmark = [

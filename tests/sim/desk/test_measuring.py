@@ -14,14 +14,14 @@ from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.rig import Rig
-from sim.measuring.desk import Desk
-from sim.measuring.live_plot import STEPS, plot
-from sim.measuring.loopback import latency
-from sim.measuring.measure import Measured, check_by_steps, measure
-from sim.measuring.multisine import Multisine, default_frequencies
-from sim.measuring.sound_card import SoundCard
+from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.live_plot import STEPS, plot
+from sim.desk.measuring.loopback import latency
+from sim.desk.measuring.measure import Measured, check_by_steps, measure
+from sim.desk.measuring.multisine import Multisine, default_frequencies
+from sim.desk.measuring.sound_card import SoundCard
+from sim.desk.soft_amp.library import address_of
 from sim.sensors.sensor_file import WiredSensor
-from sim.soft_amp.library import address_of
 
 RATE = 8_000.0
 DELAY = 73

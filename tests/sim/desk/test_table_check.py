@@ -16,9 +16,9 @@ from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.contents import Tone
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
+from drivers.playing.contents import Tone
 from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
@@ -32,8 +32,8 @@ from model.table.promise_at_sensors import Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.excitation import tone_amplitudes
-from sim.measuring import table_check
-from sim.measuring.sound_card import SoundCard
+from sim.desk.measuring import table_check
+from sim.desk.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors
 
 RATE = 8_000.0

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from drivers import clock
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.table import FAULTS, STATES
 from model.errors import InputError
 from model.rig.rig import Rig
+from registry import clock
 from rig_on_wire import SHARED_WIRES, WIRES, layer, on_two_amplifiers, rig_on_wire
-from sim.far_ends.wires import Wire, assign_wires, links_of
+from sim.far_ends.opening import Wire, assign_wires, links_of
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 

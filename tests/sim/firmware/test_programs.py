@@ -11,7 +11,7 @@ import pytest
 
 from model.errors import InputError
 from sim.firmware import bench
-from sim.firmware.bench import ending_with_parent, frequencies_in
+from sim.firmware.processes import ending_with_parent, frequencies_in
 
 RATE = 16_000.0
 
@@ -47,7 +47,7 @@ def test_missing_firmware_is_told_with_the_remedy(
 
 PARENT = """
 import subprocess, sys, time
-from sim.firmware.bench import ending_with_parent
+from sim.firmware.processes import ending_with_parent
 child = [sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"]
 subprocess.Popen(ending_with_parent(child))
 time.sleep(60)

@@ -1,0 +1,168 @@
+"""One touch of an effect simulated in time: what the finger feels, and what a resting one does."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.choice import Chooser
+from controller.play.intent import Target
+from controller.play.table_query import TableAnswer, query_table
+from controller.touch.contacts import Contact, ContactKey
+from model.arrays import FloatArray
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import decibels, detection_threshold
+from model.structure.attachments import fingertip_loads
+from model.table.effect_level import EffectLevels
+from model.table.pulse_gains import promised_over_effect_db
+from model.table.table import LocalizationTable
+from model.transients.base_motion import Bases, ramped_pulse
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation
+
+Position = tuple[float, float]
+
+STEADY_AFTER, STEADY_FOR = 0.3, 0.1
+"""Start and length [s] of the part over which a vibration without a duration is felt."""
+
+_AFTER = 0.1  # s; what a resting finger feels after the end counts, too
+
+
+@dataclass(frozen=True)
+class SimulatedTouch:
+    """A touch at a position [m], with a resting finger [m] or None.
+
+    frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
+    the resting finger feels over as long, None without one; promised_contrast_db: over that finger
+    on nine of ten plates; held_back_db: by how much it is weaker for that finger; reason: why
+    nothing plays.
+    """
+
+    at: Position
+    resting: Position | None
+    frequencies: tuple[float, ...] = ()
+    felt_db_sl: float | None = None
+    resting_db_sl: float | None = None
+    promised_contrast_db: float | None = None
+    reason: str | None = None
+    held_back_db: float = 0.0
+
+
+class TouchSimulator:
+    """Plays effects as the controller does, along plain ramps, on the plate of a table in time.
+
+    The fingers weigh on it.
+    """
+
+    def __init__(self, table: LocalizationTable) -> None:
+        self.table = table
+        self._levels = EffectLevels(table)
+        self.chooser = Chooser(table, self._levels)
+        """Chooses what is played beside other contents."""
+        self.capabilities = PlaybackCapabilities(
+            drive_mode=DRIVE_MODES[-1],
+            playable=DRIVE_MODES,
+            frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
+            max_amplitudes=table.strokes,
+            envelope_support=RAMPS_ONLY,
+        )
+        """Of amplifiers that play whatever the table has."""
+
+    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> TableAnswer:
+        """Answer a target at a position [m] among quiet fingers, along plain ramps.
+
+        Raises InputError where nothing can be played.
+        """
+        finger = Contact(target.key, *at, since=0.0)
+        others = [
+            Contact(ContactKey("quiet", number), *place, since=0.0)
+            for number, place in enumerate(quiet)
+        ]
+        return query_table(self.table, finger, target, others, self.capabilities, self._levels)
+
+    def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
+        """Play a target's content at a finger."""
+        try:
+            answer = self.answered(target, at, [] if resting is None else [resting])
+        except InputError as error:
+            return SimulatedTouch(at, resting, reason=str(error))
+        pattern, pulse = answer.pattern, target.pulse
+        is_whole = pulse is not None and pulse.is_raised
+        since = 0.0 if is_whole else STEADY_AFTER
+        duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
+        bases = [
+            (frequency, ramped_pulse(part, self.table.eras, ramp=pattern.ramp, duration=end))
+            for end in (since + duration,)
+            for frequency, part in _by_frequency(pattern.excitation)
+        ]
+        transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
+        end = since + duration
+        felt = self._levels_at(transients, at, bases, length=duration, until=end)
+        level = float(felt[round(since * SAMPLE_RATE)])
+        resting_level = promised = None
+        if resting is not None:
+            over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
+            resting_level = float(over[round(since * SAMPLE_RATE) :].max())
+            promised = promised_over_effect_db(pattern, level - resting_level)
+        return SimulatedTouch(
+            at,
+            resting,
+            tuple(frequency for frequency, _ in bases),
+            level,
+            resting_level,
+            promised,
+            held_back_db=answer.held_back_db,
+        )
+
+    def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:
+        """The table's plate in time with fingers on it, if they weigh anything."""
+        table = self.table
+        if table.fingertip is None:
+            return table.in_time
+        loads = fingertip_loads(table.fingertip, contacts)
+        return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
+
+    def _levels_at(
+        self,
+        transients: Transients,
+        at: Position,
+        bases: Sequence[tuple[float, Bases]],
+        *,
+        length: float,
+        until: float,
+    ) -> FloatArray:
+        """Level [dB SL] of the rms over each stretch of a length [s] up to a time [s], (n,).
+
+        Mean over a fingertip; one value for each sample at which a stretch starts.
+        """
+        plate = self.table.plate
+        points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
+        power = np.zeros((round(until * SAMPLE_RATE), len(points)))
+        for frequency, motion in bases:
+            acceleration = transients.acceleration(motion, points, duration=until)
+            power = (
+                power
+                + (acceleration / detection_threshold(np.array(frequency), self.table.threshold))
+                ** 2
+            )
+        total = np.vstack([np.zeros(len(points)), np.cumsum(power, axis=0)])
+        count = min(round(length * SAMPLE_RATE), len(total) - 1)
+        mean = np.maximum((total[count:] - total[:-count]) / count, 0.0)
+        return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
+
+
+def _by_frequency(excitation: Excitation) -> list[tuple[float, Excitation]]:
+    """Return the tones of each frequency [Hz], ascending."""
+    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    return [
+        (
+            frequency,
+            {name: tone for name, tone in excitation.items() if tone.frequency == frequency},
+        )
+        for frequency in frequencies
+    ]

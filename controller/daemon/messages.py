@@ -1,0 +1,393 @@
+"""The state of the control loop and the amplifiers as messages of the API."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+from controller.api.learning_status import LearningStatus
+from controller.api.methods import EffectsResult, HelloResult
+from controller.api.schema import (
+    API_VERSION,
+    AmplifierReport,
+    AmplifierSilence,
+    AmplifierStatus,
+    ContactStatus,
+    EffectDescription,
+    EraPosition,
+    LatencySummary,
+    LearningSummary,
+    LinkCounters,
+    PlateEvent,
+    PlayedTone,
+    RigSummary,
+    TableSummary,
+)
+from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
+from controller.daemon.config import DaemonConfig
+from controller.effects.layout import SurfaceLayout
+from controller.operation.states import Loss
+from controller.play.content import BEING_CHOSEN, leaks_db_sl
+from controller.play.intent import NO_CONTACTS
+from controller.play.observer import Applied, Silenced
+from controller.play.routing import Drive
+from controller.touch.contacts import Contact, ContactKey
+from drivers.counters import LinkStatistics
+from drivers.host.amplifier import Amplifier
+from drivers.host.members import is_lost
+from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
+from drivers.host.stop import Stopped
+from drivers.protocol.table import FAULTS, QUANTITIES, STATES, has_flag, name_of
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from registry import clock
+
+_LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
+_VOLTAGE = QUANTITIES["voltage"]
+
+
+@dataclass
+class PlateView:
+    """Contacts on the plate, and what the control loop has last reported of what plays.
+
+    effect_of: the effect that plays for a contact; report: None before the first, and once others
+    have silenced what played; why_not: why a contact feels nothing that these do not say, "" if it
+    shall.
+    """
+
+    effect_of: Callable[[ContactKey], str | None]
+    contacts: tuple[Contact, ...] = ()
+    report: Applied | Silenced | None = None
+    why_not: Callable[[ContactKey], str] = lambda key: ""
+
+    @property
+    def applied(self) -> Applied | None:
+        """The pattern that plays; None while nothing does."""
+        return self.report if isinstance(self.report, Applied) else None
+
+    def contact_statuses(self) -> list[ContactStatus]:
+        """All contacts with their roles."""
+        return self._statuses(self.contacts)
+
+    @property
+    def silence_reason(self) -> str | None:
+        """Why nothing plays for the contacts of now; None while a pattern plays."""
+        if self.applied is not None:
+            return None
+        reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
+        return "; ".join(filter(None, reasons)) or NO_CONTACTS
+
+    def _statuses(self, contacts: Iterable[Contact]) -> list[ContactStatus]:
+        report, reason = self.report, ""
+        if isinstance(report, Silenced) and not report.targets:  # as by a failure
+            reason = report.reason
+        known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
+        return [
+            contact_status(
+                each,
+                report,
+                self.effect_of(each.key),
+                why_not=self.why_not(each.key)
+                or (reason if (each.key, each.since) in known else BEING_CHOSEN),
+            )
+            for each in contacts
+        ]
+
+    def statuses_now(self, table: LocalizationTable) -> list[ContactStatus]:
+        """All contacts with their roles, and what leaks to them where they are now."""
+        statuses = self.contact_statuses()
+        if self.applied is None:
+            return statuses
+        contents = [each.content for each in self.applied.contents.values() if each.drive]
+        leaks = leaks_db_sl(table, contents, self.contacts)
+        return [
+            status.model_copy(update={"leak_db_sl": _finite(leaks[contact.key])})
+            for status, contact in zip(statuses, self.contacts, strict=True)
+        ]
+
+    @property
+    def targets(self) -> list[str]:
+        """The fingers that feel something now, by source and number."""
+        keys = [each.contact.key for each in self.applied.targets] if self.applied else []
+        return [f"{key.source} {key.id}" for key in keys]
+
+    def contacts_event(self) -> ContactsEvent:
+        """The event of topic `contacts`."""
+        return ContactsEvent(contacts=self.contact_statuses())
+
+    def pattern_event(self) -> PatternEvent | None:
+        """The event of topic `pattern`; None while nothing plays."""
+        applied = self.applied
+        if applied is None:
+            return None
+        return PatternEvent(
+            contacts=self._statuses(applied.contacts),
+            **playing_of(applied),
+            latency_ms=None if applied.latency is None else 1e3 * applied.latency,
+        )
+
+    def silence_event(self) -> SilenceEvent | None:
+        """The event of topic `silence`; None while something plays, or before a decision."""
+        silenced = self.report
+        if not isinstance(silenced, Silenced):
+            return None
+        return SilenceEvent(
+            contacts=self._statuses(silenced.contacts),
+            reason=silenced.reason,
+            latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
+        )
+
+
+def playing_of(applied: Applied | None) -> dict[str, Any]:
+    """What of a `Playing` is of a pattern: its tones, what is promised and predicted, if any."""
+    pattern = None if applied is None else applied.pattern
+    contents = {} if applied is None else applied.contents
+    return {
+        "drive": {} if applied is None else played_tones(applied.drive),
+        "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
+        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
+        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
+        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
+        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
+        "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
+    }
+
+
+def played_tones(drive: Drive) -> dict[str, PlayedTone]:
+    """Describe what ERAs play in one layer."""
+    return {
+        era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
+        for era, tone in drive.items()
+    }
+
+
+def contact_status(
+    contact: Contact, report: Applied | Silenced | None, effect: str | None, *, why_not: str
+) -> ContactStatus:
+    """Describe a contact with what it is predicted to feel, and the effect that it was to feel.
+
+    why_not: why it feels nothing of its own, unless it is a target of the report.
+    """
+    status: dict[str, object] = {
+        "source": contact.key.source,
+        "id": contact.key.id,
+        "x_m": contact.x,
+        "y_m": contact.y,
+        "effect": effect,
+        "load": contact.load,
+        "held_back": why_not,
+    }
+    if report is not None:
+        for felt in report.targets:
+            # A report may be older than a finger of the same number.
+            if (felt.contact.key, felt.contact.since) == (contact.key, contact.since):
+                status |= {
+                    "role": "target",
+                    "feels": felt.content,
+                    "level_db_sl": _finite(felt.level_db_sl),
+                    "robust_felt_contrast_db": _finite(felt.promised_contrast_db),
+                    "contrast_db": _finite(felt.contrast_db),
+                    "verdict": felt.verdict,
+                    "frequency_hz": felt.frequency,
+                    "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
+                    "held_back": felt.held_back,
+                }
+    if isinstance(report, Applied) and any(each.key == contact.key for each in report.quiet):
+        # Of several quiet contacts only the level of the loudest is known.
+        is_known = len(report.quiet) == len(report.contents) == 1
+        level = report.pattern.quiet_level_db_sl if is_known else None
+        status |= {
+            "role": "quiet",
+            "level_db_sl": _finite(level),
+            "foreign_level_db_sl": _finite(report.quiet_levels.get(contact.key)),
+        }
+    return ContactStatus.model_validate(status)
+
+
+def hello_result(
+    config: DaemonConfig,
+    table: LocalizationTable,
+    amplifiers: Mapping[str, Amplifier],
+    *,
+    drive_mode: str,
+    layout: dict[str, object] | None,
+) -> HelloResult:
+    """Describe what the daemon drives."""
+    return HelloResult(
+        api_version=API_VERSION,
+        software_version=version("era-haptics"),
+        rig=_rig_summary(config.rig, amplifiers),
+        table=TableSummary(
+            fingerprint=table.fingerprint,
+            mode=drive_mode,
+            frequencies_hz=[float(each) for each in table.frequencies],
+            cells_x=table.grid.nx,
+            cells_y=table.grid.ny,
+        ),
+        rig_text=config.rig_text,
+        layout=layout,
+    )
+
+
+def effects_result(layout: SurfaceLayout) -> EffectsResult:
+    """Describe the effects of a layout that can be requested by name."""
+    return EffectsResult(
+        effects=[
+            EffectDescription(
+                name=name,
+                kind=effect.kind,
+                description=(type(effect).__doc__ or "").partition("\n")[0],
+                parameters=effect.model_dump(mode="json"),
+            )
+            for name, effect in sorted(layout.effects.items())
+        ]
+    )
+
+
+def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
+    return RigSummary(
+        length_m=rig.plate.length,
+        width_m=rig.plate.width,
+        eras=[
+            EraPosition(
+                name=era.name,
+                x_m=era.x,
+                y_m=era.y,
+                amplifier=rig.wiring[era.name].amplifier,
+                channel=rig.wiring[era.name].number,
+            )
+            for era in rig.eras
+        ],
+        simulated=any(
+            "simulated" in each.identity.get("product", "") for each in amplifiers.values()
+        ),
+        frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+    )
+
+
+def amplifier_statuses(
+    amplifiers: Mapping[str, Amplifier],
+    urls: Mapping[str, str],
+    *,
+    are_open: bool,
+    lost: Loss | None,
+    what_may_play: Callable[[str], Stopped],
+    targets: Sequence[str] = (),
+) -> list[AmplifierStatus]:
+    """Describe all amplifiers from their last statuses, without sending a request.
+
+    are_open: whether all are open together; else their last statuses are left out. lost: the loss
+    that has closed the others. what_may_play: by name, of those that do not reply. targets: the
+    fingers that feel something now.
+    """
+    missing = () if lost is None else lost.names
+    return [
+        _amplifier_status(
+            name,
+            amplifiers.get(name),
+            url,
+            is_open=are_open,
+            closed_with_lost=bool(missing) and name not in missing,
+            what_may_play=what_may_play,
+            targets=targets,
+        )
+        for name, url in urls.items()
+    ]
+
+
+def _amplifier_status(
+    name: str,
+    amplifier: Amplifier | None,
+    url: str,
+    *,
+    is_open: bool,
+    closed_with_lost: bool,
+    what_may_play: Callable[[str], Stopped],
+    targets: Sequence[str],
+) -> AmplifierStatus:
+    """closed_with_lost: whether it was closed because another amplifier was lost."""
+    status = status_at = serial_number = None
+    is_degraded, counts = False, LinkStatistics()
+    reports: list[AmplifierReport] = []
+    if amplifier is not None:
+        is_known = is_open and not is_lost(amplifier)
+        status = amplifier.status if is_known else None
+        is_degraded = is_known and amplifier.silence_cause is not None
+        status_at = amplifier.status_at
+        serial_number = amplifier.identity.get("serial_number")
+        recent = clock.now() - REPORT_LIFE
+        reports = [
+            _report(kind, targets) for kind, at in amplifier.reported_at.items() if at > recent
+        ]
+        counts = amplifier.statistics
+    return AmplifierStatus(
+        name=name,
+        url=url,
+        serial_number=serial_number,
+        state=name_of(STATES, status["state"]) if status else None,
+        fault=name_of(FAULTS, status["fault"]) if status else None,
+        levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
+        temperature_c=_TEMPERATURE.from_wire(status["temperature"]) if status else None,
+        high_voltage=has_flag(status, "high_voltage") if status else None,
+        high_voltage_v=_VOLTAGE.from_wire(status["voltage"]) if status else None,
+        reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
+        degraded=is_degraded,
+        lost=status is None and not closed_with_lost,
+        closed_with_lost=status is None and closed_with_lost,
+        reports=reports,
+        silence=AmplifierSilence(**what_may_play(name).rows(clock.now()))
+        if status is None or is_degraded
+        else None,
+        statistics=LinkCounters(
+            frames_out=counts.frames_out,
+            frames_in=counts.frames_in,
+            invalid_frames=counts.invalid_frames,
+            unexpected_frames=counts.unexpected_frames,
+            events=counts.events,
+            retries=counts.retries,
+            timeouts=counts.timeouts,
+            refusals=counts.refusals,
+            round_trip_ms=None if counts.last_round_trip is None else 1e3 * counts.last_round_trip,
+        ),
+    )
+
+
+def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
+    """Describe a report; what is limited is felt less by every finger that feels something."""
+    cause, remedy = REPORTS[kind]
+    if kind == "limited" and targets:
+        cause += f", and fingers feel less than promised: {', '.join(targets)}"
+    return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
+
+
+def learning_summary(
+    status: LearningStatus, latencies: LatencySummary, *, now: float
+) -> LearningSummary:
+    """Describe what is learned of the plate at a time [s]."""
+    return LearningSummary(
+        **plate_event(status).model_dump(),
+        readings=status.readings,
+        estimates=status.estimates,
+        discarded=status.discarded,
+        disturbed=status.disturbed,
+        corrections=status.corrections,
+        restarts=status.restarts,
+        last_estimate_s=None if status.last_at is None else max(0.0, now - status.last_at),
+        latency_ms=latencies,
+    )
+
+
+def plate_event(status: LearningStatus) -> PlateEvent:
+    """The event of topic `plate`."""
+    return PlateEvent(
+        state=status.state,
+        cause=status.cause,
+        remedy=status.remedy,
+        robust=status.are_robust,
+        alarms=status.alarms,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    """The value if JSON can represent it, else None."""
+    return value if value is not None and abs(value) < float("inf") else None

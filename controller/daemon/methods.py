@@ -1,0 +1,327 @@
+"""The methods of the API, implemented by the daemon."""
+
+import asyncio
+import itertools
+import logging
+import math
+import time
+from collections.abc import Awaitable, Mapping
+
+from controller.api.connection import Connection
+from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
+from controller.api.methods import (
+    METHODS,
+    ArmParams,
+    ArmResult,
+    ClearParams,
+    DisarmParams,
+    EffectsResult,
+    HelloParams,
+    HelloResult,
+    PlayParams,
+    RenewParams,
+    RenewResult,
+    RequestedBy,
+    StatusResult,
+    StopResult,
+    SubscribeParams,
+    TouchParams,
+    UnsubscribeParams,
+)
+from controller.api.schema import AmplifierSilence, Empty, headline
+from controller.api.server import Handler
+from controller.daemon.config import API_SOURCES, DaemonConfig
+from controller.daemon.messages import effects_result, hello_result, playing_of
+from controller.daemon.publisher import EventPublisher
+from controller.effects.player import EffectPlayer
+from controller.learning.learning import Learning
+from controller.operation.links import Supervisor
+from controller.operation.operator import LEASE_OVER
+from controller.operation.states import (
+    ENERGISED,
+    DaemonEvent,
+    DaemonState,
+    Lease,
+    Operation,
+    Trigger,
+    check_lease,
+)
+from controller.play.loop import Controller
+from controller.play.table_query import MAX_DB_SL
+from controller.touch.contacts import Contact
+from controller.touch.frames import Touch, TouchFrame
+from drivers.host.stop import Stopped
+from model.compiled.kernels import why_slow
+from model.table.table import LocalizationTable
+from registry import clock
+
+_logger = logging.getLogger(__name__)
+
+PLAY_RADIUS = 0.020
+"""Largest distance [m] from the position of a requested effect to the finger that feels it."""
+
+_ENABLED = DaemonState.OPERATION_ENABLED
+
+
+class ApiService:
+    """Handles requests of clients. Arming takes a lease; every client may disarm and stop."""
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        table: LocalizationTable,
+        controller: Controller,
+        supervisor: Supervisor,
+        *,
+        publisher: EventPublisher,
+        layout: EffectPlayer,
+        learning: Learning | None,
+    ) -> None:
+        self._config = config
+        self._table = table
+        self._controller = controller
+        self._supervisor = supervisor
+        self._publisher = publisher
+        self._layout = layout
+        self._learning = learning
+        self._next_number = itertools.count(1)
+        self._started = clock.now()
+
+    def handlers(self) -> Mapping[str, Handler]:
+        """Handlers by method name."""
+        return {name: getattr(self, f"_{name}") for name in METHODS}
+
+    def client_left(self, client: Connection) -> None:
+        """Release what a disconnected client holds; lift its fingers."""
+        self._publisher.hub.forget(client)
+        if client.number is not None:
+            self._controller.lift(f"{_origin(client)}:")
+
+    def holds_lease(self, client: Connection) -> bool:
+        """Whether a client armed or renewed the current lease: it is never evicted."""
+        lease = self._supervisor.operation.lease_at(clock.now())
+        return lease is not None and client.lease == lease.token
+
+    def _status(self, client: Connection, params: Empty) -> StatusResult:
+        operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
+        lease = operation.lease_at(now)
+        return StatusResult(
+            time_s=now,
+            unix_time_s=time.time(),
+            state=operation.state.value,
+            cause=operation.cause,
+            remedy=operation.remedy,
+            epoch=operation.epoch,
+            assume_energised=self._supervisor.assume_energised(now),
+            lost_for_s=None if operation.lost is None else now - operation.lost.at,
+            watchdog_s=self._controller.watchdog,
+            armed_by=lease.owner if lease else None,
+            lease_left_s=lease.expires_at - now if lease else None,
+            contacts=view.statuses_now(self._controller.table),
+            silence_reason=view.silence_reason if operation.state is _ENABLED else None,
+            **playing_of(view.applied if operation.state is _ENABLED else None),
+            amplifiers=self._publisher.amplifiers(),
+            latency_ms=self._publisher.latencies.summary(),
+            lift_latency_ms=self._publisher.lift_latencies.summary(),
+            lost_events=dict(self._publisher.hub.lost),
+            rejected_touches=dict(self._controller.rejects.counts),
+            rejected_examples=dict(self._controller.rejects.examples),
+            inputs=self._publisher.inputs().inputs,
+            clicks_too_late=self._controller.clicks_too_late,
+            learning=self._publisher.learning_summary(),
+            slow_reason=why_slow(),
+            uptime_s=now - self._started,
+        )
+
+    def _hello(self, client: Connection, params: HelloParams) -> HelloResult:
+        client.name = params.client
+        return hello_result(
+            self._config,
+            self._table,
+            self._controller.amplifiers,
+            drive_mode=self._controller.drive_mode,
+            layout=self._publisher.layout_event().layout,
+        )
+
+    async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
+        if self._supervisor.operation.is_lease_over(clock.now()):  # what plays is not inherited
+            await self._supervisor.handle(LEASE_OVER)
+        lease = Lease(params.owner, params.lease_s)
+        cause = f"armed by {params.owner!a}"
+        try:
+            await self._supervisor.handle(
+                DaemonEvent(Trigger.ARM, cause, "era disarm, or era stop", lease)
+            )
+            operation = self._supervisor.operation
+            is_own = operation.lease is not None and operation.lease.token == lease.token
+            if operation.state in ENERGISED and not is_own:
+                raise _armed_already(operation)
+            if operation.state is not _ENABLED:
+                raise _wrong_state(operation)
+        except BaseException:
+            self._supervisor.withdraw(lease.token, "arming failed")
+            raise
+        client.lease = lease.token
+        # After the reply was sent, or failed to be sent.
+        asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
+        return ArmResult(lease=lease.token, lease_s=lease.duration)
+
+    def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
+        lease = self._supervisor.renew(params.lease)
+        client.lease = lease.token
+        return RenewResult(lease_s=lease.duration)
+
+    async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
+        if params.lease is not None:
+            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+        if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
+            await self._stop(client, params)
+        cause = f"disarmed by {params.client or client.name!a}"
+        await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
+        operation = self._supervisor.operation
+        if operation.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
+            raise _wrong_state(operation)
+        return Empty()
+
+    def _stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
+        """Stop; the amplifiers' requests are queued when this returns."""
+        cause = f"stopped by {params.client or client.name!a}"
+        stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
+        return _silence(stopping, self._supervisor.operation.epoch)
+
+    async def _clear(self, client: Connection, params: ClearParams) -> Empty:
+        operation = self._supervisor.operation
+        if operation.state is DaemonState.COMM_LOST:
+            raise _wrong_state(operation, ErrorCode.LINK)
+        if operation.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
+            if params.epoch not in (None, operation.epoch):
+                raise RpcError(
+                    ErrorCode.WRONG_STATE,
+                    f"epoch must be that of what is latched now, {operation.epoch}, got "
+                    f"{params.epoch}: another stop, fault or loss came since",
+                    where="epoch",
+                    remedy="look at the status, then clear again",
+                )
+            await self._supervisor.handle(
+                DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
+            )
+            operation = self._supervisor.operation
+        if operation.state is not DaemonState.READY_TO_SWITCH_ON:
+            raise _wrong_state(operation)
+        return Empty()
+
+    async def _forget(self, client: Connection, params: RequestedBy) -> Empty:
+        if self._learning is None:
+            raise RpcError(
+                ErrorCode.WRONG_STATE,
+                "nothing is learned of the plate",
+                remedy="name a file in learn of the daemon's configuration",
+            )
+        await self._learning.forget()
+        _logger.info("plate: forgotten by %a", params.client or client.name)
+        return Empty()
+
+    def _touch(self, client: Connection, params: TouchParams) -> Empty:
+        if client.number is None:
+            client.number = next(self._next_number)
+        plate, origin = self._config.rig.plate, _origin(client)
+        touches = tuple(
+            Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width)
+            for point in params.touches
+        )
+        # The same source name of two clients denotes two sources.
+        name = f"{origin}:{params.source}"
+        self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
+        return Empty()
+
+    def _effects(self, client: Connection, params: Empty) -> EffectsResult:
+        return effects_result(self._layout.layout)
+
+    def _play(self, client: Connection, params: PlayParams) -> Empty:
+        """Start an effect at the contact nearest to a position, at its own level or below."""
+        operation = self._supervisor.operation
+        if operation.state is not _ENABLED or self._controller.group.degraded:
+            raise _wrong_state(operation)
+        effects = self._layout.layout.effects
+        effect = effects.get(params.effect)
+        if effect is None:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"unknown effect {params.effect!a}",
+                where="effect",
+                remedy=f"choose one of {', '.join(sorted(effects))}",
+            )
+        level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        if params.level_db_sl is not None and params.level_db_sl > level_max:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"level of effect {params.effect!a} must be at most {level_max:g} dB SL, got "
+                f"{params.level_db_sl:g}",
+                where="level_db_sl",
+                remedy="raise its level in the surface layout",
+            )
+
+        def distance(contact: Contact) -> float:
+            return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
+
+        nearest = min(self._publisher.view.contacts, key=distance, default=None)
+        if nearest is None or distance(nearest) > PLAY_RADIUS:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"no finger within {1e3 * PLAY_RADIUS:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
+                where="x_m",
+                remedy="touch the plate there, or send a touch over the API",
+            )
+        self._layout.play(params.effect, nearest, clock.now(), level_db_sl=params.level_db_sl)
+        self._controller.request_update()
+        return Empty()
+
+    def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
+        # After the reply, so that no event precedes it.
+        asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
+        return Empty()
+
+    def _subscribe_now(self, client: Connection, params: SubscribeParams) -> None:
+        if client.is_open:
+            self._publisher.hub.subscribe(client, params.topics, rate=params.rate_hz)
+
+    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
+        self._publisher.hub.unsubscribe(client, params.topics)
+        return Empty()
+
+    def _check_holder(self, client: Connection, token: str) -> None:
+        """Disarm if the client disconnected before it received its lease."""
+        if client.has_left:
+            self._supervisor.withdraw(token, "the arming client disconnected")
+
+
+def _origin(client: Connection) -> str:
+    """Return the origin of a client's touches, with which the names of its sources begin."""
+    return f"{API_SOURCES}:{client.number}"
+
+
+def _armed_already(operation: Operation) -> RpcError:
+    """Return the error of a client that arms what another has armed, or is arming."""
+    what, lease = "another client is arming", operation.lease
+    if operation.state is _ENABLED and lease is not None:
+        what = f"armed by {lease.owner!a} for {lease.expires_at - clock.now():.1f} s more"
+    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
+
+
+async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> StopResult:
+    """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
+    outcomes = await stopping
+    now = clock.now()
+    amplifiers = {name: AmplifierSilence(**each.rows(now)) for name, each in outcomes.items()}
+    if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
+        raise NotSilent(amplifiers)
+    return StopResult(epoch=epoch, amplifiers=amplifiers)
+
+
+def _wrong_state(operation: Operation, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
+    return RpcError(
+        code,
+        headline(operation.state.value, operation.cause),
+        where="state",
+        remedy=operation.next_step,
+    )

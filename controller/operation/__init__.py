@@ -1,0 +1,1 @@
+"""Whether the plate may play, and who changes that."""

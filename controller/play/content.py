@@ -1,0 +1,181 @@
+"""What layers play: one content each, for its own finger and those that share it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from controller.play.intent import Pulse, Target
+from controller.touch.contacts import Contact, ContactKey
+from model.finger.fingertip import fingertip_points
+from model.finger.perception import detection_threshold
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.table import LocalizationTable
+
+Targets = tuple[tuple[Contact, Target], ...]
+
+OWN, SHARED, HELD_BACK = "own", "shared", "held back"
+
+BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a finger that is to feel something is predicted to feel.
+
+    contact: as it was when the content was chosen; verdict: whether it feels its own content, that
+    mixed with others', that of another finger, or none; held_back: why not its own, None if it
+    does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
+    has none; contrast_db: of the steady vibration to the loudest quiet point, in peak acceleration;
+    promised_contrast_db: of levels, to the loudest quiet finger or to the contents of others here,
+    on nine of ten plates; foreign_level_db_sl: of others' contents here, which nine of ten plates
+    do not exceed. None where there is nothing to compare with. frequency [Hz]: None where several
+    or none play; content: name of what it feels.
+    """
+
+    contact: Contact
+    level_db_sl: float | None
+    contrast_db: float | None = None
+    verdict: str = OWN
+    held_back: str | None = None
+    promised_contrast_db: float | None = None
+    foreign_level_db_sl: float | None = None
+    frequency: float | None = None
+    content: str | None = None
+
+
+@dataclass(frozen=True)
+class Content:
+    """The pattern of one layer, with the contacts as they were when it was chosen.
+
+    targets: the finger whose content it is, then those that share it; question: by which its onset
+    and ending are shaped; predictions: one per target; voice: 0, or the number of a side band of
+    the finger's content, which has no predictions.
+    """
+
+    targets: Targets
+    question: Question
+    pattern: Pattern
+    predictions: tuple[Prediction, ...] = ()
+    voice: int = 0
+
+    @property
+    def key(self) -> tuple[ContactKey, int]:
+        """The finger whose content it is, and the voice."""
+        return self.targets[0][0].key, self.voice
+
+    @property
+    def frequency(self) -> float | None:
+        """Its frequency [Hz]; None of several."""
+        frequencies = {tone.frequency for tone in self.pattern.excitation.values()}
+        return frequencies.pop() if len(frequencies) == 1 else None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The contents of some contacts, or none and the reason for silence.
+
+    targets, quiet: contacts as they were when the contents were chosen, targets with their
+    intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
+    contents of some targets are still being chosen. quiet_levels [dB SL]: what quiet contacts feel
+    of the contents, which nine of ten plates do not exceed; protected: contacts that must not
+    notice those of others.
+    """
+
+    targets: Targets
+    quiet: tuple[Contact, ...]
+    contents: tuple[Content, ...] = ()
+    reason: str | None = None
+    not_served: tuple[Prediction, ...] = ()
+    is_pending: bool = False
+    quiet_levels: Mapping[ContactKey, float] = field(default_factory=dict)
+    protected: frozenset[ContactKey] = frozenset()
+
+    @cached_property
+    def contacts(self) -> dict[ContactKey, Contact]:
+        """All contacts as they were then."""
+        found = {each.key: each for each in self.quiet}
+        for contact, _ in self.targets:
+            found[contact.key] = contact
+        return found
+
+    @cached_property
+    def target_keys(self) -> frozenset[ContactKey]:
+        """Contacts of the targets."""
+        return frozenset([contact.key for contact, _ in self.targets])
+
+    @property
+    def pulses(self) -> list[Pulse]:
+        """Those of the targets that have an end of their own."""
+        return [target.pulse for _, target in self.targets if target.pulse is not None]
+
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether every target feels its own, so that who leaves changes nothing for others."""
+        is_each_alone = all(len(content.targets) == 1 for content in self.contents)
+        return bool(self.contents) and is_each_alone and not self.not_served
+
+    def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
+        """Return it without some contents, whose targets feel nothing for a reason."""
+        held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
+        left = tuple(each for each in self.contents if each not in contents)
+        return replace(
+            self,
+            contents=left,
+            reason=self.reason if left else reason,
+            not_served=(
+                *self.not_served,
+                *[not_served(contact, reason) for contact in held_back],
+            ),
+        )
+
+    @property
+    def predictions(self) -> tuple[Prediction, ...]:
+        """What each target feels, those that are not served at the end.
+
+        Of several contents the last: a pulse goes on in one that others share.
+        """
+        served = {each.contact.key: each for one in self.contents for each in one.predictions}
+        return (*served.values(), *self.not_served)
+
+
+def no_layer_free(count: int) -> str:
+    """Return why a content is held back where the layers of the amplifiers are all taken."""
+    return f"no layer is free: the amplifiers play {count} contents at once; lift a finger"
+
+
+def not_served(contact: Contact, reason: str) -> Prediction:
+    """Return the prediction for a target that feels nothing of its own."""
+    return Prediction(contact, None, verdict=HELD_BACK, held_back=reason)
+
+
+def leaks_db_sl(
+    table: LocalizationTable, contents: Sequence[Content], contacts: Sequence[Contact]
+) -> dict[ContactKey, float]:
+    """Return what each contact feels of contents that are not for it, at its loudest point [dB SL].
+
+    On the nominal plate with the contacts where they are, since weights follow them late: until a
+    finger has moved by 8 mm, and while the next answer is computed and fades in. Takes a few
+    milliseconds.
+    """
+    if not contacts:  # lifted, while what plays is not known to have ended
+        return {}
+    places = [(each.x, each.y) for each in contacts]
+    loads = [each.load for each in contacts]
+    points = [fingertip_points(*at, table.plate) for at in places]
+    ends = np.cumsum([len(each) for each in points])[:-1]
+    power = {each.key: np.zeros(len(own)) for each, own in zip(contacts, points, strict=True)}
+    fields = table.unit_fields(np.concatenate(points), contacts=places, loads=loads)
+    for content in contents:
+        frequencies, felt = table.driven(content.pattern.excitation, fields)
+        sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]
+        own = {contact.key for contact, _ in content.targets}
+        for each, part in zip(contacts, np.split((sensed**2).sum(axis=0), ends), strict=True):
+            if each.key not in own:
+                power[each.key] += part
+    return {
+        key: 10 * math.log10(each.max()) if each.any() else -math.inf for key, each in power.items()
+    }

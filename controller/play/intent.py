@@ -1,0 +1,137 @@
+"""Haptic intent: which contacts shall feel something, how strongly, and until when.
+
+The interface between the meaning of touches and their playback. All other contacts are kept quiet.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from controller.touch.contacts import Contact, ContactKey
+from model.arrays import FloatArray
+from model.choice import best_of
+from model.finger.perception import STRONG_DB_SL
+from model.table.question import SHAPED_FROM
+
+_MIN_WAIT = 0.001  # s
+
+# A pulse that has not started this long [s] after it was due has lost its touch.
+_MAX_DELAY = 0.1
+
+FADED_AFTER = 0.05
+"""After the end of a pulse, or of a layer, by so long [s] none of it is left on any amplifier."""
+
+NO_CONTACTS = "no contact on the plate"
+
+
+@dataclass(slots=True, unsafe_hash=True)
+class Pulse:
+    """A vibration of limited duration [s], requested at a time [s]; a later one is another.
+
+    Its duration counts from started_at [s], when the amplifiers have been sent its commit. Without
+    that it ends 0.1 s after it is due, or after its duration where that is more; it is due at
+    requested_at, or at due_at [s] where it waits its turn. is_raised: whether the drive is raised
+    so that the level is felt over the duration, onset included; else the level is the steady one.
+    """
+
+    duration: float
+    requested_at: float
+    is_raised: bool = True
+    due_at: float = field(default=-math.inf, init=False, compare=False)
+    started_at: float | None = field(default=None, init=False, compare=False)
+
+    @property
+    def start(self) -> float:
+        """When [s] its duration starts, as far as known."""
+        if self.started_at is None:
+            return max(self.requested_at, self.due_at)
+        return self.started_at
+
+    @property
+    def end(self) -> float:
+        """When [s] it ends, as far as known."""
+        if self.started_at is None:
+            return self.start + max(self.duration, _MAX_DELAY)
+        return self.start + self.duration
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A contact that shall feel something of its own.
+
+    level_db_sl: how strongly; None for as strongly as the neighbours allow. allow_weaker: where the
+    plate cannot reach the level, as strongly as the neighbours allow instead of nothing. pulse:
+    None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand for
+    the nearest of the table. priority: lower ones give way first. content: a name; fingers of one
+    name may share one vibration where the plate cannot give each its own. None: of this one alone.
+    is_own: whether it feels its own content or none; may_share: whether it may also feel that of
+    any finger that may share. modulation_hz: how often a second the strength of what lasts comes
+    and goes.
+    """
+
+    key: ContactKey
+    level_db_sl: float | None = STRONG_DB_SL
+    allow_weaker: bool = False
+    pulse: Pulse | None = None
+    band: tuple[float, float] | None = None
+    priority: int = 0
+    content: str | None = None
+    is_own: bool = False
+    may_share: bool = False
+    modulation_hz: float | None = None
+
+    @property
+    def shared_as(self) -> str | bool | None:
+        """Equal for contacts that may feel one vibration that lasts; None for its own alone."""
+        if self.is_short or self.is_own:
+            return None
+        return self.may_share or self.content
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it ends before a shaped onset would have settled."""
+        return self.pulse is not None and self.pulse.duration < SHAPED_FROM
+
+
+@dataclass(frozen=True)
+class HapticIntent:
+    """Targets and their levels at one moment.
+
+    targets: each contact once; those that are not on the plate are ignored. reason: why there are
+    none. until: when [s] the intent may change though no contact has; None for never. protected:
+    contacts that must not notice the contents of others.
+    """
+
+    targets: tuple[Target, ...]
+    reason: str = "no target"
+    until: float | None = None
+    protected: frozenset[ContactKey] = frozenset()
+
+    def due(self, now: float) -> float:
+        """Return when [s] to query again, at least a millisecond from now; infinite for never."""
+        if self.until is None:
+            return math.inf
+        return self.until if self.until > now else now + _MIN_WAIT
+
+
+class IntentSource(Protocol):
+    """Where intents come from; queried when contacts change and when an intent expires."""
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """Return the intent for contacts in their order of arrival, at a time [s], at once.
+
+        While it raises, all channels are silent.
+        """
+
+
+def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
+    """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
+    low, high = band
+    if low < high and ((frequencies >= low) & (frequencies <= high)).any():
+        return band
+    middle = np.sqrt(low * high)
+    nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
+    return nearest, nearest

@@ -1,0 +1,299 @@
+"""What one layer of all amplifiers of a rig is to play: routed, and shaped where possible.
+
+Excitations [m, rad] become tones of channels by the wiring of the rig, and envelopes integers of
+the wire; `sim/bench` translates back by the same wiring. An onset of fewer knots follows the same
+curve in longer steps, which keeps quiet fingers quieter than a ramp does down to a single knot; an
+ending is sent whole or not at all. The last value of an envelope, the pattern itself or silence, is
+that of the command and not among the knots on the wire.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from controller.play.capabilities import EnvelopeSupport
+from drivers.playing.contents import Layer, Tone
+from drivers.protocol.sets import Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.timing import Timing
+from model.transients.base_motion import KNOT_STEP, BaseEnvelope, Envelopes
+from model.transients.knots import ONSET_KNOTS
+from model.vibration import excitation as physics
+
+Drive = Mapping[str, Tone]
+"""What ERAs play, by name, without silent ones."""
+
+FADE_RAMP = 0.020
+"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
+
+_STEP, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("envelope_step", "level", "phase"))
+_FREQUENCY = QUANTITIES["frequency"]
+_DIGITS = 6  # of a step of the wire
+
+
+@dataclass(frozen=True)
+class PlateSet:
+    """What one layer plays on every amplifier, by name.
+
+    settled_after [s]: from the commit until the last fade or onset has ended; has_endings: whether
+    it ends along shaped endings; is_shaped: whether it has any envelope, or leads along one.
+    """
+
+    layers: Mapping[str, Layer]
+    settled_after: float
+    has_endings: bool = False
+    is_shaped: bool = False
+
+
+@dataclass(frozen=True)
+class SetBuilder:
+    """Builds the sets of one rig; timing: shapes patterns; ramp_max [s]: of all amplifiers."""
+
+    rig: Rig
+    support: EnvelopeSupport
+    ramp_max: float
+    timing: Timing
+
+    def shape(
+        self,
+        question: Question,
+        pattern: Pattern,
+        is_continued: bool,
+        *,
+        is_ended: bool = True,
+    ) -> Pattern:
+        """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
+
+        is_continued: whether it needs no onset; is_ended: whether it may have an ending.
+        """
+        has_onset = self.support.onset_knots > 0 and not is_continued
+        has_ending = self.support.ending_knots > 0 and is_ended
+        pattern = replace(
+            pattern,
+            onset=pattern.onset if has_onset else None,
+            ending=pattern.ending if has_ending else None,
+        )
+        adds_onset = has_onset and pattern.onset is None
+        adds_ending = has_ending and pattern.ending is None
+        if not (adds_onset or adds_ending):
+            return pattern
+        return self.timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
+
+    def build_pattern(
+        self,
+        number: int,
+        pattern: Pattern,
+        question: Question,
+        *,
+        playing: Drive,
+        valid_for: float,
+        restarts: bool = False,
+        is_shaped: bool = True,
+        lasts: float = math.inf,
+        among: int = 1,
+    ) -> tuple[PlateSet, Pattern]:
+        """Build the set of a pattern in a layer; returns it and the pattern as it is played.
+
+        playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
+        it restarts.
+        valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
+        onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
+        among: layers that change at once, which share the time on the wires.
+        """
+        tones, ramp = pattern.excitation, min(pattern.ramp, self.ramp_max)
+        onset = ending = None
+        if is_shaped:
+            restarted = restarted_by(tones, {} if restarts else playing)
+            is_continued = not restarted.issuperset([tone.frequency for tone in tones.values()])
+            is_ended = lasts > KNOT_STEP * ONSET_KNOTS
+            pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
+            onset, ending = pattern.onset, pattern.ending
+            if onset:
+                onset = thinned(onset, knots=max(1, self.support.onset_knots // among))
+        layers = route(
+            tones,
+            self.rig,
+            ramp=ramp,
+            number=number,
+            playing=playing,
+            restarts=restarts,
+            valid_for=valid_for,
+            onset=onset,
+            ending=ending,
+        )
+        ramp = next(iter(layers.values())).ramp
+        pattern = replace(pattern, ramp=ramp, onset=onset, ending=ending)
+        settled = max(ramp, next(iter(onset.values())).duration) if onset else ramp
+        return PlateSet(layers, settled, bool(ending), bool(onset or ending)), pattern
+
+    def plain(self, shaped: PlateSet) -> PlateSet:
+        """Build a set along its ramp, where an amplifier's ledger refuses its envelopes."""
+        layers: dict[str, Layer] = {}
+        for name, layer in shaped.layers.items():
+            if not layer.tones:
+                return self.build_end(layer.number, has_endings=False)
+            tones = [replace(tone, onset=None, ending=None) for tone in layer.tones]
+            layers[name] = replace(layer, tones=tuple(tones))
+        return PlateSet(layers, layer.ramp)
+
+    def build_renewal(self, playing: PlateSet, *, valid_for: float) -> PlateSet:
+        """Build the set that prolongs another for a time [s]."""
+        layers = {
+            name: Layer(layer.number, ramp=layer.ramp, valid_for=valid_for, renew=True)
+            for name, layer in playing.layers.items()
+        }
+        return PlateSet(layers, playing.settled_after)
+
+    def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
+        """Build the set that ends a layer along its endings, or along a ramp."""
+        ramp = min(FADE_RAMP, self.ramp_max)
+        if not has_endings:
+            return PlateSet(route({}, self.rig, ramp=ramp, number=number), ramp)
+        layers = {name: Layer(number, ramp=ramp) for name in self.rig.amplifiers}
+        return PlateSet(layers, ramp, is_shaped=True)
+
+
+def route(
+    excitation: physics.Excitation,
+    rig: Rig,
+    *,
+    ramp: float,
+    number: int = 0,
+    playing: Drive | None = None,
+    restarts: bool = False,
+    valid_for: float = 0.0,
+    onset: Envelopes | None = None,
+    ending: Envelopes | None = None,
+) -> dict[str, Layer]:
+    """Return the layer of a number for every amplifier of the rig, by name.
+
+    Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
+    level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
+    amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
+    keeps its phase if all its ERAs play it already, unless it restarts. valid_for [s]: of the
+    layers. onset, ending: by ERA; an onset may lead an ERA that is not driven to silence. All other
+    limits belong to the ledgers of the amplifiers. Raises InputError for an ERA that the rig does
+    not have.
+    """
+    unknown = sorted(excitation.keys() - rig.wiring.keys())
+    if unknown:
+        raise InputError(
+            f"pattern must drive ERAs of the rig, got {', '.join(unknown)}; build a table for this "
+            "rig"
+        )
+    before: Drive = playing or {}
+    restarted = restarted_by(excitation, {} if restarts else before)
+    strokes = {era.name: era.stroke for era in rig.eras}
+    onsets, endings = on_wire(strokes, onset, ending)
+    wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
+    for name, channel in rig.wiring.items():
+        driven, was, shape = excitation.get(name), before.get(name), onsets.get(name)
+        if driven is None:
+            # Falling silent while others play, it skips its ending, which belongs to all together.
+            frequency = onset[name].frequency if onset and shape else rig.limits.frequency_min
+            tone = Tone(channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name))
+        else:
+            phase = driven.phase  # not finite it stays so, and the ledger refuses it
+            if math.isfinite(phase):
+                phase = math.degrees(math.remainder(phase, math.tau))
+            tone = Tone(
+                channel.number,
+                driven.frequency,
+                level=driven.amplitude / strokes[name],
+                phase=phase,
+                keep_phase=driven.frequency not in restarted,
+                onset=shape,
+                ending=endings.get(name),
+            )
+        wired[channel.amplifier].append(tone)
+        rise = tone.level  # from rest, or through zero to another phase
+        if was is not None and rise and was.frequency == tone.frequency:
+            rise += was.level
+        least = rise / rig.limits.slew
+        ramp = least if least > ramp else ramp  # ledgers refuse NaN
+    return {name: Layer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()}
+
+
+def tones_by_era(
+    played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
+) -> dict[str, Tone]:
+    """Return what each ERA plays in the layer of a number, by name; without silent ones."""
+    playing = {
+        (amplifier, command.channel): command
+        for amplifier, layers in played.items()
+        for one in layers
+        for command in one.commands
+        if one.layer == number and command.level > 0
+    }
+    return {
+        name: Tone(
+            channel.number,
+            command.frequency / _FREQUENCY.per_unit,
+            command.level / _LEVEL.per_unit,
+            command.phase / _PHASE.per_unit,
+        )
+        for name, channel in rig.wiring.items()
+        if (command := playing.get((channel.amplifier, channel.number))) is not None
+    }
+
+
+def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
+    """Return the frequencies [Hz] that restart at the commit, because an ERA joins them.
+
+    All ERAs of one frequency must count its phase from one moment, or their field differs. Without
+    any, all tones continue what ERAs play now.
+    """
+    restarted = set()
+    for name, tone in excitation.items():
+        if name not in playing or playing[name].frequency != tone.frequency:
+            restarted.add(tone.frequency)
+    return restarted
+
+
+def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
+    """Return envelopes by ERA with at most so many knots beside the last value.
+
+    Over the same time, in whole steps of the wire; all have as many knots and the same step.
+    """
+    first = next(iter(envelopes.values()))
+    count, steps = len(first.knots), knots + 1
+    if count <= steps:
+        return envelopes
+    step = math.ceil(round(first.duration * _STEP.per_unit) / steps) / _STEP.per_unit
+    at = np.minimum(step * np.arange(1, steps + 1), first.duration) / first.step
+    since = np.minimum(at.astype(int), count - 1)
+    values = np.array([(each.start, *each.knots) for each in envelopes.values()])
+    between = values[:, since] + (values[:, since + 1] - values[:, since]) * (at - since)
+    return {
+        name: BaseEnvelope(each.frequency, each.start, tuple(row), step)
+        for (name, each), row in zip(envelopes.items(), between.tolist(), strict=True)
+    }
+
+
+def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[dict[str, Envelope]]:
+    """Return envelopes in integers of the wire; strokes [m]: by ERA, as envelopes are."""
+    motions: list[complex] = []
+    units: list[float] = []
+    for envelopes in several:
+        for name, one in envelopes.items() if envelopes else ():
+            motions += one.knots[:-1]
+            units += [strokes[name]] * (len(one.knots) - 1)
+    each = np.array(motions, dtype=complex) / units
+    levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
+    phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
+    phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
+    knots = zip(levels.tolist(), phases.tolist(), strict=True)
+    found: list[dict[str, Envelope]] = []
+    for envelopes in several:
+        found.append({})
+        for name, one in envelopes.items() if envelopes else ():
+            step = math.ceil(round(one.step * _STEP.per_unit, _DIGITS))
+            found[-1][name] = Envelope(step, tuple(islice(knots, len(one.knots) - 1)))
+    return found

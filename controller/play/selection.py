@@ -1,0 +1,368 @@
+"""Selection: from a haptic intent to the contents of a table that realise it, and when to ask anew.
+
+One question is answered at a time, with the fingers as they are when the one before was answered.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from functools import partial
+
+from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
+from controller.play.capabilities import PlaybackCapabilities
+from controller.play.choice import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
+from controller.play.content import (
+    BEING_CHOSEN,
+    Prediction,
+    Selection,
+    Targets,
+    no_layer_free,
+    not_served,
+)
+from controller.play.intent import FADED_AFTER, HapticIntent, Target
+from controller.touch.contacts import Contact, ContactKey
+from model.drive_modes import UNRESTRICTED
+from model.table.answer import MAX_SEPARATE
+
+# Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
+# radius is still within the disc that the pattern was chosen for.
+MOVE_TOLERANCE = 0.008
+
+# s; a finger that has not moved further for so long rests, and contents are chosen anew for it.
+_RESTS_AFTER = 0.1
+
+GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
+BLOCKED = (
+    f"{MAX_LATE} answers are still computed that took more than {TIME_LIMIT:g} s; touch with one "
+    "finger, and restart the daemon if it lasts"
+)
+
+_UNANSWERED = (GIVEN_UP, BLOCKED)
+
+_NOTHING = Selection((), ())
+
+
+@dataclass(frozen=True)
+class _Intended:
+    """Who is to feel what, among contacts: what lasts, short pulses, and who must not notice."""
+
+    contacts: tuple[Contact, ...]
+    lasting: Targets
+    short: Targets
+    protected: frozenset[ContactKey]
+
+    def is_met_by(self, chosen: Selection) -> bool:
+        """Whether what was chosen also serves what lasts among these contacts."""
+        if not (chosen.targets and self._is_part_of(chosen, _targets_of)):
+            return False
+        is_whole, then = chosen.is_whole, chosen.contacts
+        now = {each.key: each for each in self.contacts}
+        same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
+        return same and all(
+            math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+            and contact.load == then[key].load
+            and (key in self.protected) == (key in chosen.protected)
+            for key, contact in now.items()
+        )
+
+    def is_moved_from(self, chosen: Selection) -> bool:
+        """Whether those that feel what was chosen are to feel it still, in other places."""
+        return self.is_among(chosen) and self._is_part_of(chosen, _of_any_level)
+
+    def is_among(self, chosen: Selection) -> bool:
+        """Whether all contacts were there when it was chosen, and have not lifted since."""
+        then = {(each.key, each.since) for each in chosen.contacts.values()}
+        return all((each.key, each.since) in then for each in self.contacts)
+
+    def _is_part_of(self, chosen: Selection, kinds: Callable[[Targets], set[Target]]) -> bool:
+        """Whether what lasts was chosen, and no more that would leave others more if it ended.
+
+        The content of a finger that feels a short pulse meanwhile has not ended.
+        """
+        intended, had = kinds(self.lasting), kinds(chosen.targets)
+        if not intended <= had:
+            return False
+        pulsing = {contact.key for contact, _ in self.short}
+        return chosen.is_whole or all(target.key in pulsing for target in had - intended)
+
+
+def _targets_of(targets: Targets) -> set[Target]:
+    return {target for _, target in targets}
+
+
+def _of_any_level(targets: Targets) -> set[Target]:
+    return {replace(target, level_db_sl=None) for _, target in targets}
+
+
+def _of_any_course(targets: Targets) -> set[Target]:
+    return {replace(target, pulse=None, modulation_hz=None) for target in _of_any_level(targets)}
+
+
+class Selector:
+    """Chooses the contents of a table that realise an intent for the contacts on its plate.
+
+    Each target has its own: all that last are chosen together, in a thread where they are several;
+    a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
+    targets and their levels do, no contact has moved more than 8 mm, and none has another load,
+    which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
+    others as they are: a change would be felt. An answer that takes too long is given up: all that
+    lasts is silent until its fingers change, or until that answer has ended at last. chooser:
+    answers the next question; what the thread computes goes on by the former one. arrived: called
+    when the thread is done.
+    """
+
+    def __init__(
+        self,
+        chooser: Chooser,
+        *,
+        arrived: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.chooser = chooser
+        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._request_again)
+        self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
+        self._short: dict[ContactKey, Selection] = {}
+        self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
+        self._waits_since = math.inf  # s; when the first change came that waits for the thread
+        self.triggered_at = math.inf
+        """When [s] the change arrived whose answer the last selection has."""
+        self.due = math.inf
+        """When [s] to select anew though no contact changes: a finger rests, a pulse has ended."""
+
+    @property
+    def is_choosing(self) -> bool:
+        """Whether the thread computes."""
+        return self._thread.is_busy
+
+    def select(
+        self,
+        contacts: Sequence[Contact],
+        intent: HapticIntent,
+        capabilities: PlaybackCapabilities,
+        *,
+        triggered_at: float = math.inf,
+    ) -> Selection:
+        """Return the selection for contacts in their order of arrival; equal if it is kept.
+
+        While the thread computes, what played and is still to be felt stays. triggered_at [s]: when
+        their change arrived.
+        """
+        by_key = {target.key: target for target in intent.targets}
+        # Lists: a generator would be a call for each.
+        targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
+        served, skipped = _within_layers(targets, capabilities)
+        lasting: list[tuple[Contact, Target]] = []
+        short: list[tuple[Contact, Target]] = []
+        for each in served:
+            (short if each[1].is_short else lasting).append(each)
+        intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        fingers = {contact.key: contact.since for contact, _ in lasting}
+        came, self._fingers = fingers.items() - self._fingers.items(), fingers
+        if came and self._lasting.targets and not intended.is_met_by(self._lasting):
+            # Who has come back may be elsewhere.
+            self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
+        self.triggered_at = math.inf
+        arrived = self._thread.take()
+        if arrived is not None:
+            self._take(arrived, is_late=not self._is_intended(arrived, intended))
+        pulses, self._short = self._short, {}
+        for contact, target in short:
+            pulse = pulses.get(contact.key)
+            if pulse is not None and pulse.targets[0][1] == target:
+                self._short[contact.key] = pulse
+        if not contacts:
+            self._lasting = _NOTHING
+        self._waits_since = min(self._waits_since, triggered_at)
+        if self._thread.is_busy:
+            self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
+        else:
+            chooser = self.chooser
+            for requested in self._to_request(
+                intended, pulses, triggered_at, has_waited=arrived is not None
+            ):
+                if not requested.takes_long:
+                    self._take(chooser.choose(requested, capabilities))
+                elif self._thread.is_blocked:
+                    self._take(unanswered(requested, BLOCKED))
+                else:
+                    self._thread.compute(
+                        partial(chooser.choose, requested, capabilities),
+                        instead=unanswered(requested, GIVEN_UP),
+                    )
+            self._waits_since = math.inf
+        parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
+        found = _together(contacts, targets, parts, skipped, intent.reason)
+        if self._thread.is_busy and len(found.predictions) < len(targets):
+            reason = found.reason or (None if found.contents else BEING_CHOSEN)
+            found = replace(found, is_pending=True, reason=reason)
+        return found
+
+    def _request_again(self) -> None:
+        """Ask anew for fingers that were left without an answer, since one has ended."""
+        if self._lasting.reason in _UNANSWERED:
+            self._lasting = _NOTHING
+
+    def _to_request(
+        self,
+        intended: _Intended,
+        pulses: Mapping[ContactKey, Selection],
+        triggered_at: float,
+        *,
+        has_waited: bool,
+    ) -> Iterator[Requested]:
+        """Yield what is to be asked now, one after the other; pulses: of all fingers, until now.
+
+        A pulse that has waited for the thread goes before what lasts, for which it would be late.
+        """
+        lasting = intended.lasting
+        is_kept = not lasting or intended.is_met_by(self._lasting)
+        is_due = self.due < math.inf and self.due <= triggered_at
+        is_rested = bool(lasting) and is_due and is_kept
+        if is_due:
+            self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
+        new = tuple([each for each in intended.short if each[0].key not in self._short])
+        if is_kept and not is_rested and not new:
+            return
+        felt = _felt(self._lasting, self._fingers.keys())
+        before = {one.key: one for one in felt.contents}
+        for contact, _ in intended.short:
+            before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
+        playing = _playing(self._short, triggered_at)
+        requested = Requested(
+            new, intended.contacts, intended.protected, before, (felt, *playing), self._waits_since
+        )
+        if has_waited or is_kept:
+            if new:
+                yield requested
+                new, playing = (), _playing(self._short, triggered_at)
+            if is_kept and not is_rested:
+                return
+        takes_long = not is_alone(lasting, intended.protected)
+        is_moving = takes_long and not is_rested and intended.is_moved_from(self._lasting)
+        self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
+        yield replace(
+            requested,
+            short=new,
+            kept=playing,
+            lasting=lasting,
+            takes_long=takes_long,
+            is_moving=is_moving,
+            is_rested=is_rested,
+        )
+
+    def _is_intended(self, chosen: Chosen, intended: _Intended) -> bool:
+        """Whether what was chosen to last is for those that are on the plate by now.
+
+        Places may have changed since, and what effects change, or a program that plays them again:
+        else such a finger would get nothing. Those of another layout are not played. What plays may
+        do again, since a finger that came has lifted meanwhile.
+        """
+        found = chosen.lasting
+        if found is not None and found.reason in _UNANSWERED:
+            return True  # in doubt nothing plays
+        return (
+            found is not None
+            and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
+            and intended.is_among(found)
+            and intended.protected <= found.protected
+            and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
+        )
+
+    def _take(self, chosen: Chosen, *, is_late: bool = False) -> None:
+        """Take what was chosen; is_late: without what lasts."""
+        self._short = {**self._short, **chosen.short}
+        if chosen.lasting is not None and not is_late:
+            self._lasting = chosen.lasting
+            if self._lasting.reason in _UNANSWERED:
+                self.due = math.inf
+            if chosen.is_limited:
+                ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
+                self.due = max(ends) + FADED_AFTER
+        if chosen.short or not is_late:
+            self.triggered_at = chosen.requested.triggered_at
+
+
+def _together(
+    contacts: Sequence[Contact],
+    targets: Targets,
+    parts: Sequence[Selection],
+    skipped: tuple[Prediction, ...],
+    reason: str,
+) -> Selection:
+    """Join what was chosen apart, contacts as they were then; reason: why there are no targets."""
+    chosen = [part for part in parts if part.targets]
+    if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
+        return chosen[0]
+    then = {key: each for part in chosen for key, each in part.contacts.items()}
+    keys = {contact.key for contact, _ in targets}
+    quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
+    reasons = [part.reason for part in chosen if part.reason is not None]
+    levels = [part.quiet_levels for part in chosen]
+    return Selection(
+        tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
+        tuple(quiet),
+        tuple([content for part in chosen for content in part.contents]),
+        next(iter(reasons), None) if targets else reason,
+        (*[each for part in chosen for each in part.not_served], *skipped),
+        quiet_levels={
+            each.key: sum_db(level[each.key] for level in levels if each.key in level)
+            for each in quiet
+        },
+    )
+
+
+def _playing(short: Mapping[ContactKey, Selection], now: float) -> tuple[Selection, ...]:
+    """Return the short pulses that have not ended at a time [s]."""
+    return tuple([part for part in short.values() if any(now < each.end for each in part.pulses)])
+
+
+def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
+    """Return what was chosen, without the contents of all fingers but some, by key."""
+    if keys >= chosen.target_keys:
+        return chosen
+    return replace(
+        chosen,
+        targets=tuple([each for each in chosen.targets if each[0].key in keys]),
+        quiet=(*chosen.quiet, *[each for each, _ in chosen.targets if each.key not in keys]),
+        contents=tuple(
+            content
+            for content in chosen.contents
+            if any(contact.key in keys for contact, _ in content.targets)
+        ),
+        not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
+    )
+
+
+def _within_layers(
+    targets: Targets, capabilities: PlaybackCapabilities
+) -> tuple[Targets, tuple[Prediction, ...]]:
+    """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
+
+    Many that may share have one layer together.
+    """
+    mode = capabilities.drive_mode
+    count = capabilities.layers if mode == UNRESTRICTED else 1
+    if len(targets) <= count:
+        return targets, ()
+    reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
+    if mode == UNRESTRICTED:
+        reason = no_layer_free(count)
+    sharing = Counter([target.shared_as for _, target in targets])
+    layers: list[str | bool | None] = []
+    served = set[int]()
+    for at in sorted(range(len(targets)), key=lambda n: (targets[n][1].priority, n), reverse=True):
+        name = targets[at][1].shared_as
+        is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
+        if is_one and name in layers:
+            served.add(at)
+        elif len(layers) < count:
+            layers.append(name)
+            served.add(at)
+    return (
+        tuple(each for at, each in enumerate(targets) if at in served),
+        tuple(
+            not_served(contact, reason)
+            for at, (contact, _) in enumerate(targets)
+            if at not in served
+        ),
+    )

@@ -1,0 +1,1 @@
+"""A well-behaved Unix process: log, dumps, locks, service manager, children."""

@@ -1,0 +1,49 @@
+"""Child processes that end with their parent: `python -m controller.process.child PARENT MODULE ...`.
+
+PARENT is the process number of the starting process. On Linux the kernel terminates the module when
+that process exits, however it exits. Signals to the daemon that reach its children as well, as
+those of `systemctl kill` do, have no effect on them.
+"""
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import runpy
+import signal
+import sys
+
+_PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+def child_command(module: str, *arguments: str) -> list[str]:
+    """The command of a module as a child of this process."""
+    # -P: do not import a folder named controller in the working directory
+    command = [sys.executable, "-P", "-m", "controller.process.child", str(os.getpid())]
+    return [*command, module, *arguments]
+
+
+async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
+    """Wait for the end of a process that was asked to end; kill it after a time [s]."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout):
+            await process.wait()
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
+    await process.wait()
+
+
+def _main() -> None:
+    parent, module = int(sys.argv[1]), sys.argv[2]
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        return  # the parent exited before prctl
+    for number in (signal.SIGHUP, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
+    sys.argv[:] = [module, *sys.argv[3:]]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,331 @@
+"""The contacts on the plate, from any sequence of touch frames, and their loads.
+
+A load is told from what a panel reports: force, or size of the contact. It is relative to the rig's
+`fingertip`, a finger that presses lightly, and grows with the area of contact (`Fingertip.scaled`).
+Area grows as the force to the power of two thirds (Hertz), and so does the load: between the third
+of Hertz's stiffness and the first power of a pulp that stiffens exponentially.
+docs/concepts/people.md has the sources, and how well this is known.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from controller.touch.frames import Touch, TouchFrame
+from model.finger import MAX_CONTACTS
+from model.structure.plate import Plate
+
+LIGHT_FORCE = 0.5
+"""Force [N] of a finger that presses lightly: the mean of a tap on a touch screen."""
+
+LIGHT_MAJOR = 9.4
+"""Longer axis [mm] of its contact: the mean of index fingers on touch screens."""
+
+MIN_REPORTED, MAX_REPORTED = 0.4, 2.5
+"""Bounds of a reported load: contacts of 6 to 15 mm, forces of 0.13 to 2 N.
+
+Two standard deviations of the rig's default `uncertainty` of a load. What a panel reports beyond
+them tells more of the panel than of the finger.
+"""
+
+LANDING = 0.1
+"""Time [s] after which a finger that lands has its area of contact; until then none is reported."""
+
+MIN_CHANGE = 1.5
+"""Factor by which a reported load must differ from a contact's before that changes."""
+
+_BY_FORCE, _BY_SIZE = 2 / 3, 2.0  # exponents of the load
+
+
+@dataclass(frozen=True)
+class LightPress:
+    """Values of a panel's axes under a finger that presses lightly.
+
+    None for an axis that the panel does not have, or whose unit it does not state.
+    """
+
+    pressure: float | None = None
+    touch_major: float | None = None
+
+    def load(self, *, pressure: float, touch_major: float) -> float | None:
+        """Return the load of a contact with these values, not bounded; the force goes first.
+
+        None without a positive value of an axis.
+        """
+        if self.pressure is not None and pressure > 0:
+            return float((pressure / self.pressure) ** _BY_FORCE)
+        if self.touch_major is not None and touch_major > 0:
+            return float((touch_major / self.touch_major) ** _BY_SIZE)
+        return None
+
+
+def followed(known: float, reported: float | None) -> float:
+    """Return the load of a contact: the known one, unless the reported one differs enough.
+
+    Bounded. A contact whose panel stops reporting keeps its load.
+    """
+    if reported is None or not reported > 0:  # NaN is not
+        return known
+    bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
+    change = max(bounded / known, known / bounded)
+    return bounded if change >= MIN_CHANGE else known
+
+
+RIM = 0.0065
+"""How far beyond the plate's edge [m] a finger counts as on it: a fingertip's radius.
+
+Where cameras and frames report a finger on the edge depends on noise and calibration.
+"""
+
+# s; most sources repeat their frames at least every 100 ms, others state their own timeout. A
+# contact that is not confirmed must not be driven.
+CONTACT_TIMEOUT = 0.150
+
+# s; no sensor may stay silent for longer under a resting finger.
+MAX_CONTACT_TIMEOUT = 60.0
+
+# s; no finger leaves the plate so soon: its frames were held up and came together.
+MAX_GLIMPSE = 0.005
+
+# s; how long such a contact is kept, so that a click is decided, loaded and felt.
+TAP_TIME = 0.060
+
+
+class ContactKey(NamedTuple):
+    """Identifies a contact: its source and the id within that source."""
+
+    source: str
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
+
+    load: relative to the rig's fingertip, bounded and in steps, 1 where nothing is
+    reported.
+    """
+
+    key: ContactKey
+    x: float
+    y: float
+    since: float
+    load: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Contacts that came down, moved, pressed harder or less and lifted, each as it is or was.
+
+    rejected: a reason for each touch that was not accepted.
+    """
+
+    down: tuple[Contact, ...] = ()
+    moved: tuple[Contact, ...] = ()
+    pressed: tuple[Contact, ...] = ()
+    up: tuple[Contact, ...] = ()
+    rejected: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether any contact changed."""
+        return bool(self.down or self.moved or self.pressed or self.up)
+
+
+_UNCHANGED = Change()
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A source with contacts: the time [s] of its last frame, and its origin.
+
+    expiry [s]: when its contacts are lifted unless another frame arrives.
+    """
+
+    received: float
+    timeout: float
+    expiry: float
+    origin: str
+
+
+class ContactTracker:
+    """The contacts on one plate. Deterministic: times are arguments.
+
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch at most `RIM` outside
+    the plate (0..1) is at its edge. Rejects touches that are farther off, have non-finite
+    coordinates or repeat an id within a frame (the last one counts); a contact whose touch is
+    rejected is lifted. Where the maximum number of contacts
+    is reached, a contact of the input, origin or source with most is evicted if it has at least
+    two more than that of the touch; else the touch is rejected.
+    """
+
+    def __init__(self, plate: Plate) -> None:
+        self._plate = plate
+        self._contacts: dict[ContactKey, Contact] = {}
+        self._sources: dict[str, _Source] = {}
+        self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
+        self._newest = -math.inf  # s; time of the newest frame
+        self.contacts: tuple[Contact, ...] = ()
+        """All contacts in order of arrival; the newest is the last."""
+        self.next_expiry = math.inf
+        """When [s] the first contacts are lifted unless a frame of their source arrives."""
+
+    def expiry_of(self, key: ContactKey) -> float:
+        """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
+        if key not in self._contacts:
+            return -math.inf
+        return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
+
+    def sources_of(self, prefix: str) -> list[str]:
+        """Return the sources with contacts whose names begin so."""
+        return [name for name in self._sources if name.startswith(prefix)]
+
+    def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
+        """Apply a frame, which replaces the previous one of its source.
+
+        keeps_taps: whether a contact is kept for a while whose lift comes together with it.
+        """
+        rejected: list[str] = []
+        touches: dict[ContactKey, Touch] = {}
+        if math.isfinite(frame.time):
+            touches = _valid_touches(frame, self._plate, rejected)
+        elif frame.touches:
+            rejected.append("no_time")
+        if keeps_taps:
+            self._keep_taps(frame)
+        gone = []
+        for key in self._contacts:
+            if key.source == frame.source and (key in touches) == (key in self._taps):
+                gone.append(key)
+        up = self._lift(gone) if gone else ()
+        self._sources[frame.source] = _source_of(frame)
+        down: list[Contact] = []
+        moved: list[Contact] = []
+        pressed: list[Contact] = []
+        for key, touch in touches.items():
+            known = self._contacts.get(key)
+            if known is None and len(self._contacts) >= MAX_CONTACTS:
+                evicted = self._contact_to_evict(key)
+                if evicted is None:
+                    rejected.append("too_many")
+                    continue
+                up += self._lift([evicted])
+            contact = self._contacts[key] = self._contact(key, touch, known, frame.time)
+            if known is None:
+                down.append(contact)
+            elif (known.x, known.y) != (contact.x, contact.y):
+                moved.append(contact)
+            elif known.load != contact.load:
+                pressed.append(contact)
+        self._note_next()
+        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
+
+    def expire(self, now: float) -> Change:
+        """Lift the contacts of all sources that have timed out at now [s]."""
+        if self._newest <= now < self.next_expiry:
+            return _UNCHANGED
+        # Frames dated in the future are treated as received now.
+        expired = [name for name, source in self._sources.items() if source.expiry <= now]
+        ended = [key for key, end in self._taps.items() if end <= now]
+        up: tuple[Contact, ...] = ()
+        if expired or ended:
+            up = self._lift(key for key in self._contacts if key.source in expired or key in ended)
+        for name, source in self._sources.items():
+            if source.received > now:
+                self._sources[name] = replace(source, received=now, expiry=now + source.timeout)
+        self._note_next()
+        return Change(up=up) if up else _UNCHANGED
+
+    def _contact(
+        self, key: ContactKey, touch: Touch, known: Contact | None, time: float
+    ) -> Contact:
+        """Return the contact of a touch, down since a time [s] unless it is known."""
+        since, load = (time, 1.0) if known is None else (known.since, known.load)
+        if time - since >= LANDING:
+            load = followed(load, touch.load)
+        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
+        return Contact(key, x, y, since, load)
+
+    def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:
+        """Return the contact to lift for another one, if any.
+
+        The newest contact of the input, then the origin, then the source with most contacts, if it
+        has at least two more than the newcomer's.
+        """
+        keys = list(self._contacts)
+        groupings: tuple[Callable[[ContactKey], str], ...]
+        groupings = (_input_of, self._origin_of, lambda key: key.source)
+        for depth, group_of in enumerate(groupings):
+            counts = Counter(map(group_of, keys))
+            own = group_of(newcomer)
+            if max(counts.values(), default=0) > counts[own] + 1:
+                for deeper in groupings[depth:]:
+                    ((fullest, _),) = Counter(map(deeper, keys)).most_common(1)
+                    keys = [key for key in keys if deeper(key) == fullest]
+                return keys[-1]
+            keys = [key for key in keys if group_of(key) == own]
+        return None
+
+    def _origin_of(self, key: ContactKey) -> str:
+        return self._sources[key.source].origin
+
+    def _keep_taps(self, frame: TouchFrame) -> None:
+        """Keep contacts that have just come down and are not in a frame any more."""
+        ids = {touch.id for touch in frame.touches}
+        for key, contact in self._contacts.items():
+            is_lifted = key.source == frame.source and key.id not in ids
+            if is_lifted and frame.time - contact.since < MAX_GLIMPSE:
+                self._taps.setdefault(key, contact.since + TAP_TIME)
+
+    def _lift(self, keys: Iterable[ContactKey]) -> tuple[Contact, ...]:
+        """Remove contacts and return them."""
+        lifted = tuple(self._contacts.pop(key) for key in tuple(keys))
+        for contact in lifted:
+            self._taps.pop(contact.key, None)
+        return lifted
+
+    def _note_next(self) -> None:
+        """Forget sources without contacts, and note when the others expire."""
+        sources, ends = {}, [*self._taps.values()]
+        for key in self._contacts:
+            sources[key.source] = self._sources[key.source]
+        self._newest = -math.inf
+        for source in sources.values():
+            ends.append(source.expiry)
+            self._newest = max(self._newest, source.received)
+        self._sources, self.contacts = sources, tuple(self._contacts.values())
+        self.next_expiry = min(ends, default=math.inf)
+
+
+def _input_of(key: ContactKey) -> str:
+    """Return the input of a source, the beginning of its name; without one its kind."""
+    return key.source.partition(":")[0]
+
+
+def _source_of(frame: TouchFrame) -> _Source:
+    timeout = frame.timeout
+    if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
+        timeout = CONTACT_TIMEOUT
+    origin = frame.source if frame.origin is None else frame.origin
+    return _Source(frame.time, timeout, frame.time + timeout, origin)
+
+
+def _valid_touches(frame: TouchFrame, plate: Plate, rejected: list[str]) -> dict[ContactKey, Touch]:
+    """Return the touches that can be contacts; add a reason for each of the others."""
+    last = {touch.id: touch for touch in frame.touches}
+    rejected += ["twice"] * (len(frame.touches) - len(last))
+    valid = {}
+    for touch in last.values():
+        if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
+            rejected.append("not_finite")
+        elif 0 <= touch.x <= 1 and 0 <= touch.y <= 1:
+            valid[ContactKey(frame.source, touch.id)] = touch
+        else:
+            x, y = min(max(touch.x, 0.0), 1.0), min(max(touch.y, 0.0), 1.0)
+            beyond = math.hypot((touch.x - x) * plate.length, (touch.y - y) * plate.width)
+            if beyond > RIM:
+                rejected.append("off_plate")
+            else:
+                valid[ContactKey(frame.source, touch.id)] = replace(touch, x=x, y=y)
+    return valid

@@ -1,0 +1,292 @@
+"""Touch panels of a Linux machine, read from the kernel's input devices.
+
+Requests and structures are those of the kernel's include/uapi/linux/input.h, with the layout of
+request numbers that x86, Arm and RISC-V share (asm-generic/ioctl.h).
+"""
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import math
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator
+from urllib.parse import parse_qsl
+
+from controller.touch.frames import Touch, TouchFrame, TouchSource, number_option
+from controller.touch.slots import (
+    ABS_MT_POSITION_X,
+    ABS_MT_POSITION_Y,
+    ABS_MT_PRESSURE,
+    ABS_MT_SLOT,
+    ABS_MT_TOUCH_MAJOR,
+    BTN_TOUCH,
+    SINGLE_TOUCH_AXES,
+    SLOT_AXES,
+    TYPE_A,
+    InputEvent,
+    Range,
+    SlotReader,
+    SlotState,
+    as_slot_event,
+    light_press,
+)
+from model.errors import InputError
+
+_READ, _WRITE = 2, 1
+_EVENT = struct.Struct("llHHi")  # struct input_event: time of two longs, type, code, value
+_AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fuzz, flat, resolution
+_INT = struct.Struct("i")
+_EVENTS_AT_ONCE = 64
+_KEYS = 0x300 // 8  # bytes of a set of keys, KEY_CNT bits
+_MAX_AGE = 1.0  # s; of an event, else its time is of another clock
+
+
+def _request(direction: int, number: int, size: int) -> int:
+    """_IOC(direction, 'E', number, size)."""
+    return direction << 30 | size << 16 | ord("E") << 8 | number
+
+
+def eviocgabs(axis: int) -> int:
+    """Return the request EVIOCGABS: range and value of an axis."""
+    return _request(_READ, 0x40 + axis, _AXIS.size)
+
+
+def eviocgmtslots(size: int) -> int:
+    """Return the request EVIOCGMTSLOTS: an axis in every slot, for a buffer of a size."""
+    return _request(_READ, 0x0A, size)
+
+
+GRAB = _request(_WRITE, 0x90, _INT.size)  # EVIOCGRAB: exclusive access
+CLOCK = _request(_WRITE, 0xA0, _INT.size)  # EVIOCSCLOCKID: clock of the events
+PRESSED_KEYS = _request(_READ, 0x18, _KEYS)  # EVIOCGKEY
+
+
+def parse_events(data: bytes) -> Iterator[InputEvent]:
+    """Yield the complete events in data read from a device; the kernel never splits one."""
+    whole = len(data) // _EVENT.size * _EVENT.size
+    for seconds, microseconds, kind, code, value in _EVENT.iter_unpack(data[:whole]):
+        yield seconds + 1e-6 * microseconds, kind, code, value
+
+
+class InputDevice:
+    """An open panel at a path such as /dev/input/event5 or one under /dev/input/by-id.
+
+    One for a single finger, which has no multi-touch axes, looks like one with a single slot. grab:
+    keep its touches from other programs, such as a desktop. Raises InputError if it cannot be
+    opened or is no panel.
+    """
+
+    def __init__(self, path: str, *, grab: bool = False) -> None:
+        self.path = path
+        try:
+            self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise InputError(f"touch source {path}: {_advice(error, path)}") from error
+        try:
+            self._axis_codes: dict[int, int] = {}  # of axes with other codes than those of slots
+            if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # it does not have it
+                self._axis_codes = SINGLE_TOUCH_AXES
+            self.ranges = {
+                axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
+            }
+            measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
+            self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
+            self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
+            with contextlib.suppress(OSError):  # of an older kernel: see _MAX_AGE
+                fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
+            if grab:
+                fcntl.ioctl(self._descriptor, GRAB, 1)
+        except OSError as error:
+            self.close()
+            if error.errno == errno.EBUSY:
+                raise InputError(
+                    f"touch source {path}: grabbed by another program; stop that one "
+                    f"(`sudo fuser -v {path}` names it)"
+                ) from error
+            raise InputError(
+                f"touch source {path}: must be a touch panel ({error.strerror}); `libinput "
+                "list-devices` or `evtest` list the devices"
+            ) from error
+        except InputError:
+            self.close()
+            raise
+
+    def fileno(self) -> int:
+        """Return the descriptor for a selector."""
+        return self._descriptor
+
+    @property
+    def current_slot(self) -> int:
+        """The slot of the next event; raises OSError if the device is unplugged."""
+        return self._axis(ABS_MT_SLOT)[0]
+
+    def slots(self) -> dict[int, SlotState]:
+        """Return the state of every slot.
+
+        Raises OSError if the device is unplugged; EINVAL for one without slots, of type A.
+        """
+        if self._axis_codes:
+            keys = fcntl.ioctl(self._descriptor, PRESSED_KEYS, bytes(_KEYS))
+            is_down = keys[BTN_TOUCH // 8] >> BTN_TOUCH % 8 & 1
+            x, y, pressure = (self._axis(axis)[0] for axis in SINGLE_TOUCH_AXES)
+            return {0: SlotState(is_down - 1, x, y, pressure=pressure)}
+        states = zip(*map(self._slot_values, SLOT_AXES), strict=True)
+        return {slot: SlotState(*state) for slot, state in enumerate(states)}
+
+    def read(self) -> list[InputEvent]:
+        """Return the pending events; raises OSError if the device is unplugged."""
+        try:
+            data = os.read(self._descriptor, _EVENT.size * _EVENTS_AT_ONCE)
+        except BlockingIOError:
+            return []
+        if not data:
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+        events = parse_events(data)
+        return list(map(as_slot_event, events) if self._axis_codes else events)
+
+    def close(self) -> None:
+        """Close the device."""
+        os.close(self._descriptor)
+
+    def _axis(self, axis: int) -> tuple[int, int, int, int]:
+        """Return value, minimum, maximum and resolution of an axis; zeros if it has none."""
+        request = eviocgabs(self._axis_codes.get(axis, axis))
+        raw = fcntl.ioctl(self._descriptor, request, bytes(_AXIS.size))
+        value, low, high, _, _, resolution = _AXIS.unpack(raw)
+        return value, low, high, resolution
+
+    def _range(self, axis: int) -> Range:
+        """Return the range of an axis; raises InputError if it is empty."""
+        _, low, high, _ = self._axis(axis)
+        if low >= high:
+            code = self._axis_codes.get(axis, axis)
+            raise InputError(
+                f"touch source {self.path}: minimum of axis {code:#x} must be below its maximum, "
+                f"got {low} and {high}; choose a multi-touch panel that reports slots (type B), or "
+                "a single-touch panel"
+            )
+        return low, high
+
+    def _slot_values(self, axis: int) -> tuple[int, ...]:
+        """Return the value of an axis in every slot."""
+        layout = struct.Struct(f"{1 + self._slot_count}i")
+        buffer = layout.pack(axis, *([0] * self._slot_count))
+        _, *values = layout.unpack(
+            fcntl.ioctl(self._descriptor, eviocgmtslots(layout.size), buffer)
+        )
+        return tuple(values)
+
+
+def _advice(error: OSError, path: str) -> str:
+    """Return why a device cannot be opened, and the remedy."""
+    if error.errno == errno.EACCES:
+        return (
+            "no permission to read; add yourself to the group of the device (usually "
+            "`sudo usermod -aG input $USER`, then log in again) or install a udev rule"
+        )
+    if error.errno == errno.ENOENT:
+        return "no such device; `ls -l /dev/input/by-id` lists those that are plugged in"
+    return f"{path} cannot be opened: {error.strerror}"
+
+
+REPEAT_INTERVAL = 0.05  # s; a panel at rest is silent, but contacts time out without frames
+
+_LIGHT_PRESS = {"light_pressure": ABS_MT_PRESSURE, "light_major": ABS_MT_TOUCH_MAJOR}
+
+
+class EvdevSource(TouchSource):
+    """Follows the panel at `evdev:PATH` or `evdev:PATH?grab=yes`, such as evdev:/dev/input/event5.
+
+    `light_pressure=VALUE`, `light_major=VALUE`: of its axes under a finger that presses lightly.
+
+    A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
+    detects an unplugged panel at once. Raises InputError for any other URL, and in `run` if there
+    is no panel, or none any more.
+    """
+
+    def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:
+        path, _, options = url.removeprefix("evdev:").partition("?")
+        grab, self._light_values = _panel_options(options)
+        if not url.startswith("evdev:") or not path or grab not in ({}, {"grab": "yes"}):
+            raise InputError(
+                "touch source must be evdev:PATH of an input device, or evdev:PATH?grab=yes to "
+                "keep its touches from other programs; also light_pressure=VALUE and "
+                f"light_major=VALUE, got {url}"
+            )
+        self._name = f"evdev:{path}"
+        self._path = path
+        self._grab = bool(grab)
+        self._open = open_panel
+
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+        """Deliver a frame per report until cancelled."""
+        panel = self._open(self._path, grab=self._grab)
+        try:
+            await self._follow(panel, deliver)
+        except OSError as error:
+            lost = f"lost ({error.strerror}); plug it in again"
+            reason = TYPE_A if error.errno == errno.EINVAL else lost
+            raise InputError(f"touch source {self._path}: {reason}") from error
+        finally:
+            panel.close()
+
+    async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
+        """Deliver frames at the kernel's times; raises OSError if the panel is unplugged."""
+        loop = asyncio.get_running_loop()
+        press = light_press(panel.resolutions, self._light_values)
+        reader = SlotReader(panel.ranges, light_press=press)
+        reader.resynchronise(panel.slots(), current=panel.current_slot)
+        self._deliver(deliver, reader.touches)
+        readable = asyncio.Event()
+        loop.add_reader(panel.fileno(), readable.set)
+        try:
+            while True:
+                try:
+                    async with asyncio.timeout(REPEAT_INTERVAL if reader.touches else None):
+                        await readable.wait()
+                except TimeoutError:
+                    reader.resynchronise(panel.slots(), current=panel.current_slot)
+                    self._deliver(deliver, reader.touches)
+                    continue
+                readable.clear()
+                for happened, *event in panel.read():
+                    report = reader.feed(*event)
+                    if report is None:
+                        continue
+                    if report.is_partial:
+                        reader.resynchronise(panel.slots(), current=panel.current_slot)
+                        self._deliver(deliver, reader.touches, happened)
+                    else:
+                        for touches in report.states:
+                            self._deliver(deliver, touches, happened)
+        finally:
+            loop.remove_reader(panel.fileno())
+
+    def _deliver(
+        self,
+        deliver: Callable[[TouchFrame], None],
+        touches: tuple[Touch, ...],
+        happened: float = -math.inf,
+    ) -> None:
+        """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
+        now = asyncio.get_running_loop().time()
+        time = happened if now - _MAX_AGE <= happened <= now else now
+        deliver(TouchFrame(self._name, time, touches))
+
+
+def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:
+    """Split the options of a panel: others, and `light_pressure` and `light_major` by axis.
+
+    These are the values of the axes under a finger that presses lightly; one that is no number of
+    at least 0 is among the others.
+    """
+    others, by_axis = dict(parse_qsl(options, keep_blank_values=True)), {}
+    for name, axis in _LIGHT_PRESS.items():
+        value = number_option(f"{name}={others[name]}", name, default=0) if name in others else -1
+        if 0 <= value < math.inf:
+            by_axis[axis] = value
+            del others[name]
+    return others, by_axis

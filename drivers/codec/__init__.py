@@ -1,1 +1,0 @@
-"""Codecs between messages and bytes, a package for each kind of wire; no I/O."""

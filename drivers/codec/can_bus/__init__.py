@@ -1,1 +1,0 @@
-"""The CAN codec, the host's side: messages, their PDOs and objects, frames."""

@@ -1,1 +1,0 @@
-"""Codec of Modbus for the host: messages, registers, ADUs."""

@@ -1,1 +1,0 @@
-"""Codec of serial lines: messages, payloads, frames."""

@@ -1,1 +1,0 @@
-"""Discovery of amplifiers that this machine can reach."""

@@ -1,0 +1,85 @@
+"""The contract of every amplifier of protocol 3, on whatever wire, as checks.
+
+Run against hardware by its URL, and by the project's tests over every wire in virtual time. Checks
+that only read come first; the others arm the amplifier and drive its channels.
+"""
+
+from collections.abc import Callable
+
+from drivers.judge.asking import (
+    can_frames,
+    modbus_frames,
+    playing,
+    reading,
+    sensors,
+    serial_frames,
+    sets,
+    staging,
+    states,
+)
+from drivers.judge.asking.check import Check, CheckResult, Report, Result, run_checks
+from drivers.judge.asking.opening import opened
+from drivers.judge.asking.subject import LEVEL
+
+__all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]
+
+CHECKS: tuple[Check, ...] = (
+    *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
+    *(reading.unknown_types, reading.reading_changes_nothing, reading.hello_for_ever),
+    *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_frames.objects),
+    *(reading.lengths, states.stop, states.stop_ramps, states.silence_never_later),
+    *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
+    *(states.silence, states.plays_nothing_disarmed, states.arming, states.watchdog_ranges),
+    *(states.arms_again, states.sessions, states.arming_ends_fades, reading.obeys_in_time),
+    *(states.watchdog, states.watchdog_unread, states.what_feeds),
+    *(states.what_does_not_feed, states.trips_amid_other_requests),
+    *(states.trips_amid_fades, states.fault_list),
+    *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
+    *(sets.all_or_nothing, sets.accepts_its_ranges, staging.parts_of_sets, staging.max_set),
+    *(staging.sets_expire, staging.stage_and_commit, staging.repeats_change_nothing),
+    *(staging.tokens_wrap, staging.newer_sets_replace, staging.committed_together),
+    *(playing.layers_add, playing.layers_play_on, playing.valid_for, playing.renew, playing.after),
+    *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),
+    *(playing.endings_amid, playing.extreme_envelopes, playing.phases, playing.voices),
+    *(playing.voices_of_layers, playing.limited),
+    *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
+    *(modbus_frames.present_areas, modbus_frames.exceptions),
+    *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
+    *(reading.events, reading.broadcasts, reading.addresses, sensors.measured, sensors.readings),
+)
+"""All checks, in their order of execution."""
+
+
+def of_kind(kind: str) -> list[tuple[int, Check]]:
+    """Return the checks of a kind of wire, each with its number."""
+    numbered = enumerate(CHECKS, 1)
+    return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
+
+
+async def judge(
+    url: str,
+    *,
+    drives: bool,
+    level: float = LEVEL,
+    on_result: Callable[[CheckResult], None] = lambda result: None,
+    before: Report | None = None,
+) -> Report:
+    """Check the amplifier at a URL, and leave it silent and disarmed.
+
+    drives: also what arms it and drives its channels, at this level of full level at most.
+    on_result: called with each result. before: report of checks that are not run again. Raises
+    CommandError for a URL that is none, LinkError for a line that cannot be opened or is lost.
+    """
+    results = () if before is None else before.results
+    known = {each.number for each in results}
+    async with opened(url) as client:
+        checks = of_kind(client.kind)
+        chosen = [
+            (number, check)
+            for number, check in checks
+            if number not in known and (drives or not check.drives)
+        ]
+        found = await run_checks(chosen, client, level=level, on_result=on_result, before=results)
+    results = (*results, *found)
+    driven = level if any(each.check.drives for each in results) else 0.0
+    return Report(url, driven, results, len(checks) - len(results))

@@ -1,0 +1,361 @@
+"""A host below the host: one raw message at a time, the times of all that is heard, and findings.
+
+A client of a kind of wire makes frames and reads them; nothing is repeated or given up by itself,
+and what was not asked for is kept, so that checks see it. A check finds a violation of the
+contract, nothing to check, or that it came too late.
+"""
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+
+from drivers import trace
+from drivers.errors import LinkError
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import REACTION
+from drivers.wires.wire import read_nak
+from registry import clock
+
+
+class Violation(Exception):
+    """The amplifier does other than the contract: what must be what, and what was seen.
+
+    sent: the last set, came: the last bytes of the amplifier, in hexadecimal.
+    """
+
+    sent = came = ""
+
+    def __init__(self, what: str, *, expected: object, seen: object) -> None:
+        self.expected, self.seen = str(expected), f"{what}: {seen}"
+        super().__init__(f"{what} must be {expected}, got {seen}")
+
+
+class Armed(Violation):
+    """It is armed, perhaps by another host: nothing is driven."""
+
+
+class Optional(Exception):
+    """The amplifier, or its wire, does not have what is checked, as the contract allows."""
+
+
+class Unusable(Exception):
+    """A capability that the check needs is not as it must be, which its own check reports."""
+
+
+class Late(Exception):
+    """This machine was too late for what the check needs: it must be made again."""
+
+
+def require(is_possible: bool, why: str) -> None:
+    """Raise Optional, with the reason, unless the check can be made."""
+    if not is_possible:
+        raise Optional(why)
+
+
+def require_in_time(is_in_time: bool, why: str) -> None:
+    """Raise Late, with the reason, unless this machine was in time."""
+    if not is_in_time:
+        raise Late(why)
+
+
+def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
+    """Raise Violation unless the condition holds."""
+    if not condition:
+        raise Violation(what, expected=expected, seen=seen)
+
+
+def expect_equal(seen: object, expected: object, what: str) -> None:
+    """Raise Violation unless both are equal."""
+    expect(seen == expected, what, expected=expected, seen=seen)
+
+
+def expect_within(seen: float, low: float, high: float, what: str) -> None:
+    """Raise Violation unless a number is within limits."""
+    expect(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
+
+
+def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
+    """Raise Violation unless something is known."""
+    expect(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
+
+
+_MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was late
+_FEW = 3  # replies, which this machine does not make late by chance
+_MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
+_LOOK = 0.005  # s; between looks whether this machine is late
+_STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
+REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
+GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
+_MAX_SHOWN = 300  # bytes
+QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
+_T = TypeVar("_T")
+
+
+class Port(Protocol):
+    """An open port; what it receives goes to `Client.received`."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; raises LinkError."""
+
+
+class When(NamedTuple):
+    """An interval in which something happened [s]."""
+
+    earliest: float
+    latest: float
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message of the amplifier: number of its request (0: an event), type, words.
+
+    frame: that it came in, as its wire has it. Without a type these are bytes that are no frame.
+    """
+
+    at: float
+    number: int
+    type: int
+    words: tuple[int, ...]
+    frame: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of a request: code of a refusal, empty where it was carried out; its words.
+
+    channel: that a refusal names; when: between sending and the reply [s]; values: of the words.
+    """
+
+    code: str
+    channel: int | None
+    words: tuple[int, ...]
+    when: When
+    values: Values = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a value."""
+        return self.values[name]
+
+
+class Client(ABC):
+    """One amplifier at an address of a line.
+
+    heard: messages that no request was waiting for; events: those of type Event; order: types of
+    all, as they came. reply_words: the longest reply to each message by its number, where it is
+    known. quiet: time [s] in which a reply comes; timeout: for which one is awaited. wire_time: on
+    the wire [s], of a request and a reply by their words; transit: of the longest reply. session:
+    that was begun last. loss: why the line was lost. came: bytes of the amplifier since the last
+    request.
+
+    neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
+    looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
+    times until a reply began. attempts: of this check that came too late; wasted: the time
+    [s] of all of the run. lag: by how much this machine was late since the check began, at most.
+    """
+
+    kind: ClassVar[str]
+    """Kind of wire: serial, rtu, tcp or can."""
+    has_events: ClassVar[bool] = True
+    """Whether the wire carries messages that were not asked for."""
+    has_broadcasts: ClassVar[bool] = True
+    """Whether one request can reach all addresses."""
+    addresses: ClassVar[int] = 247
+    """The highest address."""
+    transactions: ClassVar[int] = 1
+    """What the wire makes of a request that changes something, each with a reply."""
+
+    port: Port
+    """Of its line; given once it is open."""
+    name = ""
+    """Under which its bytes are traced."""
+
+    def __init__(self, address: int) -> None:
+        self.address = address
+        self.heard: list[Heard] = []
+        self.events: list[Heard] = []
+        self.order: list[int] = []
+        self.reply_words: dict[int, int] = {}
+        self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
+        self.transit = 0.0
+        self.timeout = REPLY_TIMEOUT
+        self.came = b""
+        self.neighbours: frozenset[int] = frozenset()
+        self.free = self.attempts = 0
+        self.fastest: dict[str, float] = {}
+        self.reactions: dict[str, list[float]] = defaultdict(list)
+        self.wasted = self.lag = 0.0
+        self.quiet = QUIET
+        self.session = 0
+        self.loss: str | None = None
+        self._others: set[int] = set()
+        self._news = asyncio.Event()
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the port."""
+        trace.frame(trace.Direction.IN, data, self.name, str)
+        self.came = (self.came + self.hear(data))[-_MAX_SHOWN:]
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; raises LinkError."""
+        trace.frame(trace.Direction.OUT, data, self.name, str)
+        self.port.write(data)
+
+    @abstractmethod
+    def hear(self, data: bytes) -> bytes:
+        """Take messages from bytes; returns those bytes that are the amplifier's."""
+
+    @abstractmethod
+    def question(self, address: int) -> bytes:
+        """Return the frame of a request that only reads, to an address."""
+
+    @abstractmethod
+    async def hello(self) -> Values:
+        """Read the identity; raises Violation."""
+
+    @abstractmethod
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Send a message and await its reply; raises Violation where none comes."""
+
+    @abstractmethod
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frames of a request; to: its address, 0 for all, None for this amplifier."""
+
+    @abstractmethod
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
+
+    async def look_around(self) -> None:
+        """Learn who else is on the line, by what only reads; once.
+
+        Every address is asked where a broadcast would reach it, else until one is free.
+        """
+        wait = max(self.quiet, REACTION + self.transit) if self.has_broadcasts else GATEWAY_TIMEOUT
+        for address in range(self.addresses, 0, -1) if not self.free else ():
+            if address == self.address:
+                continue
+            self.write(self.question(address))
+            found = await self.next(lambda each: True, wait)
+            if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
+                self._others.add(address)
+            if address not in self._others:
+                self.free = self.free or address
+                if not self.has_broadcasts:
+                    break
+        self.heard.clear()
+        expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
+        self.neighbours = self.neighbours or frozenset(self._others)
+
+    @property
+    def slow_reply(self) -> str:
+        """Which message it always replies to later than it may, and by when; empty if none."""
+        for name, times in self.reactions.items():
+            if len(times) >= _FEW and (least := min(times)) > REACTION:
+                return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
+        return ""
+
+    def was_late(self, since: float) -> bool:
+        """Note an attempt from a time on that came too late; returns whether to make it again."""
+        if self.slow_reply:
+            return False
+        if self.attempts < _MAX_ATTEMPTS:
+            self.attempts += 1
+            self.wasted += clock.now() - since
+        return self.attempts < _MAX_ATTEMPTS and self.wasted < _MAX_WASTED
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Measure by how much this machine is late while the context lasts."""
+
+        async def look() -> None:
+            while True:
+                due = clock.now() + _LOOK
+                await asyncio.sleep(_LOOK)
+                self.lag = max(self.lag, clock.now() - due)
+
+        self.attempts, self.lag = 0, 0.0
+        looking = asyncio.create_task(look(), name="how late this machine is")
+        try:
+            yield
+        finally:
+            looking.cancel()
+
+    def lost(self, cause: str) -> None:
+        """Note why the line was lost."""
+        self.loss = cause
+
+    async def expect_silence(self, data: bytes, what: str) -> None:
+        """Send bytes, to which nothing must be heard."""
+        heard = await self.send(data)
+        expect(not heard, f"replies to {what}", expected="none", seen=len(heard))
+
+    async def send(self, data: bytes) -> list[Heard]:
+        """Send bytes; return what is heard until a reply must have come."""
+        self.heard.clear()
+        self.came = b""
+        self.write(data)
+        await asyncio.sleep(self.quiet)
+        heard, self.heard = self.heard, []
+        return heard
+
+    def take(self, message: Heard, *, is_event: bool = False) -> None:
+        """Keep a message that was heard."""
+        (self.events if is_event else self.heard).append(message)
+        self.order.append(message.type)
+        self._news.set()
+
+    async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:
+        """Return the first message that is meant, None if it does not come in time [s]."""
+        self.came = b""
+        loop, due = asyncio.get_running_loop(), clock.now() + timeout
+        timer = loop.call_at(due, self._news.set)
+        try:
+            while True:
+                for message in self.heard:
+                    if is_meant(message):
+                        self.heard.remove(message)
+                        return message
+                if self.loss is not None:
+                    raise LinkError(self.loss)
+                if clock.now() >= due:
+                    return None
+                self._news.clear()
+                await self._news.wait()
+        finally:
+            timer.cancel()
+
+    async def replied(self, is_meant: Callable[[Heard], bool], number: int) -> Heard:
+        """Return the reply to a message that was sent; Violation where none comes."""
+        before, self.lag = self.lag, 0.0
+        found = await self.next(is_meant, self.timeout)
+        is_in_time, self.lag = self.lag <= _STALLED, max(self.lag, before)
+        if found is None:
+            require_in_time(is_in_time, f"no reply came to message {number}")
+            others = f", but {len(self.came)} other bytes" if self.came else ""
+            seen = f"none within {self.timeout:g} s{others}"
+            raise Violation(f"reply to message {number}", expected="one", seen=seen)
+        return found
+
+    def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
+        """Make the answer of a Nak; Violation where it names another request."""
+        nak = read_as("Nak", read_nak, words, is_strict=True)
+        expect_equal(words[0], number, "request that a Nak names")
+        return Answer(nak.code, nak.channel, (), When(sent, came))
+
+
+def altered(data: bytes, at: int) -> bytes:
+    """Return bytes with one bit of one of them wrong."""
+    changed = bytearray(data)
+    changed[at] ^= 0x10
+    return bytes(changed)
+
+
+def read_as(what: str, read: Callable[..., _T], *arguments: object, **options: object) -> _T:
+    """Return what is read; Violation where it cannot be read."""
+    try:
+        return read(*arguments, **options)
+    except Refusal as error:
+        raise Violation(what, expected="as in the table", seen=error) from None

@@ -1,0 +1,217 @@
+"""Rows of a check, what is sent in turn and what must be answered, and sets within capabilities."""
+
+import math
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+from drivers.judge.asking.client import require
+from drivers.judge.asking.stated import Capabilities
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES, has_feature
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """A request by its values, the session that is held unless one is given, or by raw words.
+
+    layers: of a set, which is sent in its parts. codes: one of which must be the answer, an empty
+    one: carried out. channels: one of which a refusal must name.
+    """
+
+    name: str
+    raw: Sequence[int] | None
+    values: Values
+    layers: tuple[LayerSet, ...]
+    codes: tuple[str, ...]
+    channels: tuple[int | None, ...]
+
+
+Row: TypeAlias = "LayerSet | Send | float | Callable[[], Awaitable[object]] | Sequence[Row]"
+"""A layer that plays, a request, a pause [s] in which the watchdog is fed, what is awaited, or a
+course: rows that begin at rest, armed, and are followed until all is settled."""
+Rows: TypeAlias = Sequence[Row]
+
+
+def send(
+    name: str,
+    *,
+    raw: Sequence[int] | None = None,
+    code: str | tuple[str, ...] = "",
+    channels: tuple[int | None, ...] = (None,),
+    layers: tuple[LayerSet, ...] = (),
+    **values: Any,
+) -> Send:
+    """Make a request that must be carried out, or refused with a code."""
+    return Send(name, raw, values, layers, (code,) if isinstance(code, str) else code, channels)
+
+
+def play(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
+    """Make a set that plays at once; values: token, session, code, as of `send`."""
+    return send("Set", layers=layers, now=now, **values)
+
+
+def stage(*layers: LayerSet, **values: Any) -> Send:
+    """Make a set that is staged."""
+    return play(*layers, now=0, **values)
+
+
+FULL = QUANTITIES["level"].per_unit
+
+
+class Material:
+    """What an amplifier can play.
+
+    A capability is looked at where it is needed.
+    """
+
+    def __init__(self, can: Capabilities, level: float) -> None:
+        self.can = can
+        self._level = level
+        self.channels = range(can["channels"])
+
+    @property
+    def layers(self) -> range:
+        """The numbers of its layers."""
+        return range(self.can["layers"])
+
+    @cached_property
+    def level(self) -> float:
+        """Of driven channels, at most; Optional where it has none so low."""
+        limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
+        level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
+        require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
+        return level
+
+    @cached_property
+    def lowest(self) -> int:
+        """The lowest frequency of every channel, in steps; Optional where they share none."""
+        limits = [self.can, *self.can["limits"]]
+        lowest = max(one["frequency_min"] for one in limits)
+        require(lowest <= self.highest, "its channels have no frequency in common")
+        return int(lowest)
+
+    @cached_property
+    def highest(self) -> int:
+        """The highest frequency of every channel, in steps."""
+        return int(min(one["frequency_max"] for one in (self.can, *self.can["limits"])))
+
+    @cached_property
+    def frequency(self) -> int:
+        """The usual frequency, in steps."""
+        ordinary = QUANTITIES["frequency"].to_wire(110.0)
+        return min(max(ordinary, self.lowest), self.highest)
+
+    @cached_property
+    def other(self) -> int:
+        """Another frequency, where there is one, in steps."""
+        both = self.frequency + 800, self.lowest, self.highest
+        return next(each for each in both if each <= self.highest)
+
+    def has(self, feature: str) -> bool:
+        """Whether it states a feature; empty: what all have."""
+        return not feature or has_feature(self.can, feature)
+
+    def require(self, feature: str) -> None:
+        """Raise Optional where it does not state a feature."""
+        require(self.has(feature), f"it states no {feature}")
+
+    def require_knots(self) -> None:
+        """Raise Optional where its envelopes have no knots."""
+        require(self.can["knots"] > 0, "it has no knots")
+
+    def tone(
+        self,
+        channel: int = 0,
+        fraction: float = 1.0,
+        phase: float = 0.0,
+        *,
+        frequency: int = 0,
+        keep: bool = False,
+        onset: Envelope | None = None,
+        ending: Envelope | None = None,
+    ) -> Command:
+        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
+
+        Raises Optional for a level that the amplifier may round to 0.
+        """
+        level, step = round(fraction * self.level * FULL), self.can["level_step"]
+        require(
+            not 0 < level < step,
+            f"its steps of level are coarser than {level / FULL:g}; see --level",
+        )
+        numbers = frequency or self.frequency, level, QUANTITIES["phase"].to_wire(phase)
+        return Command(channel, *numbers, keep, onset=onset, ending=ending)
+
+    def one(
+        self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0
+    ) -> LayerSet:
+        """Make what layer 0 is to play, by default the usual tone on channel 0."""
+        tones = commands or [self.tone(0, level)]
+        return layer(0, *tones, ramp=ramp, valid_for=valid_for)
+
+    def whole(self) -> LayerSet:
+        """Make the usual tone on all channels."""
+        return layer(0, *map(self.tone, self.channels))
+
+    def transitions(self, ramp: int) -> list[list[LayerSet]]:
+        """Make layers that play one after the other, the last of which changes what plays."""
+        slow = self.envelope(0.1, 1, 1, 1)
+        begins, ends = self.one(self.tone(onset=slow)), self.one(self.tone(ending=slow))
+        other = self.tone(frequency=self.other)
+        return [
+            [self.one(ramp=ramp)],
+            [self.one(), layer(0, ramp=ramp)],
+            [self.one(), layer(0, other, ramp=ramp)],
+            [self.one(valid_for=60_000)],
+            [begins],
+            [ends],
+            [ends, layer(0)],
+            [begins, layer(0, other, after=True)],
+            [layer(number, self.tone(0, 0.2)) for number in self.layers],
+        ]
+
+    def envelope(self, step: float, *amplitudes: complex) -> Envelope:
+        """Make an envelope of knots in fractions of the test level, or the nearest step [s].
+
+        Of as many knots as there can be.
+        """
+        amplitudes = amplitudes[: self.can["knots"]]
+        low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
+        steps = min(max(QUANTITIES["envelope_step"].to_wire(step), low), high)
+        phases = [math.degrees(math.atan2(each.imag, each.real)) for each in amplitudes]
+        knots = [
+            (round(abs(each) * self.level * FULL), QUANTITIES["phase"].to_wire(phase))
+            for each, phase in zip(amplitudes, phases, strict=True)
+        ]
+        return Envelope(steps, tuple(knots))
+
+    def beside(self, number: int, fraction: float) -> Command:
+        """Make a tone on channel 0 that does not interfere with those of other layers."""
+        return self.tone(0, fraction, frequency=self.apart(number))
+
+    def near(self, number: int) -> int:
+        """Return one of many frequencies, all alike where there is no room."""
+        room = max(self.highest - self.frequency, 0)
+        return int(self.frequency + min(max(10, self.can["frequency_step"]) * number, room))
+
+    def apart(self, number: int) -> int:
+        """Return a frequency of a layer of its own, so that layers do not interfere."""
+        step = self.can["frequency_step"]
+        above = self.frequency + max(40, step) * number
+        highest = self.highest - (len(self.layers) - number) * step
+        return int(max(min(above, highest), self.lowest))
+
+
+def layer(
+    number: int,
+    *commands: Command,
+    ramp: int = 0,
+    valid_for: int = 0,
+    after: bool = False,
+    renew: bool = False,
+) -> LayerSet:
+    """Make what one layer is to play; ramp, valid_for in ms."""
+    return LayerSet(number, ramp, valid_for, commands, after, renew)

@@ -1,0 +1,315 @@
+"""A Modbus line, RTU or TCP, PDU by PDU: writes of messages, reads of their replies; its checks."""
+
+import asyncio
+import struct
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import cast
+
+from drivers.judge.asking.check import driving, reading
+from drivers.judge.asking.client import (
+    GATEWAY_TIMEOUT,
+    QUIET,
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect,
+    expect_equal,
+    read_as,
+    require_in_time,
+)
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
+from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
+from drivers.wires.modbus.frames import (
+    EXCEPTION,
+    READ,
+    WRITE,
+    framed,
+    read_pdu,
+    response_form,
+    response_size,
+    split_rtu,
+    split_tcp,
+    write_pdu,
+)
+from drivers.wires.modbus.registers import (
+    AREA,
+    BOX,
+    EXCEPTIONS,
+    HEAD,
+    IDENTITY,
+    IDENTITY_COUNT,
+    PRESENT,
+    REPLY,
+    unpack_identity,
+)
+from registry import clock
+
+READ_HOLDING = 3
+"""The other function that reads."""
+_PRESENT = tuple(MESSAGES[name].number for name in PRESENT)
+
+
+class ModbusClient(Client):
+    """A line or a connection; number: of the last transaction and tag."""
+
+    has_events = False
+    transactions = 2
+    has_gateway = False
+    """Whether a gateway replies for units that are not there."""
+
+    def __init__(self, address: int, *, is_rtu: bool) -> None:
+        super().__init__(address)
+        self.kind = "rtu" if is_rtu else "tcp"  # type: ignore[misc]
+        self.has_broadcasts = is_rtu  # type: ignore[misc]
+        self.is_rtu = is_rtu
+        self.number = 0
+        self._buffer = b""
+
+    def hear(self, data: bytes) -> bytes:
+        """Take responses from bytes, also what is none; those of a gateway are left out."""
+        split = partial(split_rtu, size_of=response_size) if self.is_rtu else split_tcp
+        found, self._buffer = split(self._buffer + data)
+        for adu in found:
+            is_own = adu.unit == self.address or not adu.pdu
+            if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY:
+                self.has_gateway, self.timeout = True, GATEWAY_TIMEOUT
+                continue
+            kind, frame = (adu.pdu or b"\0")[0], (adu.unit, adu.pdu or adu.raw)
+            self.take(Heard(clock.now(), adu.transaction, kind, (), frame))
+            self._others |= set() if is_own else {adu.unit}
+        return data
+
+    def question(self, address: int) -> bytes:
+        """Return the frame that reads the identity of a unit."""
+        return self.adu(read_pdu(IDENTITY, IDENTITY_COUNT), unit=address)
+
+    def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
+        """Return a PDU in a frame under the next transaction number."""
+        self.number = self.number % 0xFFFF + 1
+        unit = self.address if unit is None else unit
+        transaction = 0 if self.is_rtu else self.number
+        return framed(unit, pdu, transaction, is_rtu=self.is_rtu)
+
+    async def transact(self, pdu: bytes) -> tuple[bytes, When]:
+        """Send a PDU and await its response; returns that and when it was carried out."""
+        data, sent = self.adu(pdu), clock.now()
+        self._buffer = b""
+        number = 0 if self.is_rtu else self.number
+        self.write(data)
+        heard = await self.replied(lambda each: each.number == number or not each.type, pdu[0])
+        unit, response = heard.frame
+        expect(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
+        seen = unit, response[0] & ~EXCEPTION
+        expect_equal(seen, (self.address, pdu[0]), "unit, function of a response")
+        head, size = response_form(pdu)
+        if not response[0] & EXCEPTION:
+            seen = response[: len(head)], len(response)
+            expect_equal(seen, (head, size), f"first bytes, size of the response to {pdu[:5]!r}")
+        return response, When(sent, heard.at)
+
+    async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
+        """Read registers; Violation for an exception."""
+        response, _ = await self.transact(read_pdu(first, count, function=function))
+        what = f"function of the response to a read of {count} registers from {first}"
+        expect_equal(response[0], function, what)
+        return struct.unpack(f">{count}H", response[2:])
+
+    async def hello(self) -> Values:
+        """Read the identity."""
+        registers = await self.read(IDENTITY, IDENTITY_COUNT)
+        expect_equal(registers[0], 0, "tag of the identity")
+        return read_as("identity", unpack_identity, registers)
+
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Write a message, then read its reply; one that shows the present is read alone."""
+        tag, when = None, None
+        if number not in _PRESENT or words:
+            tag = self.number % 0xFFFF + 1  # that of the frame, see `write_of`
+            response, when = await self.transact(self.write_of(number, words))
+            if response[0] & EXCEPTION:
+                code = EXCEPTIONS.get(response[1], f"exception {response[1]}")
+                return Answer(code, None, (), when)
+        sent = clock.now()
+        count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
+        shown, result, *reply = await self.read(BOX * number + REPLY, count)
+        when = when or When(sent, clock.now())
+        if tag is not None:
+            expect_equal(shown, tag, f"tag of the reply to message {number}")
+        if result:
+            return self.refusal(*when, number, (number, *divmod(result, 256)))
+        return Answer("", None, tuple(reply), when)
+
+    def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
+        """Return the PDU that writes a message, tagged with the number of its frame."""
+        tag = self.number % 0xFFFF + 1 if tag is None else tag
+        return write_pdu(BOX * number % 0x10000, (tag, *words))
+
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frame that writes a message."""
+        return self.adu(self.write_of(number, words), unit=to)
+
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds; a gateway keeps those to other units."""
+        pdu = self.write_of(number, words)
+        if not self.has_gateway:
+            yield "another unit", self.adu(pdu, unit=self.free)
+        if self.is_rtu:
+            frame = self.adu(pdu)
+            for at in (-2, -1, -4):
+                yield f"a wrong byte {at}", altered(frame, at)
+
+    async def send(self, data: bytes) -> list[Heard]:
+        """Send bytes; return what is heard until a reply must have come."""
+        self._buffer = b""
+        heard = await super().send(data)
+        if self.is_rtu:
+            await asyncio.sleep(QUIET)  # ends a frame that is not whole
+        return heard
+
+
+_PLACE = "modbus.md#registers"
+_GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response of it
+_PING, _STATUS, _CAPS, _ACHIEVED, _STOP = (
+    MESSAGES[name].number for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop")
+)
+_TOO_LONG = REFUSALS["BAD_LENGTH"] << 8 | NO_CHANNEL
+
+
+def _client(subject: Subject) -> ModbusClient:
+    return cast(ModbusClient, subject.client)
+
+
+@reading(_PLACE, "rtu", "tcp")
+async def areas(subject: Subject) -> None:
+    """It keeps each reply under its tag, zeros behind it, and shows the present without a write."""
+    client = _client(subject)
+
+    async def write(number: int, tag: int, *words: int) -> None:
+        await client.transact(client.write_of(number, words, tag=tag))
+
+    async def area(number: int, count: int = AREA, at: int = 0, function: int = READ) -> list[int]:
+        return [*await client.read(BOX * number + REPLY + at, count, function=function)]
+
+    for number in set(BY_NUMBER) - {_STATUS}:
+        shown = await area(number)
+        again = await area(number, function=READ_HOLDING)
+        expect_equal(again, shown, f"reply area {number} by function 3")
+    for tag in (1, 0xFFFF, 77):
+        await write(_PING, tag, 1)
+        shown = await area(_PING)
+        behind = shown[HEAD + client.reply_words[_PING] :]
+        expect_equal((*shown[:2], any(behind)), (tag, 0, False), "tag, result, registers behind")
+        expect_equal(await area(_PING, 3, HEAD + 3), shown[HEAD + 3 : HEAD + 6], "part of an area")
+    await write(_ACHIEVED, 5, 0)
+    expect_equal((await area(_ACHIEVED, 1)), [5], "tag of GetAchieved")
+    expect_equal((await area(_PING, 1)), [77], "tag of a Ping before it")
+    await write(_ACHIEVED, 6, 15, 0)
+    expect_equal(await area(_ACHIEVED, 2), [6, _TOO_LONG], "tag, result of a word too many")
+    for number in (_CAPS, _STATUS):
+        await write(number, 9, 0)
+        expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a refusal")
+        tag, result, first = await area(number, 3)
+        shown_once = tag, result, first > 0
+        expect_equal(shown_once, (9, 0, True), "tag, result, words once a refusal was read")
+    texts = await client.read(IDENTITY, IDENTITY_COUNT, function=READ_HOLDING)
+    part = await client.read(IDENTITY + 2, 16)
+    expect_equal(part, texts[2:18], "part of the identity")
+
+
+@driving(_PLACE, "rtu", "tcp")
+async def present_areas(subject: Subject) -> None:
+    """It shows the status of the moment at every read, and other replies as they were."""
+    client = _client(subject)
+    await client.look_around()
+    await subject.run([subject.arm, subject.one(), subject.ping])
+    kept = await client.read(BOX * _PING + REPLY, AREA)
+    await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
+    again = await client.read(BOX * _PING + REPLY, AREA)
+    expect_equal(again, kept, "reply to a Ping, read again after a set")
+    if client.is_rtu:
+        subject.require_alone()
+        data = client.adu(client.write_of(_PING, [subject.session], tag=4242), unit=0)
+        await client.expect_silence(data, "a Ping for all")
+        await subject.starve()
+        await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
+        (tag,) = await client.read(BOX * _STOP + REPLY, 1)
+        expect(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
+
+
+def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
+    """Yield PDUs with the exceptions that they must raise."""
+    area = BOX * _PING + REPLY
+    last = area + AREA
+    functions = (1, 2, 5, 6, 22, 43, 100)
+    for function in functions:
+        yield f"function {function}", bytes([function]) + b"\0\0\0\1", 1
+    yield "function 23", struct.pack(">BHHHHBH", 23, 0, 1, BOX * _PING, 1, 2, 1), 1
+    for what, first, registers, code in (
+        ("a write within a message", BOX * _PING + 1, [1, 1], 2),
+        ("a write of no message", BOX * 63, [1, 1], 2),
+        ("a write of message 1", BOX, [1], 2),
+        ("a write to a reply area", area, [1, 1], 2),
+        ("a write of 122 registers", BOX * _PING, [1] * 122, 2),
+        ("a write of 0 registers", BOX * _PING, [], 3),
+    ):
+        yield what, write_pdu(first, registers), code
+    wrong_size = ping[:5] + bytes([ping[5] + 2]) + ping[6:] + b"\0\0"
+    yield "a write of another number of bytes", wrong_size, 3
+    for what, first, count, code in (
+        ("a read beyond an area", last - 1, 2, 2),
+        ("a read behind an area", last, 1, 2),
+        ("a read of no message", BOX * 63 + REPLY, 1, 2),
+        ("a read of what is written", BOX * _PING, 1, 2),
+        ("a read beyond the identity", IDENTITY, IDENTITY_COUNT + 1, 2),
+        ("a read of 0 registers", area, 0, 3),
+        ("a read of 126 registers", area, 126, 3),
+    ):
+        yield what, read_pdu(first, count), code
+
+
+@driving("modbus.md#functions-and-exceptions", "rtu", "tcp")
+async def exceptions(subject: Subject) -> None:
+    """It raises exceptions for what Modbus defines, which change and feed nothing."""
+    client = _client(subject)
+    await subject.arm()
+    await subject.play(subject.one())
+    known = READ, READ_HOLDING, WRITE
+    for what, pdu, code in _bad_pdus(client, client.write_of(_PING, [subject.session])):
+        # On RTU the length of a frame follows from its function: of others it ends with a pause.
+        if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
+            continue
+        await subject.run([subject.ping, 0.02])
+        response, _ = await client.transact(pdu)
+        expect_equal(response, bytes([pdu[0] | EXCEPTION, code]), f"response to {what}")
+        await subject.request("GetStatus")
+
+
+@reading("modbus.md#the-line", "rtu", "tcp")
+async def pieces(subject: Subject) -> None:
+    """It takes a frame in pieces, gives half a frame up after a pause, and loses none behind it."""
+    client = _client(subject)
+    pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
+
+    def frame() -> bytes:
+        return client.request(_PING, [1])
+
+    whole, broken = frame(), bytearray(frame())
+    broken[6] = 200  # bytes that would follow
+    cases = [(whole[:5], pause, whole[5:], 1)]
+    if client.is_rtu:
+        for first in (whole[:2], whole[:7], whole[:-1], bytes(broken)):
+            cases.append((first, 0.03, frame(), 1))
+    else:
+        cases.append((b"", 0.0, frame() + frame(), 2))
+    for first, wait, second, count in cases:
+        began = clock.now()
+        client.write(first)
+        await asyncio.sleep(wait)
+        require_in_time(not wait < limit < clock.now() - began, "the rest of a frame came too late")
+        heard = await client.send(second)
+        what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
+        expect_equal(len(heard), count, what)

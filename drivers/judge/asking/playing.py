@@ -1,0 +1,288 @@
+"""Checks of what plays: layers and their ends, transitions, kept phases, voices, interference."""
+
+import asyncio
+import math
+from dataclasses import replace
+from functools import partial
+
+from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import require, require_in_time
+from drivers.judge.asking.material import Rows, layer, play, send
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.table import SHORTENED_FADE
+from registry import clock
+
+_PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
+_SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
+_MAX_VOICES = 24  # that are tried
+_PAUSE = 0.004  # s; between the sets of voices, at least
+
+
+@driving(_SETS)
+def layers_add(subject: Subject) -> Rows:
+    """It plays the sum of its layers, each with its own token, and those not named play on."""
+    share, last = 1 / len(subject.layers), len(subject.layers) - 1
+    filled = [layer(each, subject.beside(each, share)) for each in reversed(subject.layers)]
+    emptied = map(layer, subject.layers[:-1])
+    return [subject.arm, *filled, *emptied, play(filled[-1], layer(last))]
+
+
+@driving(_SETS)
+def layers_play_on(subject: Subject) -> Rows:
+    """It lets ramps, onsets and ends of layers that a set does not name go on as they were."""
+    first = subject.one(level=0.75, ramp=subject.ramp, valid_for=subject.ramp + 100)
+    loud, quiet = (layer(1, subject.beside(1, each)) for each in (0.25, 0.125))
+    return [(first, 0.02, loud, quiet, loud)]
+
+
+@driving(_SETS)
+def valid_for(subject: Subject) -> Rows:
+    """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
+    ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
+    half, pause = subject.one(level=0.5, valid_for=short), 0.15 * subject.slowness
+    lasting = layer(1, subject.beside(1, 0.25), valid_for=60_000)
+    several = play(half, lasting, layer(2, subject.beside(2, 0.25)))
+    return [
+        [subject.one(valid_for=1)],
+        [subject.one(valid_for=short)],
+        [subject.one(ramp=ramp, valid_for=subject.lasting(150))],
+        [several, partial(subject.follow, 2 * pause), half, subject.one(level=0.5), pause],
+    ]
+
+
+@driving(_SETS)
+def renew(subject: Subject) -> Rows:
+    """It starts valid_for anew by a renewal, and changes nothing else."""
+    first, second = (
+        subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
+        layer(1, subject.beside(1, 0.25)),
+    )
+    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(60))
+    return [
+        (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
+        (layer(2, renew=True, valid_for=subject.lasting(100)), second),
+        (third, layer(3, renew=True), 0.12 * subject.slowness),
+    ]
+
+
+@driving(_SETS)
+def after(subject: Subject) -> Rows:
+    """It starts commands with *after* once the onsets of the layer have ended, at once without."""
+    first = subject.one(subject.tone(onset=subject.long_onset))
+    waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
+    newer = layer(0, subject.tone(0, 0.75), after=True)
+
+    async def achieved() -> None:
+        answer = await subject.request("GetAchieved", layer=0)
+        require_in_time(subject.shown.outputs.waits(answer.when), "the onset may have ended")
+
+    return [
+        (first, newer, waiting, achieved),
+        (subject.one(), waiting),
+        (first, waiting, layer(0), 0.25),
+        (first, waiting, subject.one(level=0.75), 0.25),
+        (first, waiting, send("Silence", ramp=0), 0.25),
+    ]
+
+
+@driving(_PLACE)
+def ramps(subject: Subject) -> Rows:
+    """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
+    whole, times = subject.whole(), {subject.ramp, 20, subject.can["ramp_max"]}
+    rises = [[replace(whole, ramp=time)] for time in times]
+    return [*rises, *([whole, layer(0, ramp=time)] for time in times)]
+
+
+@driving(_PLACE)
+def cross_fades(subject: Subject) -> Rows:
+    """It cross-fades tones, each along its own raised cosine, continued where it is interrupted."""
+    ramp, part = subject.ramp, 0.4 * subject.ramp / 1000
+    half, other = subject.one(level=0.5), subject.tone(0, 0.5, frequency=subject.other)
+    fade = layer(0, other, ramp=ramp)
+    return [
+        (half, layer(0, subject.tone(frequency=subject.other), ramp=ramp)),
+        (half, layer(0, subject.tone(0, 0.5, 180.0), ramp=ramp)),
+        (subject.one(ramp=ramp), part, fade),
+        (subject.one(), fade, part, layer(0, ramp=min(3 * ramp, subject.can["ramp_max"]))),
+    ]
+
+
+@driving(_SETS)
+def kept_phase(subject: Subject) -> Rows:
+    """It leads a tone whose phase is kept from its present amplitude to the new one."""
+    tones = [
+        subject.tone(0, fraction, phase, keep=True, frequency=frequency)
+        for fraction, phase, frequency in (
+            *((0.5, 0, 0), (1, 180, 0), (1, 90, 0)),
+            (1, 180, subject.other),
+        )
+    ]
+    return [(subject.one(), layer(0, tone, ramp=subject.ramp)) for tone in tones]
+
+
+@driving(_PLACE)
+def onsets(subject: Subject) -> Rows:
+    """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
+    subject.require_knots()
+    shapes = [
+        subject.envelope(0.05, *fractions)
+        for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
+    ]
+    alone = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
+    kept = subject.one(subject.tone(0, 0.5, onset=shapes[0], keep=True))
+    rising = subject.one(ramp=subject.ramp), 0.4 * subject.ramp / 1000
+    return [*alone, (subject.one(), kept), (*rising, kept)]
+
+
+@driving(_PLACE)
+def endings(subject: Subject) -> Rows:
+    """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
+    subject.require_knots()
+    last, ramp = len(subject.channels) - 1, subject.ramp
+    tone = subject.tone(last, ending=subject.envelope(0.05, 0.25, 0.75j))
+    first, quiet = layer(0, tone), subject.tone(last, 0.0)
+    replaced = replace(quiet, onset=subject.envelope(0.1))
+    return [
+        (first, layer(0)),
+        (first, layer(0, quiet)),
+        (first, layer(0, subject.tone(0, 0.0))),
+        (layer(0, tone, valid_for=100),),
+        (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
+        (first, layer(0, replaced, ramp=ramp)),
+        (first, layer(0, subject.tone(last, keep=True), ramp=ramp), layer(0, ramp=ramp)),
+    ]
+
+
+@driving(_PLACE)
+def endings_amid(subject: Subject) -> Rows:
+    """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
+    subject.require_knots()
+    knots = math.ceil(subject.slowness)
+    onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
+    half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
+    towards_0 = subject.tone(0, 0.0, onset=onset)  # a voice counts until its onset has ended
+    long = min(500, subject.can["ramp_max"])
+    return [
+        (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
+        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp)),
+        (subject.one(subject.tone(ending=ending)), layer(0), part, layer(0, ramp=long)),
+    ]
+
+
+@driving(_PLACE)
+def extreme_envelopes(subject: Subject) -> Rows:
+    """It plays as many knots as it states, along its shortest and longest step."""
+    subject.require_knots()
+    count = range(subject.can["knots"])
+    levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in count]
+    ends = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
+    cases = (ends[0], levels), (100, levels), (ends[1], [1.0])
+    shapes = [subject.envelope(step / 10_000, *knots) for step, knots in cases]
+    return [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
+
+
+@driving(_PLACE)
+async def phases(subject: Subject) -> None:
+    """It plays phases and frequencies: tones of one frequency interfere, also if begun apart."""
+    await subject.arm()
+    await subject.require_interference()
+    silent, slow = play(layer(0), *map(layer, subject.layers[1:])), max(subject.lowest, _SLOW) / 20
+    require(
+        subject.exchange_time / subject.client.transactions <= 0.25 / slow,
+        "the line is too slow to see phases of tones that began apart",
+    )
+    for channel in subject.channels:
+        first = layer(0, subject.tone(channel, 0.5, 30.0))
+        for number in subject.layers[1:]:
+            other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
+            await subject.run([play(first, other), silent])
+    turned: list[tuple[int, float, float, bool | None]] = [
+        *((channel, phase, 1.25, None) for channel in subject.channels for phase in (90.0, -90.0)),
+        *((0, 0.0, round(0.9 * slow) + periods, None) for periods in (0.25, 0.5)),
+        *((0, 0.0, 0.5, keep) for keep in (True, False)),
+    ]
+    for case in turned:
+        await subject.in_time(partial(_expect_turned, subject, *case))
+
+
+async def _expect_turned(
+    subject: Subject, channel: int, phase: float, periods: float, keep: bool | None
+) -> None:
+    """Play two tones some periods apart; keep: both at once, one of them again with that flag."""
+    slow = max(subject.lowest, _SLOW)
+    await subject.arm()
+    subject.shown.outputs.interferes = True
+    tone = subject.tone(channel, 0.5, frequency=slow)
+    again = replace(subject.tone(channel, 0.5, phase, keep=bool(keep)), frequency=slow)
+    time = periods * 20 / slow
+    first = await subject.play(layer(0, tone), *([] if keep is None else [layer(1, tone)]))
+    await subject.pause(first.when.earliest + time - clock.now())
+    second = await subject.play(layer(1, again))
+    require_in_time(
+        second.when.latest - first.when.earliest <= time + 0.25 * 20 / slow,
+        "two sets were too far apart in time",
+    )
+    await subject.status()
+
+
+@driving(_PLACE)
+async def voices(subject: Subject) -> None:
+    """It refuses no set for its fades: the oldest fade ends within 2 ms, and what lasts stays."""
+    ramp, sets = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES) + 4
+    # Each tone is at its level at once, and falls along the ramp of the next set.
+    onset = subject.envelope(0.0001)
+    tones = [
+        subject.tone(0, 1 / sets, frequency=subject.near(at), onset=onset) for at in range(sets)
+    ]
+    await subject.arm()
+    subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
+    # Apart, so that the oldest has faded further than the newest, but none ends before the last.
+    pause = max(0.4 * ramp / 1000 / sets - subject.exchange_time, _PAUSE + onset.step / 10_000)
+    began = clock.now()
+    for tone in tones:
+        last = await subject.play(layer(0, tone, ramp=ramp))
+        await asyncio.sleep(pause)
+    require_in_time(
+        last.when.latest - began <= 0.8 * ramp / 1000,
+        "sets were too far apart for so many voices",
+    )
+    cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)
+    # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
+    others = [play(layer(each, tones[each], ramp=ramp)) for each in subject.layers[1:3]]
+    fade = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
+    await asyncio.sleep(cut)  # in which the oldest fade may end as it likes
+    await subject.follow(0.05)
+    for row in (*others, fade, play(subject.one())):
+        await subject.send(row)
+    await asyncio.sleep(cut)
+    await subject.follow()
+
+
+@driving(_PLACE)
+def voices_of_layers(subject: Subject) -> Rows:
+    """It cuts fades only: what lasts on all layers plays on while others fade."""
+    ramp, share = subject.can["ramp_max"], 1 / (2 * len(subject.layers))
+    others = subject.layers[1:]
+    count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
+    near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
+    least = max(near[0].level // 4, subject.can["level_step"])
+    quiet = [replace(each, level=least) for each in near[len(others) + 1 :]]
+    lasting = play(*(layer(number, near[number]) for number in others))
+
+    async def fade() -> None:
+        for tone in quiet:
+            await subject.play(layer(0, tone, ramp=ramp))
+
+    return [(lasting, fade, layer(0))]
+
+
+@driving(_PLACE)
+async def limited(subject: Subject) -> None:
+    """It limits the sum of its layers to full level, and says once that it was limited."""
+    require(subject.level * 2 > 1.0, "tried above half of full level only; see --level")
+    require(
+        abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
+        "it has one frequency, whose tones interfere",
+    )
+    over = layer(1, subject.tone(frequency=subject.other))
+    await subject.run([subject.arm, subject.one(), over, layer(1), over, layer(1)])

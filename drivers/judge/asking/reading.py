@@ -1,0 +1,291 @@
+"""Checks of what it is, can and refuses, which only read; of events, broadcasts and addresses."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import cast
+
+from drivers.judge.asking.check import driving, reading
+from drivers.judge.asking.client import (
+    Armed,
+    Client,
+    Violation,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+    require,
+)
+from drivers.judge.asking.material import Rows, layer, send, stage
+from drivers.judge.asking.serial_frames import SerialClient
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
+from drivers.protocol.table import (
+    ENABLED,
+    EVENT,
+    EVENT_RECORD,
+    MESSAGES,
+    NO_CHANNEL,
+    QUANTITIES,
+    REACTION,
+    STATES,
+    VERSION,
+    has_flag,
+    name_of,
+)
+from registry import clock
+
+_UNKNOWN = (19, 24, 29, 63)  # numbers of no message, below those of vendors
+_TRIES = 20
+_FEATURE_OF = {
+    **{"GetMeasured": "electrical", "SetAddress": "address"},
+    **{"GetSensors": "sensors", "Measure": "sensors", "GetReading": "sensors"},
+}
+
+
+@reading("protocol.md#messages")
+async def identity(subject: Subject) -> None:
+    """It says who it is, always the same, and that it speaks version 3."""
+    first = subject.identity
+    for name in ("vendor", "product", "serial_number", "firmware"):
+        expect(bool(first[name]), name, expected="a text", seen="none")
+    expect_equal(await subject.client.hello(), first, "identity, read again")
+
+
+@reading("protocol.md#messages")
+async def capabilities(subject: Subject) -> None:
+    """It states capabilities within their ranges, always the same."""
+    must, seen = (
+        "; ".join(f"{name} {each[at]}" for name, each in subject.can.wrong.items()) for at in (0, 1)
+    )
+    expect_equal(seen, must, "capabilities")
+    again = (await subject.request("GetCaps")).values
+    expect_equal(again, subject.can, "capabilities, read again")
+
+
+@reading("protocol.md#states")
+async def starts_disarmed(subject: Subject) -> None:
+    """It is disarmed and silent unless it was armed, and shows what it has only."""
+    status = (await subject.request("GetStatus")).values
+    if status["state"] == ENABLED:
+        raise Armed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
+    disarmed = [number for number in STATES.values() if number != ENABLED]
+    expect_one_of(status["state"], disarmed, "state before Arm")
+    is_open = has_flag(status, "interlock_open") and not subject.has("interlock")
+    expect_equal(is_open, False, "interlock of one without")
+    expect_within(status["flags"], 0, 7, "flags")
+
+
+@reading("protocol.md#times")
+async def replies_in_time(subject: Subject) -> None:
+    """It begins each reply within 10 ms."""
+    for name in ("GetStatus", "GetCaps", "GetFaults"):
+        await _expect_prompt(subject, name, partial(subject.request, name))
+
+
+@driving("protocol.md#times")
+async def obeys_in_time(subject: Subject) -> None:
+    """It begins each reply to what feeds, plays and silences within 10 ms."""
+    requests: dict[str, Callable[[], Awaitable[object]]] = {
+        "Arm": partial(subject.request, "Arm", watchdog=subject.can["watchdog_max"]),
+        "Ping": subject.ping,
+        "Set": partial(subject.send, stage(subject.one())),
+        "Commit": lambda: subject.request("Commit", token=subject.token),
+        "GetAchieved": partial(subject.request, "GetAchieved", layer=0),
+        "Silence": partial(subject.request, "Silence", ramp=0),
+        "Disarm": partial(subject.request, "Disarm", ramp=0),
+        "Stop": partial(subject.request, "Stop", ramp=0),
+    }
+    await subject.arm(subject.can["watchdog_max"] / 1000)
+    for name, request in requests.items():
+        await _expect_prompt(subject, name, request)
+
+
+async def _expect_prompt(
+    subject: Subject, name: str, request: Callable[[], Awaitable[object]]
+) -> None:
+    """Make a request again and again, whose fastest replies must begin in time."""
+    subject.client.reactions[name].clear()  # lest a longer one of before hides its time
+    for _ in range(_TRIES):
+        await request()
+    fastest = min(subject.client.reactions[name])
+    what = f"time until the reply to {name} begins [ms], the shortest of {_TRIES}"
+    expect_within(1e3 * fastest, 0, 1e3 * REACTION, what)
+
+
+@reading("protocol.md#messages")
+async def unknown_types(subject: Subject) -> None:
+    """It refuses messages that it does not know, and those of what it does not have."""
+    for number in _UNKNOWN:
+        answer = await subject.client.exchange(number, ())
+        expect_equal(answer.code, "UNKNOWN_TYPE", f"refusal of message {number}")
+    missing = [name for name, feature in _FEATURE_OF.items() if not subject.has(feature)]
+    await subject.run([send(each, raw=_shortest(each), code="UNKNOWN_TYPE") for each in missing])
+
+
+@driving("protocol.md#checks-in-this-order")
+def lengths(subject: Subject) -> Rows:
+    """It refuses messages that are a word too short or too long."""
+    known = [name for name in MESSAGES if subject.has(_FEATURE_OF.get(name, ""))]
+    shorter = [(name, words[:-1]) for name in known if (words := _shortest(name))]
+    longer = [(name, [*_shortest(name), 0]) for name in known if name != "Set"]
+    return [send(name, raw=words, code="BAD_LENGTH") for name, words in (*shorter, *longer)]
+
+
+@reading("protocol.md#messages")
+async def reading_changes_nothing(subject: Subject) -> None:
+    """It shows the achieved tones of every layer, none while disarmed, and its faults."""
+    beyond = range(len(subject.layers), 16)
+    await subject.run([send("GetAchieved", layer=each, code="BAD_VALUE") for each in beyond])
+    await subject.run([send("GetAchieved", layer=number) for number in subject.layers])
+    known = *subject.channels, NO_CHANNEL
+    for each in (await subject.request("GetFaults"))["faults"]:
+        expect_one_of(each["channel"], known, "channel of a fault")
+    await subject.status()
+
+
+@reading("serial.md#receiving", "serial")
+async def hello_for_ever(subject: Subject) -> None:
+    """It answers a Hello of any version and length, and no other version of anything else."""
+    client = cast(SerialClient, subject.client)
+    for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
+        shown = await client.identity(payload, version)
+        expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
+    status, ping = MESSAGES["GetStatus"].number, MESSAGES["Ping"].number
+    refused = [(status, b"", each, "UNSUPPORTED_VERSION") for each in (0, 2, 4, 255)]
+    for number, payload, version, code in (*refused, (ping, b"\1\0\0", VERSION, "BAD_LENGTH")):
+        answer = await client.exchange_payload(number, payload, version)
+        what = f"refusal of {len(payload)} bytes of version {version}"
+        expect_equal(answer.code, code, what)
+
+
+def _shortest(name: str) -> list[int]:
+    """Return the words of a request that is right but for the state."""
+    values = {
+        **{"session": 1, "watchdog": 250, "ramp": 5, "token": 1, "index": 0, "parts": 1},
+        **{"now": 0, "stream": [], "latch": 0, "layer": 0, "address": 9, "serial_number": "?"},
+        **{"first": 0, "reading": 1, "window": 1000, "tones": 1},
+        "frequencies": [QUANTITIES["frequency"].to_wire(100.0)],
+    }
+    return MESSAGES[name].request.pack(values)
+
+
+_MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
+_TYPE = 0x7F  # of a frame, without the bit of a reply
+_MOVED = 0.1  # s; until an amplifier has taken its address
+
+
+@driving("protocol.md#states")
+async def events(subject: Subject) -> None:
+    """It sends one Event of every change of state, before the reply to its cause."""
+    client = subject.client
+    require(client.has_events, "this wire carries no Events")
+    await client.look_around()
+    is_stated = subject.has("events") and not (client.kind == "serial" and client.neighbours)
+    client.events.clear()
+    client.order.clear()
+    await subject.arm(0.0)
+    types = [EVENT, MESSAGES["Arm"].number][not is_stated :]
+    seen = [each & _TYPE for each in client.order]
+    expect_equal(seen, types, "types of the messages after Arm, the Event before the reply")
+    await subject.run(
+        [
+            *(subject.one(), subject.starve, subject.settle, subject.clear),
+            *(subject.arm, subject.one(), send("Disarm", ramp=50), subject.settle),
+            *(send("Stop", ramp=0), subject.clear, 0.02),
+        ]
+    )
+    second = subject.latch
+    first = second - 1
+    required = [
+        *(("OPERATION_ENABLED", 0, first - 1), ("FAULT_REACTION_ACTIVE", 1, first)),
+        *(("FAULT", 1, first), ("SWITCH_ON_DISABLED", 0, first), ("OPERATION_ENABLED", 0, first)),
+        *(("SWITCHED_ON", 0, first), ("SWITCH_ON_DISABLED", 0, first)),
+        *(("QUICK_STOP_ACTIVE", 0, second), ("SWITCH_ON_DISABLED", 0, second)),
+    ]
+    reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
+    reported = [(name_of(STATES, each["state"]), each["fault"], each["latch"]) for each in reports]
+    # A state that lasts no time may be left out or told.
+    needed = [each for each in required if each[0] not in _MOMENTARY or each in reported]
+    shown = [each for each in reported if each[0] not in _MOMENTARY or each in required]
+    expect_equal(shown, needed if is_stated else [], "states, faults and latches of Events")
+    channels = {each["channel"] for each in reports}
+    expect_equal(channels - {NO_CHANNEL}, set(), "channels of Events")
+
+
+@driving("protocol.md#what-a-host-does-and-may-rely-on", "serial", "rtu", "can")
+async def broadcasts(subject: Subject) -> None:
+    """It obeys a Commit or Stop that is for all, without a reply, and no other broadcast."""
+    await subject.client.look_around()
+    subject.require_alone()
+
+    async def send_to_all(name: str, *, is_obeyed: bool = False, **values: object) -> None:
+        message, sent = MESSAGES[name], clock.now()
+        words = message.request.pack({"session": subject.session, **values})
+        data = subject.client.request(message.number, words, to=0)
+        await subject.client.expect_silence(data, f"a {name} for all")
+        if is_obeyed:
+            own = {"session": subject.session, **values}
+            subject.shown.granted(name, own, {}, When(sent, clock.now()))
+        await subject.request("GetStatus")
+
+    await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
+    await subject.arm(0.5)
+    half = layer(0, subject.tone(0, 0.5))
+    for name, values in (
+        ("Set", subject.parts(half, token=2)[0]),
+        *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
+        ("Clear", {"latch": subject.latch}),
+        ("Commit", {"session": 77, "token": 2}),
+    ):
+        await subject.run([subject.one(), subject.ping])
+        await send_to_all(name, **values)
+    await subject.run([stage(half), 0.1])
+    await send_to_all("Commit", is_obeyed=True, token=subject.token)
+    await subject.starve()
+    await send_to_all("Stop", is_obeyed=True, ramp=0)
+
+
+@driving("protocol.md#set-the-address")
+async def addresses(subject: Subject) -> None:
+    """It takes a new address by its serial number while it is disarmed, and replies there alone."""
+    subject.require("address")
+    client, own = subject.client, subject.client.address
+    serial = str(subject.identity["serial_number"])
+    await client.look_around()
+    free = client.free
+    right: Values = {"address": free, "serial_number": serial}
+    _, *text = MESSAGES["SetAddress"].request.pack(right)
+    others = {serial + "x", serial[:-1], ""} - {serial}
+    named: list[Values] = [{**right, "serial_number": other} for other in others]
+    beyond = [[address, *text] for address in (0, client.addresses + 1)]
+    await subject.run(
+        [
+            *(send("SetAddress", **each, code="BAD_VALUE") for each in named),
+            *(send("SetAddress", raw=each, code="BAD_VALUE") for each in beyond),
+            *(subject.arm, send("SetAddress", **right, code="WRONG_STATE")),
+            *(send("Disarm", ramp=0), subject.settle),
+        ]
+    )
+    try:
+        await subject.request("SetAddress", **right)
+        await asyncio.sleep(_MOVED)
+        expect_equal(await _is_at(client, own), False, "whether it replies at its old address")
+        expect_equal(await _is_at(client, free), True, "whether it replies at its new address")
+    finally:
+        if await _is_at(client, free):
+            await subject.request("SetAddress", address=own, serial_number=serial)
+            await asyncio.sleep(_MOVED)
+        client.address = own
+        client.heard.clear()
+    expect_equal(await _is_at(client, own), True, "whether it replies at its first address again")
+
+
+async def _is_at(client: Client, address: int) -> bool:
+    client.address = address
+    try:
+        await client.hello()
+    except Violation:
+        return False
+    return True

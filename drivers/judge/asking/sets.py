@@ -1,0 +1,198 @@
+"""Checks of what a set may hold, and that it is taken whole or not at all."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_within, require
+from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, stage
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, pack_layers
+from drivers.protocol.table import QUANTITIES
+
+_PLACE = "protocol.md#sets"
+_SCANNED = 8
+_LEVEL, _PHASE = QUANTITIES["level"].maximum, QUANTITIES["phase"]
+_TONE = "frequency", "level", "phase"
+
+
+@driving(_PLACE)
+def every_channel(subject: Subject) -> Rows:
+    """It plays every channel at its own level, and silences those that a set does not name."""
+    tones = [subject.tone(channel, 1 - 0.05 * channel) for channel in subject.channels]
+    reverse = [replace(tones[-1 - at], channel=at) for at in reversed(subject.channels)]
+    but_one = reverse[: max(len(tones) - 1, 1)]
+    alone = [layer(0, tone) for tone in tones]
+    return [subject.arm, *alone, *(layer(0, *each) for each in (tones, reverse, but_one, []))]
+
+
+@driving(_PLACE)
+def levels_of_every_frequency(subject: Subject) -> Rows:
+    """It plays the level that was asked for at its lowest and its highest frequency."""
+    ends = [
+        (number, limits[end])
+        for number, limits in enumerate(subject.can["limits"])
+        for end in ("frequency_min", "frequency_max")
+    ]
+    return [subject.arm, *(layer(0, subject.tone(at, frequency=each)) for at, each in ends)]
+
+
+@driving("protocol.md#messages")
+async def achieved(subject: Subject) -> None:
+    """It says what each layer plays within half a step, and *exact* where that was asked."""
+    await subject.arm()
+    for number in subject.layers:
+        tones = [
+            subject.tone(
+                channel,
+                (0.98765 - 0.05 * channel) / len(subject.layers),
+                20.0 * channel - 160.12,
+                frequency=min(subject.frequency + 7 * channel + 40 * number, subject.highest),
+            )
+            for channel in subject.channels
+        ]
+        await subject.play(layer(number, *tones, ramp=number + 1, valid_for=50_000 + number))
+        await subject.request("GetAchieved", layer=number)
+    for number in subject.layers:
+        await subject.request("GetAchieved", layer=number)
+
+
+@driving("protocol.md#messages")
+async def steps_as_stated(subject: Subject) -> None:
+    """It rounds to the steps that it states."""
+    base = subject.tone(0)
+    coarse = [name for name in _TONE if subject.can[f"{name}_step"] > 3]
+    require(bool(coarse), "its steps are about those of the wire")
+    ranges = {
+        "frequency": (subject.lowest, base.frequency, subject.highest),
+        "level": (1, base.level - subject.can["level_step"], _LEVEL),
+        "phase": (_PHASE.minimum, base.phase, _PHASE.maximum),
+    }
+    await subject.arm()
+    for name in coarse:
+        found: set[int] = set()
+        step = subject.can[f"{name}_step"]
+        lowest, start, highest = ranges[name]
+        for number in range(_SCANNED):
+            value = min(max(start + number * step // _SCANNED, lowest), highest)
+            await subject.play(layer(0, replace(base, **{name: value})))
+            shown = await subject.request("GetAchieved", layer=0)
+            found.update(each[name] for each in shown["commands"])
+        what = f"number of values achieved of {_SCANNED} within a step of {name}"
+        expect_within(len(found), 0, 2, what)
+
+
+class _Flawed(NamedTuple):
+    """Words of a set that must be refused; channels: one of which the refusal names."""
+
+    words: list[int]
+    code: str = "BAD_VALUE"
+    channels: tuple[int | None, ...] = (None,)
+
+    def sent(self, *, token: int, now: int) -> Send:
+        """Send it as a set of one part."""
+        part: Values = {"token": token, "index": 0, "parts": 1, "now": now, "stream": self.words}
+        return send("Set", **part, code=self.code, channels=self.channels)
+
+
+def _flawed_tones(subject: Subject) -> Iterator[Command]:
+    """Yield commands beyond the limits of their channel, or the envelopes that there can be."""
+    low, high = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
+    count, knot = subject.can["knots"], (100, 0)
+    shapes = [Envelope(step, (knot,)) for step in {low - 1, high + 1} - {0, 1001}]
+    shapes += [Envelope(low, (knot,) * (count + 1))] if count < 32 else []
+    yield from (subject.tone(onset=shape) for shape in shapes)
+    for number, limits in enumerate(subject.can["limits"]):
+        own, loud = subject.tone(number), limits["level_max"] + 1
+        for frequency in (limits["frequency_min"] - 1, limits["frequency_max"] + 1):
+            if 0 <= frequency <= 0xFFFF:
+                yield replace(own, frequency=frequency)
+        if loud <= FULL:
+            above = Envelope(low, ((loud, 0),))
+            yield from (
+                replace(own, level=loud),
+                replace(own, onset=above),
+                replace(own, ending=above),
+            )
+
+
+def _flawed_sets(subject: Subject) -> Iterator[_Flawed]:
+    """Yield sets that must be refused: beside a good layer, and as words that no set can have."""
+    tone, good = subject.tone(), layer(1, subject.tone(0, 0.5))
+    channels, layers, ramp = len(subject.channels), len(subject.layers), subject.can["ramp_max"]
+    for one in _flawed_tones(subject):
+        yield _Flawed(pack_layers([good, layer(0, one)]), channels=(one.channel,))
+    yield _Flawed(pack_layers([good, layer(0, tone, tone)]), "BAD_CHANNEL", (0,))
+    if channels < 16:
+        beyond = pack_layers([good, layer(0, replace(tone, channel=channels))])
+        yield _Flawed(beyond, "BAD_CHANNEL", (channels,))
+    for layer_set in (
+        *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
+        *([layer(layers, tone)] if layers < 16 else []),
+        *([layer(0, tone, ramp=ramp + 1)] if ramp < 1000 else []),
+    ):
+        yield _Flawed(pack_layers([good, layer_set]))
+    words = pack_layers([layer(0, tone)])
+    for at, word, named in (
+        (0, words[0] | 1 << 15, (None,)),
+        (1, QUANTITIES["ramp"].maximum + 1, (None,)),
+        (2, QUANTITIES["valid_for"].maximum + 1, (None,)),
+        (3, words[3] | 1 << 12, (None, 0)),
+        (5, _LEVEL + 1, (None, 0)),
+        (6, _PHASE.maximum + 1, (None, 0)),
+        (6, 0x10000 + _PHASE.minimum - 1, (None, 0)),
+    ):
+        yield _Flawed([*words[:at], word, *words[at + 1 :]], channels=named)
+    for wrong in (words[:-1], [*words, 0], [words[0] + 1, *words[1:]]):
+        yield _Flawed(wrong, "BAD_LENGTH")
+
+
+@driving(_PLACE)
+def all_or_nothing(subject: Subject) -> Rows:
+    """It refuses a set as a whole, says why and names the channel; what plays and waits stays."""
+    flawed = [
+        row
+        for token, each in enumerate(_flawed_sets(subject), 2)
+        for row in (
+            each.sent(token=token, now=1),
+            each.sent(token=token, now=0),
+            send("Commit", token=token, code="BAD_TOKEN"),
+        )
+    ]
+    last, silent = len(flawed) // 3 + 2, _Flawed(pack_layers([layer(0)]), "BAD_TOKEN")
+    return [
+        subject.arm,
+        subject.one(),
+        *flawed,
+        play(subject.one(level=0.5), token=last),
+        stage(subject.one(level=0.25)),
+        silent.sent(token=last - 1, now=1),
+        send("Set", raw=[subject.next_session, 0, 1 << 1, *silent.words], code="BAD_TOKEN"),
+        send("Commit", token=last + 1),
+    ]
+
+
+@driving("protocol.md#messages")
+def accepts_its_ranges(subject: Subject) -> Rows:
+    """It takes what is just within its ranges, and any frequency of a silent channel."""
+    can, quiet = subject.can, round(subject.level * FULL)
+    shapes = [
+        Envelope(can[f"envelope_step_{end}"], ((quiet, _PHASE.maximum),) * count)
+        for end in ("min", "max")
+        for count in {0, min(1, can["knots"]), can["knots"]}
+    ]
+    loud = [
+        Command(number, limits[end], limits["level_max"], _PHASE.minimum)
+        for number, limits in enumerate(can["limits"])
+        for end in ("frequency_min", "frequency_max")
+    ]
+    ramp, lasting = can["ramp_max"], QUANTITIES["valid_for"].maximum
+    return [
+        subject.arm,
+        *(stage(subject.one(each, ramp=ramp, valid_for=lasting)) for each in loud),
+        *(stage(subject.one(subject.tone(onset=each, ending=each))) for each in shapes),
+        stage(layer(len(subject.layers) - 1, subject.tone(), ramp=ramp)),
+        *(layer(0, Command(0, frequency, 0, 0)) for frequency in (0, 0xFFFF)),
+    ]

@@ -1,0 +1,275 @@
+"""Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
+
+import asyncio
+from functools import partial
+from itertools import chain, cycle
+
+from drivers.judge.asking.check import driving
+from drivers.judge.asking.material import Rows, layer, play, send, stage
+from drivers.judge.asking.staging import long_set
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.table import QUANTITIES
+from registry import clock
+
+_STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
+_WRONG = "WRONG_STATE"
+
+
+@driving(_STATES)
+def plays_nothing_disarmed(subject: Subject) -> Rows:
+    """It plays nothing before it is armed."""
+    return [
+        play(subject.one(), code=_WRONG),
+        stage(subject.one(), code=_WRONG),
+        send("Commit", token=1, code=_WRONG),
+        send("Silence", ramp=0, code=_WRONG),
+        subject.ping,
+    ]
+
+
+@driving(_STATES)
+def arming(subject: Subject) -> Rows:
+    """It is silent once armed, with high voltage on, and forgets what was played and staged."""
+    return [
+        *(subject.arm, play(subject.one(), token=40_000), stage(subject.one(), token=40_001)),
+        *(send("Disarm", ramp=0), subject.settle, subject.arm),
+        send("Commit", token=40_001, code="BAD_TOKEN"),
+        play(subject.one(), token=39_999),  # older than 40 000, but the first of this session
+    ]
+
+
+@driving(_STATES)
+async def watchdog_ranges(subject: Subject) -> None:
+    """It arms with its shortest watchdog, which trips, its longest, and with none beyond."""
+    low, high = subject.can["watchdog_min"], subject.can["watchdog_max"]
+    outer = QUANTITIES["watchdog"]
+    times = low - 1, high + 1, outer.minimum - 1, outer.maximum + 1, 0, 0xFFFF
+    beyond = [time for time in times if not low <= time <= high]
+    await subject.run([send("Arm", watchdog=time, code="BAD_VALUE") for time in beyond])
+    await subject.send(send("Arm", session=0, watchdog=low, code="BAD_VALUE"))
+    # No feeding is needed, and none may be possible on a slow line.
+    await subject.arm(low / 1000, is_fed=False)
+    await subject.settle()
+    await subject.run([send("GetFaults"), subject.clear, partial(subject.arm, high / 1000)])
+    await subject.run([send("Disarm", ramp=0)])
+
+
+@driving(_STATES)
+def arms_again(subject: Subject) -> Rows:
+    """It takes the same Arm again as a restart of the watchdog with its time, and plays on."""
+    low, high = subject.shortest_watchdog, subject.can["watchdog_max"]
+    return [
+        *(partial(subject.arm, high / 1000), subject.one(), stage(subject.one(level=0.5))),
+        *(send("Arm", watchdog=low), send("Arm", watchdog=high), send("Commit", token=2)),
+    ]
+
+
+@driving(_SESSIONS)
+def sessions(subject: Subject) -> Rows:
+    """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
+    subject.client.session, own = 0x1233, 0x1234
+    quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
+    others = [
+        request
+        for other in (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
+        for request in (
+            play(quarter, token=3, session=other, code="WRONG_SESSION"),
+            send("Commit", token=2, session=other, code="WRONG_SESSION"),
+            send("Silence", ramp=0, session=other, code="WRONG_SESSION"),
+            send("Ping", session=other, code="WRONG_SESSION"),
+            send("Arm", watchdog=maximum, session=other, code="WRONG_SESSION"),
+        )
+    ]
+    return [
+        subject.arm,
+        subject.one(),
+        stage(subject.one()),
+        *others,
+        send("Ping", session=0, code="BAD_VALUE"),
+        *(send("Disarm", ramp=0), subject.settle),
+        send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
+        *(subject.arm, play(quarter, session=own, code="WRONG_SESSION")),
+    ]
+
+
+@driving(_STATES)
+def arming_ends_fades(subject: Subject) -> Rows:
+    """It is silent 5 ms after an Arm amid the fade of a Disarm."""
+    disarm = send("Disarm", ramp=subject.can["ramp_max"])
+    return [subject.arm, subject.one(), disarm, subject.arm, 0.02, subject.one()]
+
+
+@driving(_STATES)
+def stop(subject: Subject) -> Rows:
+    """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
+    return [
+        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
+        send("Arm", watchdog=subject.can["watchdog_max"], code=_WRONG),
+        *(send("Commit", token=2, code=_WRONG), play(subject.one(), code=_WRONG)),
+        *(send("Silence", ramp=0, code=_WRONG), send("Disarm", ramp=0), 0.1),
+    ]
+
+
+@driving(_STATES)
+def stop_ramps(subject: Subject) -> Rows:
+    """It falls silent along the ramp of a Stop or Disarm, a raised cosine, then is off."""
+    long, refused = min(500, subject.can["ramp_max"]), play(subject.one(), code=_WRONG)
+    stops = [(subject.whole(), send("Stop", ramp=each)) for each in (subject.ramp, long, 0xFFFF)]
+    ramps = subject.ramp, 0xFFFF
+    return [*stops, *((subject.whole(), send("Disarm", ramp=each), refused) for each in ramps)]
+
+
+@driving(_STATES)
+def silence_never_later(subject: Subject) -> Rows:
+    """It is silent by the sooner of two Stops; a later one prolongs nothing, nor does a fault."""
+    subject.require_ramp()
+    slow, quick = send("Stop", ramp=min(400, subject.can["ramp_max"])), send("Stop", ramp=50)
+    fading = layer(0, ramp=50)
+    return [
+        (subject.whole(), slow, quick),
+        (subject.whole(), quick, slow),
+        (subject.one(), fading, slow),
+    ]
+
+
+@driving(_STATES)
+def stop_ends_all(subject: Subject) -> Rows:
+    """It ends fades, onsets, endings, waiting sets and all layers by Stop, skipping endings."""
+    subject.require_ramp()
+    stopped = send("Stop", ramp=10), 0.05, subject.clear
+    return [(*rows, *stopped) for rows in subject.transitions(subject.can["ramp_max"])]
+
+
+@driving(_STATES)
+def stops_are_numbered(subject: Subject) -> Rows:
+    """It numbers every Stop, also of one disarmed; Clear names the last, else changes nothing."""
+    latch = token_after(token_after(token_after(subject.latch)))
+    others = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
+    return [
+        *(send("Stop", ramp=0), send("Stop", ramp=0), send("Stop", ramp=0)),
+        *(send("Clear", latch=other, code="WRONG_LATCH") for other in others),
+        *(subject.clear, subject.clear, subject.arm, subject.one(), subject.clear),
+    ]
+
+
+@driving(_STATES)
+def clear_too_early(subject: Subject) -> Rows:
+    """It stays stopped by a Clear amid its fade."""
+    subject.require_ramp()
+    ramp = subject.can["ramp_max"]
+    slow = send("Stop", ramp=ramp)
+    return [subject.arm, subject.one(), slow, subject.clear, ramp / 1000 + 0.02, subject.clear]
+
+
+@driving("protocol.md#sets")
+def silence(subject: Subject) -> Rows:
+    """It silences all layers along the ramp of Silence, drops what is staged, and stays armed."""
+    ending = subject.envelope(0.1, 1, 1)
+    several = play(
+        layer(0, subject.tone(0, 0.5, ending=ending)),
+        layer(1, subject.tone(0, 0.4, frequency=subject.other)),
+        layer(2, subject.tone(1 % len(subject.channels), 0.1)),
+    )
+    return [
+        *(subject.arm, several, stage(subject.one()), send("Silence", ramp=subject.ramp)),
+        *(subject.follow, send("Commit", token=2, code="BAD_TOKEN"), subject.one()),
+        send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
+    ]
+
+
+async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
+    """Play sets and starve it: it trips at its time [s], is silent 5 ms later, and lists it."""
+    first: Rows = [partial(subject.arm, time), *sets]
+    rows: Rows = (
+        *first,
+        *(subject.starve, 0.8 * time, subject.settle, send("GetFaults")),
+        *(play(*sets[:1], code="WRONG_STATE"), 0.05),
+        send("Arm", session=77, watchdog=round(1000 * time), code="WRONG_STATE"),
+        send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
+        *(send("Disarm", ramp=0), subject.clear),
+    )
+    await subject.run(rows)
+
+
+@driving(_SESSIONS)
+async def watchdog(subject: Subject) -> None:
+    """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
+    for time in (subject.shortest_watchdog, min(350, subject.can["watchdog_max"])):
+        await subject.in_time(partial(_trips, subject, time / 1000, subject.whole()))
+
+
+@driving(_SESSIONS)
+async def trips_amid_fades(subject: Subject) -> None:
+    """It trips at its time and is silent 5 ms later, whatever plays, fades, ends or waits."""
+    time = subject.shortest_watchdog
+    for sets in subject.transitions(min(3 * time, subject.can["ramp_max"])):
+        await subject.in_time(partial(_trips, subject, time / 1000, *sets))
+
+
+@driving(_SESSIONS)
+async def watchdog_unread(subject: Subject) -> None:
+    """It trips at its time though nothing is asked of it, and lists the fault with its age."""
+    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
+    await asyncio.sleep(subject.shown.watchdog + 0.4)
+    await subject.run([send("GetFaults")])
+
+
+@driving(_SESSIONS)
+def what_feeds(subject: Subject) -> Rows:
+    """It is fed by Arm, Ping, Set, Commit and Silence of its session, and counts the time left."""
+    long, *_ = subject.parts(*long_set(subject), token=3, now=0)
+    feeds = (
+        *(subject.ping, subject.one(), stage(subject.one(level=0.5))),
+        *(send("Commit", token=2), send("Commit", token=2), send("Set", **long)),
+        *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
+    )
+    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.1, feed))]
+
+
+@driving(_SESSIONS)
+def what_does_not_feed(subject: Subject) -> Rows:
+    """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
+    (part,) = subject.parts(subject.one(), token=7)
+    flawed = {**part, "stream": [0xFFFF, 0, 0]}
+    flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
+    idle: Rows = [
+        *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
+        *(send("GetAchieved", layer=0), send("Clear", latch=0)),
+        send("Ping", session=77, code="WRONG_SESSION"),
+        play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
+        play(subject.one(), token=0x8001, code="BAD_TOKEN"),
+        send("Set", **flawed, code=flaws),
+        send("Commit", token=20_000, code="BAD_TOKEN"),
+        send("Commit", token=1, session=77, code="WRONG_SESSION"),
+        send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
+        send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
+        send("Ping", raw=(1, 0), code="BAD_LENGTH"),
+        partial(subject.client.exchange, 63, ()),
+    ]
+    rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
+    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows)]
+
+
+@driving(_SESSIONS)
+async def trips_amid_other_requests(subject: Subject) -> None:
+    """It trips at its time amid requests that do not feed it."""
+    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
+    others: Rows = (
+        *(send("GetFaults"), send("GetAchieved", layer=0), send("Clear", latch=0)),
+        *(send("Ping", session=77, code="WRONG_SESSION"), partial(subject.client.exchange, 63, ())),
+    )
+    last = subject.shown.fed[0] + 0.7 * subject.shown.watchdog - subject.exchange_time
+    for row in cycle(others):
+        if clock.now() > last:
+            break
+        await subject.run([row])
+    await subject.settle()
+
+
+@driving("protocol.md#messages")
+async def fault_list(subject: Subject) -> None:
+    """It lists faults, the newest first, by their ages, also after they were cleared."""
+    for _ in range(2):
+        await _trips(subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
+    await subject.run([send("GetFaults"), 0.1, send("GetFaults")])

@@ -1,0 +1,390 @@
+"""The amplifier that is judged: requests by name, each status compared with what it must show."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from drivers.judge.amplifier import OFF
+from drivers.judge.asking.client import (
+    QUIET,
+    REPLY_TIMEOUT,
+    Answer,
+    Client,
+    Late,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    read_as,
+    require,
+    require_in_time,
+)
+from drivers.judge.asking.judge import Judge
+from drivers.judge.asking.material import FULL, Material, Rows, Send, layer, play, send
+from drivers.judge.asking.stated import STATED, Capabilities
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
+from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
+from drivers.wires.wire import reply_words
+from registry import clock
+
+LEVEL = 0.2
+"""Level of driven channels unless another is given: perceptible, and far from any limit."""
+_SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
+_PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest that count
+_NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
+_SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
+_MAX_WATCHDOG_USE = 0.8
+_DONE = "carried out"
+_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
+_BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
+_MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
+
+
+class Subject(Material):
+    """An identified amplifier at the far end of a client; level: of driven channels, at most.
+
+    expected: what it must show, None until it was brought to rest. token: of the last set made.
+    sent_set: the parts of the last set that was sent.
+    """
+
+    def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
+        super().__init__(can, level)
+        self.client, self.identity = client, identity
+        self.session, self.token = 1, 0
+        self.expected: Judge | None = None
+        self.is_starving = True
+        self.sent_set: list[Sequence[int]] = []
+        client.quiet = REPLY_TIMEOUT
+        self.heard_at = clock.now()
+        channels, layers = can["channels"], can["layers"]
+        client.reply_words = {
+            each.number: reply_words(name, channels, layers) for name, each in MESSAGES.items()
+        }
+
+    @property
+    def shown(self) -> Judge:
+        """What it must show."""
+        assert self.expected is not None  # noqa: S101
+        return self.expected
+
+    # Requests
+
+    async def run(self, rows: Rows) -> None:
+        """Carry rows out in turn; after each, the status must show what is expected."""
+        for row in rows:
+            if isinstance(row, float):
+                await self.pause(row)
+            elif isinstance(row, LayerSet | Send):
+                await self.send(row if isinstance(row, Send) else play(row))
+            elif isinstance(row, Sequence):
+                await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
+            else:
+                await row()
+            await self.status()
+
+    async def send(self, row: Send) -> Answer:
+        """Send a request, whose answer must be one of its codes."""
+        several = [row.values]
+        if row.layers:
+            token, now = row.values.get("token", 0), row.values["now"]
+            parts = self.parts(*row.layers, token=token, now=now)
+            several = [{**each, **row.values} for each in parts]
+        for values in several:
+            answer = await self.answer(row.name, row.raw, **values)
+            if answer.code:
+                break
+            answer = await self._carried_out(row.name, {"session": self.session, **values}, answer)
+        brief = {name: value for name, value in values.items() if name != "stream"}
+        what = f"{row.name} {row.raw or brief}"
+        codes = [each or _DONE for each in row.codes]
+        expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
+        is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
+        if answer.code and is_named:
+            expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")
+        return answer
+
+    async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
+        """Send a request by its values, or raw words, and return what became of it."""
+        self._check_fed()
+        message, values = MESSAGES[name], {"session": self.session, **values}
+        if raw is None:
+            try:
+                raw = message.request.pack(values)
+            except ValueError:  # beyond the table
+                raw = [values[each] for each in message.request.names]
+        if name == "Set":
+            is_part = self.sent_set and [*self.sent_set[-1][:2]] == [*raw[:2]]
+            self.sent_set = [*(self.sent_set if is_part else ()), raw]
+        client, sent = self.client, clock.now()
+        answer = await client.exchange(message.number, raw)
+        self._check_fed()  # or it may have been carried out after the watchdog
+        took = clock.now() - sent
+        client.quiet = min(client.quiet, QUIET + took)
+        if not answer.code:  # a refusal may come sooner
+            beyond = max(took - client.wire_time(len(raw), len(answer.words)), 0.0)
+            count = 1 if name in _READ_ALONE else client.transactions
+            client.fastest[name] = min(client.fastest.get(name, math.inf), took)
+            client.reactions[name].append(beyond / count)
+        self.heard_at = answer.when.latest
+        return answer
+
+    async def request(self, name: str, **values: Any) -> Answer:
+        """Send a request that must be carried out; its reply must show what is expected."""
+        return await self.send(send(name, **values))
+
+    async def _carried_out(self, name: str, values: Values, answer: Answer) -> Answer:
+        """Read the reply to a request, and compare it with what must be shown."""
+        record = STATED if name == "GetCaps" else MESSAGES[name].reply
+        shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
+        if "levels" in shown:
+            for each in ("channels", "layers"):
+                expect_equal(shown[each], self.can[each], f"number of {each} in Status")
+        if self.expected is not None:
+            if name == "Set":
+                self.token = values["token"]
+                if self.token != self.expected.token:
+                    self.expected.sets.sent(values, answer.when.earliest)
+            if name == "Commit" or shown.get("played"):
+                is_exact = shown.get("exact", self.expected.sets.is_exact)
+                await self._learn_achieved(values["token"], is_exact=bool(is_exact))
+            self.expected.granted(name, values, shown, answer.when)
+            self.is_starving = self.is_starving or name in ("Stop", "Disarm")
+        return replace(answer, values=shown)
+
+    async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
+        """Read what is played of a set that is not played to the word."""
+        judge, played = self.shown, []
+        layers = judge.sets.whole(token) if token != judge.token else None
+        if layers is None or is_exact:
+            return
+        for one in layers:
+            answer = await self.answer("GetAchieved", layer=one.layer)
+            unpack = MESSAGES["GetAchieved"].reply.unpack
+            shown = read_as("reply to GetAchieved", unpack, answer.words, is_strict=False)
+            is_shown = shown["token"] == token and not one.renew
+            played.append(judge.achieved(one, shown) if is_shown else one)
+        judge.sets.replace(token, tuple(played))
+
+    async def status(self) -> Answer:
+        """Read the status; feeds the watchdog where that is due."""
+        if self._is_hungry:
+            return await self.ping()
+        return await self.request("GetStatus")
+
+    async def ping(self) -> Answer:
+        """Feed the watchdog."""
+        return await self.request("Ping")
+
+    async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True) -> Answer:
+        """Arm under a new session with a watchdog [s], or the nearest that is possible.
+
+        is_fed: the nearest in which it can be fed, else it may expire from now on.
+        """
+        self.session = self.client.session = self.next_session
+        self.token, self.is_starving = 0, not is_fed
+        shortest = self.shortest_watchdog if is_fed else self.can["watchdog_min"]
+        milliseconds = min(max(round(1000 * watchdog), shortest), self.can["watchdog_max"])
+        return await self.request("Arm", session=self.session, watchdog=milliseconds)
+
+    @property
+    def next_session(self) -> int:
+        """The session of the next Arm."""
+        return self.client.session % 0xFFFF + 1
+
+    async def clear(self) -> Answer:
+        """Acknowledge the last stop or fault."""
+        return await self.request("Clear", latch=self.latch)
+
+    @property
+    def latch(self) -> int:
+        """The number of the last stop or fault."""
+        return self.shown.latch or 0
+
+    def _check_fed(self) -> None:
+        """Raise Late where this machine may have starved the watchdog."""
+        require_in_time(self._since_fed <= _MAX_WATCHDOG_USE, "the watchdog was not fed in time")
+
+    @property
+    def _since_fed(self) -> float:
+        """Share of the watchdog time that has passed."""
+        if self.is_starving or self.expected is None or self.expected.state != ENABLED:
+            return 0.0
+        return (clock.now() - self.expected.fed[0]) / self.expected.watchdog
+
+    @property
+    def _is_hungry(self) -> bool:
+        return self._since_fed > 0.25
+
+    async def starve(self) -> None:
+        """From now on the watchdog may expire."""
+        self.is_starving = True
+
+    async def rest(self) -> None:
+        """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
+        self.expected = None
+        await self.request("Stop", ramp=0)
+        stopped = await self.settle()
+        cleared = await self.request("Clear", latch=stopped["latch"])
+        expect_equal(cleared["state"], OFF, "state after Clear")
+        await self.watch()
+
+    def require_alone(self) -> None:
+        """Raise Optional where what is for all would reach other amplifiers."""
+        where = ", ".join(map(str, sorted(self.client.neighbours)))
+        require(not where, f"left out, since it would reach others: what is for all ({where})")
+
+    async def watch(self) -> None:
+        """Judge all replies from now on, by the status as it is."""
+        status = await self.request("GetStatus")
+        self.expected = Judge(self.can, status.values, status.when)
+
+    def parts(
+        self, *layers: LayerSet, token: int = 0, now: int = 1, count: int = 1
+    ) -> list[Values]:
+        """Make the parts of a set but for their session; token: 0 for the next; count: at least."""
+        if not token:
+            token = self.token = self.token % 0xFFFF + 1
+        ramp_max = self.can["ramp_max"]
+        layers = tuple([replace(one, ramp=min(one.ramp, ramp_max)) for one in layers])
+        stream = pack_layers(layers)
+        made = parts(stream, session=1, token=token, now=bool(now), max_words=len(stream) // count)
+        return [{name: each[name] for name in each if name != "session"} for each in made]
+
+    def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:
+        """Return a set of one part that plays at once, and its words."""
+        (part,) = self.parts(*layers)
+        words = MESSAGES["Set"].request.pack({"session": self.session, **part})
+        self.sent_set = [words]
+        return part, words
+
+    def played(self, part: Values, when: When) -> None:
+        """Note that a set of one part was carried out."""
+        self.shown.sets.sent(part, when.earliest)
+        self.shown.carry_out("Set", part, {}, when)
+
+    async def play(self, *layers: LayerSet) -> Answer:
+        """Play a set at once."""
+        return await self.send(play(*layers))
+
+    # In time
+
+    @property
+    def exchange_time(self) -> float:
+        """The shortest exchange [s] of the slowest message so far, or what it may take if less.
+
+        Lest an amplifier that is late has longer times. A line may delay more than is known of it,
+        which a reading shows.
+        """
+        count, fastest = self.client.transactions, self.client.fastest
+        read = min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
+        slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
+        return min(slowest, count * REACTION + max(self.client.transit, count * read))
+
+    @property
+    def slowness(self) -> float:
+        """By what times must be longer than those for a line with exchanges of 10 ms or less."""
+        return max(min(self.exchange_time, _SLOWEST) / _PROMPT, 1.0)
+
+    def lasting(self, milliseconds: int) -> int:
+        """Return a time [ms] that is long against an exchange, as this one is on a quick line."""
+        return math.ceil(milliseconds * self.slowness)
+
+    @property
+    def shortest_watchdog(self) -> int:
+        """The shortest watchdog time [ms], or that in which it can be fed on a slow line."""
+        fed = math.ceil(10_000 * min(self.exchange_time, _SLOWEST))
+        return int(min(max(self.can["watchdog_min"], fed), self.can["watchdog_max"]))
+
+    @property
+    def ramp(self) -> int:
+        """A ramp [ms] that is long against an exchange."""
+        required = max(200, math.ceil(30_000 * min(self.exchange_time, 0.03)))
+        return int(min(required, self.can["ramp_max"]))
+
+    def require_ramp(self, duration: float = 0.0) -> None:
+        """Raise Optional where no ramp lasts as long as a time [s], or as a few exchanges."""
+        duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
+        require(
+            self.can["ramp_max"] >= 1000 * duration, f"its ramps are shorter than {duration:.2g} s"
+        )
+
+    @property
+    def long_onset(self) -> Envelope:
+        """An onset with knots that is long against an exchange, as far as there are knots."""
+        duration = max(0.2, 16 * min(max(self.exchange_time, self.client.transit / 2), 1.0))
+        step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
+        self.require_knots()
+        count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
+        return self.envelope(duration / (count + 1), *([0.5, 1.0] * count)[:count])
+
+    async def pause(self, duration: float) -> None:
+        """Wait for a time [s], feeding the watchdog."""
+        end = clock.now() + duration
+        while (left := end - clock.now()) > 0:
+            if self._is_hungry:
+                await self.ping()
+                continue
+            is_fed = self.is_starving or self.shown.state != ENABLED
+            await asyncio.sleep(left if is_fed else min(left, self.shown.watchdog / 8))
+        self.heard_at = end
+        require_in_time(clock.now() <= end + _OVERSLEPT, "a pause took too long")
+
+    async def settle(self) -> Answer:
+        """Read statuses until it is silent and in a state that lasts."""
+        due = clock.now() + _SETTLED
+        while True:
+            reply = await self.status()
+            if not any(reply["levels"]) and reply["state"] not in (*_MOVING, ENABLED):
+                return reply
+            seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
+            expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
+            await asyncio.sleep(_POLL)
+
+    async def follow(self, duration: float | None = None) -> None:
+        """Read statuses for a time [s] from the last change on, None until all is settled.
+
+        Raises Late where this machine was too slow to see what happens.
+        """
+        began = self.shown.outputs.began
+        end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
+        end = end if duration is None else began[0] + duration
+        end = max(end, clock.now() + 3 * min(self.exchange_time, 1.0))  # of a slow line: a few
+        time, seen = end - self.heard_at, 0
+        pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
+        while clock.now() < end:
+            reply = await self.status()
+            width = reply.when.latest - reply.when.earliest + began[1] - began[0]
+            is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)
+            seen += is_narrow
+            await asyncio.sleep(pause * is_narrow)
+        needed = max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2)
+        require_in_time(seen >= needed, f"only {seen} statuses were in time")
+
+    async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
+        """Try a case, each time from rest, until this machine was in time."""
+        while True:
+            began = clock.now()
+            await self.rest()
+            try:
+                await case()
+                return
+            except Late:
+                if not self.client.was_late(began):
+                    raise
+
+    async def require_interference(self) -> None:
+        """Raise Optional where levels do not show that tones of one frequency cancel."""
+        halves = [self.tone(0, 0.5, phase) for phase in (0.0, 180.0)]
+        await self.play(*(layer(at, each) for at, each in enumerate(halves)))
+        level = (await self.request("GetStatus"))["levels"][0]
+        await self.play(*map(layer, range(2)))
+        require(
+            level <= 0.75 * self.level * FULL,  # phases may be rounded
+            "its levels do not show that tones of one frequency interfere",
+        )
+        self.shown.outputs.interferes = True

@@ -1,0 +1,275 @@
+"""What the channels and layers of an amplifier must show: levels, tokens, sums that are limited.
+
+A set begins at some time between its commit and the reply, or a little later; what plays then is
+asked of `drivers.playing.uncertain`.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol, TypeAlias
+
+from drivers.playing.playback import Playback, playback_of
+from drivers.playing.uncertain import Interval, UncertainPlayback
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES, has_flag
+
+_LATE = 0.002  # s; by which a set may begin later
+_DRIFT = 1e-3  # of a time; of the amplifier's clock
+_TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
+_MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
+_MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
+_LASTING = 3.0  # s; what ends after it is not awaited
+_FINE = 0.026  # Hz; half a step of the wire
+_RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
+_LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
+_ALL_LAYERS = {*range(_LAYERS)}
+
+
+class Report(Protocol):
+    """Takes a violation: rule, time [s], what must be what, and what was seen."""
+
+    def __call__(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
+        """Report it."""
+
+
+Unclear: TypeAlias = Callable[[str], None]
+"""Takes why it is unclear what plays: things came too close together."""
+
+
+def silent() -> Playback:
+    """Return a silent playback with all the channels and voices that there can be.
+
+    No fade is cut short in it, so that its levels are upper bounds.
+    """
+    return Playback(QUANTITIES["channel_count"].maximum, _VOICES)
+
+
+class ExpectedOutputs:
+    """The channels and layers of one amplifier, silent at first; times [s], intervals of two.
+
+    can: its capabilities, empty while unknown; slack [s]: of times. began: when what plays was
+    changed last, by its cause. is_exact: levels are those asked for, to the step; may_derate: or
+    lower, since it is warm. interferes: levels show how tones of one frequency interfere. lasting:
+    `valid_for` that a layer may show, of its set, a renewal or what waits.
+    """
+
+    def __init__(
+        self,
+        can: Values,
+        *,
+        report: Report,
+        unclear: Unclear | None,
+        slack: float,
+        cause: str,
+        began: Interval,
+    ) -> None:
+        self.began = began
+        self.cause = cause
+        self.is_exact, self.may_derate, self.interferes = True, False, False
+        self._report, self._unclear, self._slack = report, unclear, slack
+        self._plays = UncertainPlayback(playback_of(can) if can else silent())
+        self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
+        self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
+        self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
+        self.lasting: dict[int, set[int]] = {}
+        self._before: Sequence[float] = ()  # levels of channels before the last set
+        self._highest = 0.0  # of the sums of a channel since the last status, at most
+
+    def forget(self) -> None:
+        """Treat what plays as unknown."""
+        self._unknown = [math.inf] * _LAYERS
+
+    @property
+    def playback(self) -> Playback:
+        """What plays, with each commit in the middle of its interval."""
+        return self._plays.playback
+
+    # What happens
+
+    def _begins(
+        self, when: Interval, layers: Sequence[LayerSet] | None, ramp: float = 0.0
+    ) -> Interval:
+        """Return between which times begins what is carried out between two.
+
+        It is unclear where something ends or starts by itself just then.
+        """
+        begins = when[0], when[1] + _LATE
+        if self._unclear is not None and self._plays.is_ambiguous(begins, layers, ramp):
+            self._unclear("a request came as a layer ended by itself, or its onset")
+        return begins
+
+    def _may_end(self, layer: int, start: float, end: float) -> bool:
+        """Whether a layer may end by itself between two times."""
+        half = self._plays.half[layer]
+        return start - half <= self.playback.end_of(layer) <= end + half
+
+    def play(
+        self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
+    ) -> None:
+        """Play a set from some time between two on; is_exact: every command to the word."""
+        start, end = self._begins(when, layers)
+        channels = range(self.playback.channels)
+        self._before = [*map(self.playback.settled, channels)]
+        for one in layers:
+            number = one.layer
+            lasting = self.lasting.setdefault(number, set())
+            if not (one.renew or one.after):
+                lasting.clear()
+            lasting.add(one.valid_for)
+            if self._may_end(number, start, end) and (
+                one.renew or any(each.keep_phase for each in one.commands)
+            ):
+                self._unknown[number] = math.inf
+            elif not one.renew and not one.after:
+                fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
+                self._unknown[number] = min(self._unknown[number], fade)
+        self._plays.commit(layers, token, (start, end))
+        self.began, self.cause = when, f"set {token} of layers {[one.layer for one in layers]}"
+        self._has_floor, self.is_exact = True, self.is_exact and is_exact
+        self._highest = max(self._highest, self._peak(start))
+
+    def silence(
+        self, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
+    ) -> Interval:
+        """Silence all along a ramp [s] from some time between two on; return when it is silent."""
+        start, end = self._begins(when, None, ramp)
+        for layer in filter(lambda each: self._may_end(each, start, end), _ALL_LAYERS):
+            self._unknown[layer] = math.inf  # it fades, or has fallen silent by its ending
+        self._plays.silence((start, end), ramp)
+        is_known = max(self._unknown) < start
+        self._unknown = [min(until, end + ramp) for until in self._unknown]
+        self.began, self.cause, self._has_floor = when, cause, has_floor
+        ends, lag = self.playback.ends_by, self._plays.lag
+        first = max(ends - lag, start) if has_floor and is_known else when[0]
+        return first, max(ends + lag, end if is_known else end + ramp)
+
+    # What is known
+
+    def _widened(self, when: Interval) -> Interval:
+        """Return an interval as the amplifier's clock may have it."""
+        since = self.began[0]
+        extra = self._slack + _DRIFT * (when[1] - since)
+        return when[0] - extra, when[1] + extra
+
+    def sure(self, when: Interval) -> set[int]:
+        """Return the layers of which it is known what they play between two times.
+
+        No layer while what one of them plays is unknown.
+        """
+        start, end = self._widened(when)
+        is_known = max(self._unknown) < start
+        return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
+
+    def tokens_of(self, layer: int, sure: set[int]) -> set[int]:
+        """Return the tokens that a layer may show; sure: layers of which it is known."""
+        if layer in sure:
+            return {self.playback.tokens.get(layer, 0)}
+        return self.playback.next_tokens(layer)
+
+    def waits(self, when: Interval) -> bool:
+        """Whether a set surely waits for the end of an onset, whenever within an interval."""
+        return self.sure(when) == _ALL_LAYERS and bool(self.playback.waiting)
+
+    def settled_at(self, now: float) -> float:
+        """Return when all that plays lasts for long or is silent [s], as far as is known."""
+        playback, last = self.playback.copied(), now + _LASTING
+        while (due := playback.next_due) < last:
+            playback.advance(due)
+            now = due
+        ends = [voice.transition.end for voices in playback.all_voices for voice in voices]
+        return max([now, *ends])
+
+    # What is shown
+
+    def check(self, shown: Values, when: Interval) -> None:
+        """Compare a status that was true at some time between two; the next counts from there."""
+        tokens, start = shown["tokens"], self._widened(when)[0]
+        levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
+        if sure := self.sure(when):
+            low = self._check_levels(levels, when, self._report)
+            for layer, token in enumerate(tokens):
+                possible = self.tokens_of(layer, sure)
+                if token not in possible:
+                    what = f"token of layer {layer}, {self._since(when)}"
+                    self._report("token", when[1], what, must=one_of(possible), seen=token)
+            is_limited = has_flag(shown, "limited")
+            is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
+            must_be = is_beyond and self.is_exact and not self.may_derate
+            if must_be > is_limited or (is_limited and self._highest < 1):
+                self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
+        for layer, until in enumerate(self._unknown):
+            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
+                self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
+        self._highest = self._peak(start)
+
+    def _peak(self, time: float) -> float:
+        """The largest sum of a channel from a time on, with endings; infinite if a set waits."""
+        if self.playback.waiting:
+            return math.inf
+        return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
+
+    def check_sensors(
+        self,
+        levels: Sequence[float],
+        frequencies: Mapping[int, float],
+        time: float,
+        *,
+        report_low: Report | None,
+    ) -> None:
+        """Compare what sensors measure: levels, and frequencies [Hz] of channels that settled.
+
+        report_low: takes levels that are too low, None where they may be.
+        """
+        when = time, time
+        if sure := self.sure(when):
+            self._check_levels(levels, when, report_low)
+        lag = self._plays.lag + self._slack
+        for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
+            voices = self.playback.all_voices[channel]
+            lasting = sorted({each.frequency for each in voices if not each.has_ended})
+            is_settled = all(each.transition.end < time - lag for each in voices)
+            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
+                what = f"frequency of channel {channel}"
+                self._report("plays", time, what, must=one_of(lasting), seen=frequency)
+
+    def _check_levels(
+        self, levels: Sequence[float], when: Interval, report_low: Report | None
+    ) -> float:
+        """Compare levels of channels; returns the largest level that one surely has."""
+        can_be_low = self.may_derate or not self.is_exact or report_low is None
+        start, end = self._widened(when)
+        largest = 0.0
+        for channel, level in enumerate(levels[: self.playback.channels]):
+            low, high = self._plays.bounds(channel, start, end, is_exact=self.interferes)
+            largest = max(largest, low)
+            voices = len(self.playback.all_voices[channel])
+            slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
+            low, high = min(low, 1.0) * self._has_floor - slack, min(high, 1.0) + slack
+            is_low = level < low
+            if level > high or (is_low and not can_be_low):
+                report = report_low if is_low and report_low is not None else self._report
+                what = f"level of channel {channel}, {self._since(when)}"
+                must = f"{low:.6g} to {high:.6g}"
+                report(self._rule(channel, level, when), when[1], what, must=must, seen=level)
+        return largest
+
+    def _since(self, when: Interval) -> str:
+        low, high = 1e3 * (when[0] - self.began[1]), 1e3 * (when[1] - self.began[0])
+        return f"{low:.1f} to {high:.1f} ms after {self.cause}"
+
+    def _rule(self, channel: int, level: float, when: Interval) -> str:
+        """Which rule a wrong level breaks."""
+        if self.cause == "the watchdog":
+            return "watchdog"
+        if not self.playback.is_settled(self._widened(when)[0] - self._plays.lag):
+            return "ramp"
+        if not self.cause.startswith("set"):
+            return "silent"
+        before = self._before[channel] if channel < len(self._before) else 0.0
+        return "commit" if abs(level - before) < _TOLERANCE else "plays"
+
+
+def one_of(known: Iterable[object]) -> str:
+    """Return what something must be: one of some values."""
+    return " or ".join(map(str, known))

@@ -1,0 +1,5 @@
+"""The witness: it decodes every frame on the wires and reports broken rules.
+
+Messages are read by the one table and codec (`drivers.protocol`, `drivers.codec`), what plays comes
+from `drivers.playing.playback`; the rules are its own, and nothing of the host or of the far ends is here.
+"""

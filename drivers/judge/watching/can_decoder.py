@@ -1,0 +1,124 @@
+"""Messages on a CAN bus, in the text of an adapter: socketcand over TCP, slcan on a serial port.
+
+Of NMT, boot-up and what resets a node are decoded; heartbeats, emergencies and SDO, which other
+masters read, concern no rule. Other text is ignored.
+"""
+
+import re
+from collections import deque
+
+from drivers.counters import WireCounters
+from drivers.judge.watching.capture import Direction
+from drivers.judge.watching.decoded import (
+    NAMES,
+    DecodedFrame,
+    Decoder,
+    Message,
+    Notice,
+    damaged,
+    request_of,
+    sent_by_amplifier,
+)
+from drivers.protocol.table import EVENT, MAX_WORDS
+from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id
+from drivers.wires.can_bus.frames import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
+from drivers.wires.can_bus.frames import Message as Words
+from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
+
+_MAX_REST = 512  # bytes kept of text that does not end
+_KEPT = 3 * frames_of(MAX_WORDS)  # frames of the host, which an adapter may echo
+_NMT_START: int = CANOPEN["nmt"]["start"]
+_FORMS = {"slcan": SLCAN, "socketcand": SOCKETCAND}
+_IS_FRAME = re.compile(rb"t|< (?:send|frame) [0-9A-Fa-f]{1,3} ")  # with an 11-bit identifier
+
+
+class CanDecoder(Decoder):
+    """Decodes the text of an adapter of this kind."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self._form = _FORMS[kind]
+        self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
+        self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
+
+    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
+        """Decode bytes; returns the complete frames."""
+        *pieces, rest = self._form.end.split(self.rest[direction] + data)
+        self.rest[direction] = rest[-_MAX_REST:]
+        decode = self._form.decode_sent if direction == "amplifier" else self._form.decode
+        seen: list[DecodedFrame] = []
+        for piece in map(bytes.strip, pieces):
+            frame = decode(piece)
+            if frame is None:
+                if _IS_FRAME.match(piece):
+                    seen.append((piece, damaged("a malformed frame line")))
+                continue
+            sender = self._sender(frame)
+            take = self._from_host if direction == "amplifier" else self._from_bus
+            message = take(time, frame, sender)
+            if sender.cut_short is not None:
+                number, begun = sender.cut_short
+                seen.append((b"", damaged(f"message {number} without all frames", begun)))
+                sender.cut_short = None
+            seen.append((piece, message))
+        return seen
+
+    def _sender(self, frame: CanFrame) -> "_Sender":
+        is_numbered = frame.data[:1] != b"\0"
+        return self._senders.setdefault((frame.id, is_numbered), _Sender(is_numbered=is_numbered))
+
+    def _from_host(self, time: float, frame: CanFrame, sender: "_Sender") -> Message | None:
+        node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
+        self._sent.append(frame)
+        if frame.id == cob_id("nmt") and len(frame.data) == 2:
+            return None if frame.data[0] == _NMT_START else Notice("boot", frame.data[1])
+        words = sender.add(time, frame.data) if kind == REQUEST else None
+        if not isinstance(words, Words):
+            return words
+        key = (node, words.number, words.type) if node else None
+        return request_of(words.type, words.words, node, key, sender.begun)
+
+    def _from_bus(self, time: float, frame: CanFrame, sender: "_Sender") -> Message | None:
+        node, kind = frame.id & NODE_MAX, frame.id & ~NODE_MAX
+        if frame.id == cob_id("heartbeat", node) and frame.data == b"\0":
+            return Notice("boot", node)
+        if kind == REQUEST and node and frame not in self._sent:
+            is_first = len(frame.data) == BLOCK and frame.data[1] == 0
+            name = NAMES.get(frame.data[2]) if is_first else None
+            return Notice("other host", node, text=name) if name else None
+        words = sender.add(time, frame.data) if kind == REPLY and node else None
+        if not isinstance(words, Words):
+            return words
+        if words.number == 0 and words.type != EVENT:
+            return damaged(f"a message of type {words.type} without a number")
+        return sent_by_amplifier(words.type, words.words, node, words.number)
+
+
+class _Sender:
+    """Messages of one identifier; begun: time of the first frame of the last one [s].
+
+    cut_short: number and begin of a message that the last frame ended before it was whole.
+    """
+
+    def __init__(self, *, is_numbered: bool) -> None:
+        self.begun = 0.0
+        self.cut_short: tuple[int | None, float] | None = None
+        self._counters = WireCounters()
+        self._assembler = Assembler(self._counters, is_numbered=is_numbered)
+        self._number: int | None = None  # of the last frame
+        self._is_whole = True
+
+    def add(self, time: float, data: bytes) -> Words | Notice | None:
+        """Take the data of a frame; returns the message that it completes."""
+        if len(data) != BLOCK:
+            return damaged(f"a frame of {len(data)} bytes, must be {BLOCK}")
+        if data[0] != self._number or (self._is_whole and data[1] == 0):
+            self.cut_short = None if self._is_whole else (self._number, self.begun)
+            self._number, self._is_whole, self.begun = data[0], False, time
+        before = self._counters.invalid_frames, self._counters.unexpected_frames
+        words = self._assembler.add(data, time)
+        if words is None and self._counters.invalid_frames > before[0]:
+            return damaged("a frame that fits no message")
+        # An older one, or a copy, is no beginning of a message.
+        self._is_whole |= words is not None or self._counters.unexpected_frames > before[1]
+        return words

@@ -1,0 +1,232 @@
+"""Messages as they are decoded and sent, alike for every kind of wire; those of a serial line."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from drivers.judge.amplifier import FEEDING as FEEDING
+from drivers.judge.watching.capture import Direction
+from drivers.protocol.records import Record, Refusal, Values
+from drivers.protocol.table import (
+    BY_NUMBER,
+    ENABLED,
+    EVENT,
+    EVENT_RECORD,
+    FAULTS,
+    IDENTITY,
+    LATCHED,
+    MESSAGES,
+    NAK,
+    NAK_RECORD,
+    REFUSALS,
+    STATES,
+    VERSION,
+    read_request,
+)
+from drivers.protocol.table import HELLO as HELLO_NUMBER
+from drivers.wires.serial_line.frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
+
+HELLO = "Hello"
+A_READ = "a read"
+"""Name of a read that is no message, and changes nothing."""
+STATUS_RECORD = MESSAGES["GetStatus"].reply
+REPLIES = {HELLO: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
+"""Records of replies by the name of the request."""
+NAMES = {HELLO_NUMBER: HELLO, **{number: message.name for number, message in BY_NUMBER.items()}}
+"""Names of requests by number."""
+BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
+"""Requests that may be for all amplifiers of a line."""
+_WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A request. address: 0 for broadcast; key: of its reply, None where there is none.
+
+    values: of its record; problem: what is wrong with it, or ""; begun: when the first of its
+    frames passed, None where it has one [s].
+    """
+
+    name: str
+    address: int
+    key: Hashable = None
+    values: Values = field(default_factory=dict)
+    problem: str = ""
+    begun: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A reply. key: of its request, None where it matches none; values: None where it has none.
+
+    refusal: code, 0 if granted; problem: what is wrong with it, or "".
+    """
+
+    address: int
+    key: Hashable = None
+    values: Values | None = None
+    refusal: int = 0
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What is neither: part of an exchange, a change, or what cannot be read.
+
+    carried out: the amplifier has carried the request of a key out; read on: the host goes on with
+    it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
+    has reset it. other host: its request, by name. damaged: a frame that is none, and why.
+    begun: when the first of its frames passed, None where it is one [s].
+    """
+
+    what: Literal["carried out", "read on", "event", "boot", "other host", "damaged"]
+    address: int = 0
+    key: Hashable = None
+    values: Values = field(default_factory=dict)
+    text: str = ""
+    begun: float | None = None
+
+
+class Decoder(ABC):
+    """Decodes both directions of a kind of wire; rest: bytes that begin a frame."""
+
+    def __init__(self) -> None:
+        self.rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
+
+    @abstractmethod
+    def feed(self, direction: Direction, time: float, data: bytes) -> list["DecodedFrame"]:
+        """Decode bytes; returns the complete frames."""
+
+
+Message: TypeAlias = Request | Reply | Notice
+DecodedFrame: TypeAlias = tuple[bytes, Message | None]
+"""A frame and its message; None for part of a message, or none that concerns the rules."""
+
+
+def damaged(why: str, begun: float | None = None) -> Notice:
+    """Return what is said of bytes that form no message."""
+    return Notice("damaged", text=why, begun=begun)
+
+
+def request_of(
+    number: int,
+    words: Sequence[int],
+    address: int,
+    key: Hashable,
+    begun: float | None = None,
+) -> Request:
+    """Read a request by the number of its message."""
+    name, values = NAMES.get(number, f"type {number}"), Values()
+    problem = "" if address or name in BROADCAST else "must not be a broadcast"
+    try:
+        if number != HELLO_NUMBER:
+            _, values = read_request(number, words)
+    except Refusal as refusal:
+        problem = str(refusal)
+    return Request(name, address, key, values, problem, begun)
+
+
+def reply_of(record: Record, words: Sequence[int], address: int, key: Hashable) -> Reply:
+    """Read what an amplifier sends: the record of a reply, a refusal or an Event."""
+    try:
+        values = record.unpack(words, is_strict=False)
+    except Refusal as refusal:
+        return Reply(address, key, problem=str(refusal))
+    problem = ""
+    for name, known in (("state", STATES), ("fault", FAULTS)) if record in _WITH_STATE else ():
+        if values[name] not in known.values():
+            problem = f"{name} must be 0 to {max(known.values())}, got {values[name]}"
+    return Reply(address, key, values, values["code"] if record is NAK_RECORD else 0, problem)
+
+
+def sent_by_amplifier(
+    number: int, words: Sequence[int], address: int, sequence: int
+) -> Reply | Notice:
+    """Read a message that an amplifier sends by its number; sequence: 0 for an Event on CAN."""
+    if number == EVENT:
+        event = reply_of(EVENT_RECORD, words, address, None)
+        if event.problem or event.values is None:
+            return damaged(f"an invalid Event: {event.problem}")
+        return Notice("event", address, values=event.values)
+    if number == NAK:
+        return reply_of(NAK_RECORD, words, address, (address, sequence, *words[:1]))
+    if number not in NAMES:
+        return damaged(f"a reply of unknown type {number}")
+    return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))
+
+
+@dataclass(eq=False, slots=True)
+class Sent:
+    """A request as it was sent, in this order; begun [s]: when its first byte passed.
+
+    since: from which on its amplifier has to respond, infinite while it is the host's turn; begin,
+    end: between which it is carried out, None for until its reply [s].
+    """
+
+    number: int
+    request: Request
+    begun: float
+    since: float
+    begin: float
+    end: float | None = None
+    is_overdue: bool = False
+
+
+_CARRIED_OUT: dict[str, Callable[[Values, Values], bool]] = {
+    "Arm": lambda values, status: status["state"] == ENABLED,
+    "Disarm": lambda values, status: status["state"] != ENABLED,
+    "Set": lambda values, status: values["now"] and status["token"] == values["token"],
+    "Commit": lambda values, status: status["token"] == values["token"],
+    "Silence": lambda values, status: not any(status["tokens"]),
+    "Stop": lambda values, status: status["state"] in LATCHED,
+    "Clear": lambda values, status: True,
+}
+CHANGING = frozenset(_CARRIED_OUT)
+"""Requests that change what the amplifier does."""
+
+
+def is_carried_out(request: Request, status: Values) -> bool:
+    """Whether a later status shows that a request was carried out."""
+    return bool(_CARRIED_OUT[request.name](request.values, status))
+
+
+_MAX_REST = 512  # bytes kept of a frame that does not end
+
+
+class SerialDecoder(Decoder):
+    """Decodes frames between zero bytes."""
+
+    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
+        """Decode bytes; returns the complete frames."""
+        *pieces, rest = (self.rest[direction] + data).split(b"\0")
+        self.rest[direction] = rest[-_MAX_REST:]
+        return [(b"\0" + one + b"\0", _decode(direction, one)) for one in pieces if one]
+
+
+def _decode(direction: Direction, piece: bytes) -> Message:
+    frames = FrameReader().feed(piece + b"\0")
+    if not frames:
+        return damaged("a frame of invalid length or checksum")
+    (frame,) = frames
+    if frame.is_reply != (direction == "host") and frame.type != EVENT:
+        return damaged("a frame of the wrong direction")
+    key = (frame.address, frame.sequence, frame.type) if frame.address else None
+    is_hello = frame.type == HELLO_NUMBER
+    message: Message
+    try:
+        words = () if is_hello else unpack_words(frame.payload)
+        if direction == "amplifier":
+            message = request_of(frame.type, words, frame.address, key)
+        elif is_hello:
+            message = Reply(frame.address, key, unpack_identity(frame.payload))
+        else:
+            message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
+    except Refusal as refusal:
+        if direction == "amplifier":
+            return Request(f"type {frame.type}", frame.address, key, problem=str(refusal))
+        return Reply(frame.address, key, problem=str(refusal))
+    is_other = frame.version != (NEUTRAL if is_hello else VERSION)
+    if is_other and getattr(message, "refusal", 0) != REFUSALS["UNSUPPORTED_VERSION"]:
+        return damaged(f"protocol version {frame.version}")
+    return message

@@ -1,0 +1,190 @@
+"""An amplifier as it must be (`drivers.judge`) by what passes on a wire, where replies get lost.
+
+A request without a reply may have been carried out: the next status says so.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from drivers.judge.amplifier import OFF, ExpectedAmplifier
+from drivers.judge.watching.capture import ReportViolation
+from drivers.judge.watching.decoded import (
+    CHANGING,
+    FEEDING,
+    REPLIES,
+    STATUS_RECORD,
+    Request,
+    Sent,
+    is_carried_out,
+)
+from drivers.playing.uncertain import Interval
+from drivers.protocol.achieved import TONE
+from drivers.protocol.records import Values
+from drivers.protocol.table import REACTION
+
+_LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
+
+
+class WatchedAmplifier(ExpectedAmplifier):
+    """The expected state of one amplifier by name; times [s].
+
+    report_always: for violations that no fault of the wire excuses; report: for all others.
+    is_answered: it has said in a reply that it is in a fault; last_fault: when that came;
+    reported_at: when it showed a state other than before. unanswered: requests that have no
+    reply, and may have been carried out.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        slack: float,
+        report: ReportViolation,
+        report_always: ReportViolation,
+    ) -> None:
+        self._name = name
+        always, excused = partial(self._say, report_always), partial(self._say, report)
+        super().__init__(excused, always, slack=slack, left_slack=_LEFT)
+        self.last_fault = -math.inf
+        self.is_answered = True
+        self.reported_at = -math.inf
+        self._answered = 0  # number of the newest request of which a reply was seen
+        self._fed_before = math.inf
+        # Silence where there must be none, which an unreported fault would explain.
+        self._suspicions: list[tuple[str, float, str, object, object]] = []
+
+    def _say(
+        self, report: ReportViolation, rule: str, time: float, what: str, *, must: object,
+        seen: object,
+    ) -> None:  # fmt: skip
+        report(rule, time, f"{self._name}: {what} must be {must}, got {seen}")
+
+    def report_silence(
+        self, rule: str, time: float, what: str, *, must: object, seen: object
+    ) -> None:
+        """Note silence that is no violation if it has a fault, as its next status says."""
+        self._suspicions.append((rule, time, what, must, seen))
+
+    def forget(self, cause: str = "what was not heard") -> None:
+        """Treat all as unknown until the next status."""
+        super().forget(cause)
+        self.unanswered: list[Sent] = []
+
+    def restarted(self, time: float) -> None:
+        """Note a restart: disarmed and silent."""
+        self.forget()
+        self.state, self.token, self.last_status = OFF, 0, time
+        self._settle("a restart", (time, time))
+
+    def advance(self, time: float) -> None:
+        """Apply what must have happened without a request until now."""
+        if not self.unanswered:
+            super().advance(time)
+
+    def _trip(self, fault: int, since: Interval, cause: str) -> None:
+        super()._trip(fault, since, cause)
+        self.is_answered, self.last_fault = False, since[1]
+
+    # requests
+
+    def sent(self, sent: Sent) -> None:
+        """Note a request without a reply, or none yet, that may be carried out soon."""
+        if sent.request.name in FEEDING:
+            self._fed_before = self.fed[1]
+            self.fed = self.fed[0], max(self.fed[1], sent.begun + REACTION)
+        if sent.request.name in CHANGING:
+            self.unanswered.append(sent)
+
+    def replied(self, sent: Sent, values: Values, end: float) -> None:
+        """Apply a request carried out until a time [s], and compare its reply.
+
+        A reply that the wire delayed beyond that of a newer request says nothing of now.
+        """
+        if sent.number < self._answered:
+            return
+        self._answered = sent.number
+        name = sent.request.name
+        self.advance(sent.begin)
+        if REPLIES.get(name) is STATUS_RECORD:
+            self._resolve(sent.number, values, end)
+        elif name in ("GetAchieved", "GetFaults") and self.unanswered:
+            return
+        self.granted(name, sent.request.values, values, (sent.begin, end))
+
+    def _take(self, part: Values, reply: Values, when: Interval) -> None:
+        """Compare the reply to a part of a set; one that plays finely and is cool plays exactly."""
+        super()._take(part, reply, when)
+        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
+        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
+            self._expect("plays", when[1], f"exact of set {part['token']}", 1, reply["exact"])
+
+    def refused(self, request: Request, time: float) -> None:
+        """Note a refusal; what silences must not be refused, nor a commit of what is staged."""
+        if request.name in FEEDING:
+            self.fed = self.fed[0], self._fed_before
+        if request.name in ("Stop", "Disarm"):
+            self.report("stop", time, f"answer to {request.name}", must="a status", seen="a Nak")
+        until, _ = self.sets.staged_until(request.values.get("token"))
+        is_held = self.is_enabled and request.values.get("session") == self.session
+        if request.name == "Commit" and is_held and time + REACTION <= until:
+            what = f"answer to Commit of set {request.values['token']}, which is staged"
+            self.report("commit", time, what, must="a status", seen="a Nak")
+
+    def _resolve(self, number: int, status: Values, end: float) -> None:
+        """Apply earlier requests without a reply that were carried out by a status."""
+        earlier = [each for each in self.unanswered if each.number < number]
+        self.unanswered = [each for each in self.unanswered if each.number >= number]
+        for each in earlier if self.state is not None else ():
+            request, begun, is_broadcast = each.request, each.begun, each.request.key is None
+            until, _ = self.sets.staged_until(request.values.get("token"))
+            if is_carried_out(request, status):
+                last = min(end, begun + REACTION) if is_broadcast else end
+                self.carry_out(request.name, request.values, status, (begun, max(last, begun)))
+            elif request.name == "Arm":
+                self.token = None  # 0, if it was carried out before what disarmed again
+            elif is_broadcast and request.name == "Stop":
+                self.report("stop", end, "answer to a broadcast Stop", must="obeyed", seen="none")
+            elif is_broadcast and begun + REACTION <= until:
+                what = f"answer to a broadcast Commit of set {request.values['token']}"
+                self.report("commit", end, what, must="obeyed", seen="none")
+
+    # reports
+
+    def note_state(self, shown: Values, when: Interval) -> bool:
+        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
+        before = self.state, self.is_shown
+        fits = super().note_state(shown, when)
+        if before != (shown["state"], True):
+            self.reported_at = when[1]
+        for rule, time, what, must, seen in () if self.is_in_fault else self._suspicions:
+            self.report(rule, time, what, must=must, seen=seen)
+        self._suspicions.clear()
+        return fits
+
+    def check(self, shown: Values, when: Interval) -> None:
+        """Compare a status that was true at some time between two."""
+        super().check(shown, when)
+        self.is_answered = True
+
+    def event_reported(self, event: Values, time: float) -> None:
+        """Compare an Event, unless a request that explains it is not replied to yet."""
+        if self.unanswered:
+            return
+        self.advance(time)
+        if not self.note_state(event, (time, time)):
+            self._adopt(event, (time, time))
+        self.last_status = time
+
+    def check_sensors(
+        self, levels: Sequence[float], frequencies: Mapping[int, float], time: float
+    ) -> None:
+        """Compare what sensors measure on its channels: levels, and known frequencies [Hz]."""
+        self.advance(time)
+        if self.unanswered:
+            return
+        is_fault_possible = self.is_enabled or not self.is_shown
+        report_low = self.report_silence if is_fault_possible else self.report
+        may_be_off = self.is_enabled and time > self.expiry[0] - self.slack
+        report = None if may_be_off else report_low
+        self.outputs.check_sensors(levels, frequencies, time, report_low=report)

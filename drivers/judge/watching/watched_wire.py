@@ -1,0 +1,305 @@
+"""One watched wire: matches replies with requests, and passes both to host and amplifier rules."""
+
+import math
+from collections import deque
+from collections.abc import Hashable, Mapping
+
+from drivers.judge.watching.amplifier_session import AmplifierSession, Delays, check_sums
+from drivers.judge.watching.can_decoder import CanDecoder
+from drivers.judge.watching.capture import Direction, Report
+from drivers.judge.watching.config import TimeLimits
+from drivers.judge.watching.decoded import (
+    BROADCAST,
+    CHANGING,
+    FEEDING,
+    HELLO,
+    Decoder,
+    Message,
+    Notice,
+    Reply,
+    Request,
+    Sent,
+    SerialDecoder,
+)
+from drivers.judge.watching.host_rules import HostRules
+from drivers.judge.watching.modbus_decoder import ModbusDecoder
+
+_RECOVERY = 0.5  # s; after a fault a wire counts as disturbed for so long
+_COPIES = 64  # frames kept to recognise repeated ones
+_PENDING_TIMEOUT = 1.0  # s; then a reply matches nothing any more
+_PRESENT = ("GetStatus", "GetFaults")
+"""Requests that are carried out when their reply is read, on Modbus."""
+_CONSTANT = (HELLO, "GetCaps")
+
+
+def decoder_of(kind: str) -> Decoder:
+    """Return a decoder for a kind of wire."""
+    if kind == "serial":
+        return SerialDecoder()
+    if kind.startswith("modbus"):
+        return ModbusDecoder(over_tcp=kind == "modbus-tcp")
+    return CanDecoder(kind)
+
+
+class WatchedWire:
+    """A wire; sessions: by the addresses of the amplifiers."""
+
+    def __init__(
+        self,
+        name: str,
+        kind: str,
+        sessions: Mapping[int, AmplifierSession],
+        *,
+        host: HostRules,
+        times: TimeLimits,
+        delays: Delays,
+        report: Report,
+    ) -> None:
+        self.name = name
+        self.sessions = dict(sessions)
+        self._kind = kind
+        self._decoder = decoder_of(kind)
+        self._host, self._times, self._delays, self._report = host, times, delays, report
+        self._begun: dict[Direction, float] = {}  # start of partial frames [s]
+        self._pending: dict[Hashable, Sent] = {}  # by key of the reply
+        self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
+        self._replied: deque[Hashable] = deque(maxlen=_COPIES)
+        self._number = self._preempted_by = 0  # of the last request, and of one that preempts
+        self._damaged_at = -math.inf  # when a frame of the host was damaged last [s]
+        self._faults_until = self._disturbed_until = -math.inf
+
+    # host and faults
+
+    def opened(self, time: float) -> None:
+        """Note that a host has opened it: its amplifiers are not identified yet."""
+        self._decoder, self._begun = decoder_of(self._kind), {}
+        self._forget_pending(time)
+        for session in self.sessions.values():
+            session.is_open, session.is_identified, session.session = True, False, None
+            session.is_asked = True
+            session.forget_amplifier()
+
+    def closed(self, time: float) -> None:
+        """Note that the host has closed or lost it."""
+        for sent in self._pending.values():
+            if sent.request.name in CHANGING:  # it may be executed unheard
+                self.sessions[sent.request.address].amplifier.forget()
+        self._forget_pending(time)
+        for session in self.sessions.values():
+            session.is_open = False
+            session.stop_requested_at = session.last_feed = session.first_stop = None
+
+    def _forget_pending(self, time: float) -> None:
+        """Abandon the pending requests; their replies may still arrive, and at another host."""
+        if self._pending:
+            self.disturb(time)
+        self._replied.extend(self._pending)
+        self._pending.clear()
+
+    def _drop_pending(self, session: AmplifierSession) -> None:
+        """Expect no reply to what was sent to an amplifier."""
+        self._pending = {
+            key: sent
+            for key, sent in self._pending.items()
+            if self.sessions[sent.request.address] is not session
+        }
+
+    def is_pending(self, session: AmplifierSession) -> bool:
+        """Whether an amplifier has not replied to a request yet."""
+        return any(self.sessions[one.request.address] is session for one in self._pending.values())
+
+    def is_disturbed(self, time: float) -> bool:
+        """Whether faults are injected at a time [s], or were shortly before."""
+        return time <= self._disturbed_until
+
+    def disturb(self, time: float) -> None:
+        """Count as disturbed for a while from a time [s] on."""
+        self._disturbed_until = max(self._disturbed_until, time + _RECOVERY)
+
+    def set_disturbed(self, time: float, *, is_on: bool) -> None:
+        """Note the start or the end of injected faults."""
+        self._faults_until = math.inf if is_on else time
+        self._disturbed_until = self._faults_until + _RECOVERY
+        for session in () if is_on else self.sessions.values():
+            session.amplifier.forget()  # what it did meanwhile may be unseen
+
+    # frames
+
+    def feed(self, direction: Direction, time: float, data: bytes) -> int:
+        """Process bytes; returns how many frames they complete.
+
+        Bytes that follow a frame cut by a fault are read as its rest, and are a disturbance too.
+        """
+        begun = self._begun.pop(direction, time)
+        if begun < time and begun <= self._faults_until < time:
+            self.disturb(time)
+        found = self._decoder.feed(direction, time, data)
+        if self._decoder.rest[direction]:
+            self._begun[direction] = time if found else begun
+        for raw, message in found:
+            self._report.frame(self.name, time, direction, raw)
+            if isinstance(message, Notice) and message.what == "damaged":
+                since = begun if message.begun is None else message.begun
+                self._damaged(direction, time, message.text, since)
+            elif direction == "amplifier" and message is not None:
+                self._sent(time, raw, message, begun)
+            elif message is not None:
+                self._received(time, message)
+            begun = time  # of those behind the first
+        return len(found)
+
+    def advance(self, now: float) -> None:
+        """Report replies that are overdue."""
+        for key, sent in list(self._pending.items()):
+            since = max(sent.since, self._begun.get("host", -math.inf))
+            due = since + self._times.reply + self._times.slack + self._delays.since(since)
+            if now > due and not sent.is_overdue:
+                sent.is_overdue = True
+                session = self.sessions[sent.request.address]
+                session.overdue_at = now
+                if not (session.is_mute or self.is_disturbed(due)):
+                    what = f"no reply to {sent.request.name} of {sent.begun:.4f} s"
+                    session.report_always("answer", now, f"{session.name}: {what}")
+            if now > sent.begun + _PENDING_TIMEOUT:
+                del self._pending[key]
+
+    def _damaged(self, direction: Direction, time: float, why: str, begun: float) -> None:
+        if direction == "amplifier":
+            self._damaged_at = time
+        if not self.is_disturbed(begun):
+            sender = "host" if direction == "amplifier" else "amplifier"
+            self._report.add("garbage", self.name, time, f"{sender} sent {why}")
+
+    def _sent(self, time: float, raw: bytes, message: Message, begun: float) -> None:
+        """Process a frame of the host."""
+        is_copy = self.is_disturbed(time) and raw in self._recent
+        self._recent.append(raw)
+        if isinstance(message, Notice):
+            self._noticed(time, message)
+        if not isinstance(message, Request):
+            return
+        begun = begun if message.begun is None else min(begun, message.begun)
+        self._number += 1
+        sent = Sent(self._number, message, begun, since=time, begin=begun)
+        addressed = self.sessions.get(message.address)
+        sessions = self.sessions.values() if message.address == 0 else (addressed,)
+        for session in [each for each in sessions if each is not None]:
+            if not is_copy:
+                self._check_request(session, time, sent)
+            if session.is_mute and message.name == HELLO:
+                self._drop_pending(session)  # never to be replied to
+            if message.key is not None and (not is_copy or message.name == HELLO):
+                self._pending[message.key] = sent
+            session.is_mute &= message.name != HELLO
+            if message.problem:
+                continue
+            if not session.is_mute:
+                session.amplifier.sent(sent)
+            if message.key is None:
+                self._move(session, message)
+
+    def _check_request(self, session: AmplifierSession, time: float, sent: Sent) -> None:
+        request = sent.request
+        problem = request.problem
+        if request.name == "Set" and not problem:
+            problem = session.amplifier.sets.sent(request.values, time)
+        if problem:
+            session.report_always("garbage", time, f"host sent {request.name}: {problem}")
+        if request.problem:
+            return
+        if self._host.is_preempting(session, time, request):
+            self._preempted_by = sent.number
+        elif not self.is_disturbed(sent.begun):
+            is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1
+            pending = [
+                one
+                for one in self._pending.values()
+                if not (is_to_each and one.request.name in BROADCAST)
+            ]
+            self._host.check_order(session, sent, pending, self._preempted_by)
+        self._host.check_request(session, time, request)
+
+    def _noticed(self, time: float, notice: Notice) -> None:
+        """Process what is no request, and no reply."""
+        sent = self._pending.get(notice.key)
+        session = self.sessions.get(notice.address)
+        if notice.what == "carried out" and sent is not None:
+            sent.since, sent.end = math.inf, time
+        elif notice.what == "read on" and sent is not None:
+            sent.since = time
+            if sent.request.name in _PRESENT:
+                sent.begin, sent.end = time, None
+        elif notice.what == "event" and session is not None:
+            session.amplifier.event_reported(notice.values, time)
+        elif notice.what == "other host" and session is not None and notice.text in FEEDING:
+            session.heard_other_host = time
+            session.amplifier.forget()
+
+    def _received(self, time: float, message: Message) -> None:
+        """Process a frame of an amplifier."""
+        session = self.sessions.get(message.address)
+        if isinstance(message, Reply) and session is not None:
+            self._process_reply(session, time, message)
+        elif isinstance(message, Notice) and message.what == "boot" and session is not None:
+            if session.amplifier.is_enabled:
+                session.report("state", time, f"{session.name} restarted while enabled")
+            session.forget_amplifier()
+            session.amplifier.restarted(time)
+            session.is_mute = True
+        elif isinstance(message, Notice):
+            self._noticed(time, message)
+
+    def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+        sent = self._pending.pop(reply.key, None)
+        if sent is None:
+            self._check_unexpected(session, time, reply)
+            return
+        self._replied.append(reply.key)
+        request, amplifier = sent.request, session.amplifier
+        if reply.problem:
+            what = f"{session.name} replied to {request.name}: {reply.problem}"
+            session.report("garbage", time, what)
+        amplifier.unanswered = [one for one in amplifier.unanswered if one is not sent]
+        if reply.refusal:
+            amplifier.refused(request, time)
+        elif request.problem or reply.problem:
+            if request.problem:
+                what = f"{session.name} accepted {request.name}: {request.problem}"
+                session.report_always("garbage", time, what)
+            amplifier.forget()
+        elif reply.values is not None:  # else not all of it was read
+            self._granted(session, time, sent, reply)
+
+    def _granted(self, session: AmplifierSession, time: float, sent: Sent, reply: Reply) -> None:
+        request, amplifier, values = sent.request, session.amplifier, reply.values or {}
+        if request.name in _CONSTANT:
+            session.check_constant(request.name, values, time)
+        if request.name == "GetCaps":
+            amplifier.identified(values)
+        self._host.request_granted(session, time, request)
+        if self.is_disturbed(time) and request.name == "Arm":
+            amplifier.forget()
+        self._host.status_heard(session, values)
+        token = amplifier.token
+        amplifier.replied(sent, values, time if sent.end is None else sent.end)
+        if amplifier.token != token and not self.is_disturbed(time):
+            check_sums(session, sent.begin)
+        self._move(session, request)
+
+    def _move(self, session: AmplifierSession, request: Request) -> None:
+        """Follow an amplifier to the address that it is set to, by its serial number."""
+        known = session.constants.get(HELLO, {}).get("serial_number")
+        if request.name == "SetAddress" and request.values["serial_number"] == known:
+            others = {at: one for at, one in self.sessions.items() if one is not session}
+            self.sessions = {**others, request.values["address"]: session}
+
+    def _check_unexpected(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+        is_new = reply.key not in self._replied
+        if reply.key is None:
+            is_new = not self.is_disturbed(time)
+        if time < self._damaged_at + self._times.reply and is_new:
+            session.report_always("damage", time, f"{session.name} executed a damaged frame")
+        else:
+            why = f": {reply.problem}" if reply.problem else ""
+            what = f"{session.name}: reply without a pending request{why}"
+            session.report("credit", time, what)

@@ -1,0 +1,1 @@
+"""What channels are to play, and what they play at a time."""

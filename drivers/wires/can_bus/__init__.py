@@ -1,0 +1,1 @@
+"""CAN buses: frames, the host's side, addresses and adapters."""

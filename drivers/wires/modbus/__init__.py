@@ -1,0 +1,1 @@
+"""Modbus, RTU and TCP: frames, the host's side and addresses."""

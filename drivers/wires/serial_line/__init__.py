@@ -1,0 +1,1 @@
+"""Serial lines: frames, the host's side and addresses."""

@@ -1,0 +1,135 @@
+"""The host's side of a serial line: frames of words, matched by address and sequence number."""
+
+from drivers.counters import WireCounters
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import (
+    BROADCAST,
+    BY_NUMBER,
+    EVENT,
+    HELLO,
+    MESSAGES,
+    NAK,
+    VERSION,
+)
+from drivers.wires.serial_line.frames import (
+    NEUTRAL,
+    REPLY,
+    Frame,
+    FrameReader,
+    encode_frame,
+    frame_length,
+    unpack_identity,
+    unpack_words,
+)
+from drivers.wires.wire import (
+    NETWORK_DELAY,
+    Arrival,
+    Broken,
+    Reply,
+    Several,
+    Wire,
+    read_event,
+    read_nak,
+)
+
+_BITS = 10  # of a byte, with start and stop
+
+
+class SerialWire(Wire):
+    """A line at a speed [baud], 0 if unknown; sequence: number of the last request.
+
+    delay [s]: of a network on the way to it, as there is where the speed is unknown.
+    """
+
+    def __init__(self, baud: int, *, sequence: int, delay: float = 0.0) -> None:
+        self.counters = WireCounters()
+        self.delay = delay if baud else NETWORK_DELAY
+        self._byte_time = _BITS / baud if baud else 0.0
+        self._sequence = sequence
+        self._pending: Frame | None = None
+        self._replied: Frame | None = None  # the last reply
+        self._reader = FrameReader(on_invalid=self._count_invalid)
+
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the frame of a request, which is on the wire from now on; address 0: of all."""
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        kind, version, words = HELLO, NEUTRAL, list[int]()
+        if name != "Hello":
+            message = MESSAGES[name]
+            kind, version, words = message.number, VERSION, message.request.append([], values)
+        frame = Frame(kind, address, self._sequence, b"", version)
+        data = encode_frame(frame, words)
+        self._pending = None if address == BROADCAST else frame
+        self.counters.frames_out += 1
+        self.takes = self._byte_time * len(data)
+        return data
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these bytes complete."""
+        arrivals: list[Arrival] = []
+        for frame in self._reader.feed(data):
+            self.counters.frames_in += 1
+            pending, kind = self._pending, frame.kind ^ REPLY
+            if (
+                pending is None
+                or kind & REPLY
+                or (frame.address, frame.sequence) != (pending.address, pending.sequence)
+            ):
+                arrivals += self._unexpected(frame)
+                continue
+            self._pending, self._replied = None, frame
+            try:
+                if kind != NAK and (kind, frame.version) != (pending.kind, pending.version):
+                    expected = f"{pending.kind} in version {pending.version}"
+                    got = f"{kind} in {frame.version}"
+                    raise Refusal(f"type of the reply must be {expected}, got {got}")
+                if kind == HELLO:
+                    arrivals.append(Reply(unpack_identity(frame.payload)))
+                    continue
+                words = unpack_words(frame.payload)
+                if kind == NAK:
+                    arrivals.append(read_nak(words))
+                else:  # what follows is ignored
+                    arrivals.append(Reply(BY_NUMBER[kind].reply.read(words)[0]))
+            except Refusal as refusal:
+                arrivals.append(Broken(str(refusal)))
+        return arrivals
+
+    def _unexpected(self, frame: Frame) -> list[Arrival]:
+        """Read a frame that is no reply to the request on the wire."""
+        if frame.kind == EVENT:
+            words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
+            return read_event(frame.address, EVENT, words, self.counters)
+        self.counters.unexpected_frames += 1
+        self.counters.remark = (
+            f"a reply of address {frame.address} to another request came: check the address, and "
+            "that nothing delays the line"
+            if frame.is_reply
+            else "the request itself came back: check the wire from the amplifier to this machine"
+        )
+        last = self._replied
+        # Of another request that comes twice, late, each reply is of its own moment.
+        if last is None or frame == last or last.kind != HELLO | REPLY:
+            return []
+        is_same = (frame.address, frame.sequence) == (last.address, last.sequence)
+        return [Several(frame.address)] if is_same else []
+
+    def withdraw(self) -> None:
+        """Take the request off the wire: its reply will be unexpected."""
+        self._pending = None
+        if self._reader.rest:
+            self._remark_invalid(self._reader.rest)
+
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]."""
+        return self._byte_time * frame_length(2 * words)
+
+    def _count_invalid(self, piece: bytes) -> None:
+        self.counters.invalid_frames += 1
+        self._remark_invalid(piece)
+
+    def _remark_invalid(self, piece: bytes) -> None:
+        self.counters.remark = (
+            f"{len(piece)} bytes that are no valid frame came ({piece[:8].hex(' ')}): check baud "
+            "rate, cable and protocol; modbus+rtu:// is another one"
+        )

@@ -1,0 +1,195 @@
+"""A kind of wire without I/O: requests of a host as bytes, and received bytes as what came.
+
+A wire carries one request at a time. What arrives is matched by it: a reply to an earlier request
+is counted as unexpected, and damaged bytes as invalid.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Protocol, TypeAlias
+
+from drivers.counters import WireCounters
+from drivers.protocol.records import (
+    TEXT_MAX,
+    Number,
+    Numbers,
+    Real,
+    Record,
+    Refusal,
+    Rest,
+    Rows,
+    Text,
+    Values,
+    WireQuantity,
+)
+from drivers.protocol.table import (
+    EVENT,
+    EVENT_RECORD,
+    IDENTITY,
+    MAX_WORDS,
+    MESSAGES,
+    NAK_RECORD,
+    NO_CHANNEL,
+    QUANTITIES,
+    REFUSALS,
+)
+from drivers.protocol.timing import TAKEN_WORDS, set_words
+
+NETWORK_DELAY = 1.0
+"""Time [s] after which a port gives up a connection that has not taken what was sent.
+
+What a broken network delivers later than that is not accounted for.
+"""
+WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
+"""Channels and layers of the largest amplifier there can be."""
+_CODES = {number: name for name, number in REFUSALS.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The values of the reply to the request on the wire."""
+
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Nak:
+    """The amplifier refused the request: name of the code, and the channel at fault."""
+
+    code: str
+    channel: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """The reply to the request is none of the protocol: why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change that an amplifier tells unasked: its address, the values of the Event."""
+
+    address: int
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class OtherHost:
+    """Another host drives the amplifier at an address: its request was heard."""
+
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
+class Several:
+    """Several amplifiers have an address: two replies to one request differ."""
+
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
+class More:
+    """The request goes on with these bytes, as on Modbus."""
+
+    data: bytes
+
+
+Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More
+
+
+def read_event(
+    address: int, kind: int, words: Sequence[int], counters: WireCounters
+) -> list[Arrival]:
+    """Read an unasked message of an amplifier, and count it; nothing where it is no event."""
+    try:
+        if kind != EVENT:
+            raise Refusal(f"type must be {EVENT}, got {kind}")
+        values = EVENT_RECORD.unpack(words, is_strict=False)
+    except Refusal:
+        counters.invalid_frames += 1
+        return []
+    counters.events += 1
+    return [Event(address, values)]
+
+
+def read_nak(words: Sequence[int], *, is_strict: bool = False) -> Nak:
+    """Read the words of a Nak; is_strict: nothing may follow them. Raises Refusal."""
+    values = NAK_RECORD.unpack(words, is_strict=is_strict)
+    channel = None if values["channel"] == NO_CHANNEL else values["channel"]
+    return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
+
+
+@cache
+def request_words(name: str) -> int:
+    """Return the most words of a request."""
+    return 0 if name == "Hello" else _words(MESSAGES[name].request, {})
+
+
+@cache
+def reply_words(name: str, channels: int, layers: int) -> int:
+    """Return the most words of a reply of an amplifier with so many channels and layers."""
+    if name in ("Hello", "GetCaps"):
+        channels, layers = WIDEST
+    rows = {"channels": channels, "layers": layers}
+    if name in ("GetAchieved", "GetMeasured"):
+        rows["count"] = channels
+    return _words(IDENTITY if name == "Hello" else MESSAGES[name].reply, rows)
+
+
+def _words(record: Record, rows: Mapping[str, int]) -> int:
+    """Return the most words of a record; rows: how many there are, by the name of their count."""
+    words = 0
+    for field in record.fields:
+        match field:
+            case Rows(count=str(counted), record=row):
+                words += rows.get(counted, MAX_WORDS) * _words(row, rows)
+            case Numbers(count=counted):
+                words += rows.get(counted, MAX_WORDS)
+            case Rest():
+                words += MAX_WORDS
+            case Text():
+                words += 1 + TEXT_MAX // 2
+            case Number(quantity=WireQuantity(wire="u32")) | Real():
+                words += 2
+            case _:
+                words += 1
+    return min(words, MAX_WORDS)
+
+
+class Wire(Protocol):
+    """The host's side of a kind of wire."""
+
+    counters: WireCounters
+    delay: float
+    """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
+    is_kept: bool = False
+    """Whether a frame is sent again until somebody takes it, as by an adapter on a CAN bus."""
+    takes: float = 0.0
+    """How long what was sent last takes to arrive [s]; 0 over a network."""
+    blocked: str = "the port takes no bytes: check flow control and the adapter"
+    """What a port that is blocked means, and what to check."""
+    busy: float = 0.0
+    """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
+
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the bytes of a request, which is on the wire from now on; address 0: of all."""
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these bytes complete."""
+
+    def withdraw(self) -> None:
+        """Take the request off the wire: its reply will be unexpected."""
+
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]."""
+
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and a reply of so many words take [s]; 0 if unknown."""
+        return self.transit(words) + self.transit(reply)
+
+    def set_time(self, channels: int) -> float:
+        """Return how long a set of so many channels and its reply take [s]; 0 if unknown."""
+        return self.exchange_time(set_words(channels), TAKEN_WORDS)

@@ -1,0 +1,1 @@
+"""A sound card as amplifier and as instrument."""

@@ -1,0 +1,122 @@
+"""How a rig is wired to a sound card, and what its limits allow of that."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
+from model.errors import InputError
+from model.rig.rig import Rig
+from sim.desk.measuring.loopback import converters
+from sim.sensors.sensor_file import WiredSensor
+
+
+@dataclass(frozen=True)
+class Desk:
+    """How a rig is wired to a sound card: its ERAs by their channels, counted from 1; a loop-back.
+
+    The loop-back is a cable from the output after those of the ERAs to the input after those of
+    the sensors.
+    """
+
+    rig: Rig
+    sensors: tuple[WiredSensor, ...]
+
+    @property
+    def eras(self) -> list[tuple[str, int]]:
+        """Name and output of each ERA."""
+        rig = self.rig
+        return [(era.name, rig.wiring[era.name].number + 1) for era in rig.eras]
+
+    @property
+    def output(self) -> int:
+        """Output of the loop-back, the last one."""
+        return max(at for _, at in self.eras) + 1
+
+    @property
+    def input(self) -> int:
+        """Input of the loop-back, the last one."""
+        return max(sensor.input for sensor in self.sensors) + 1
+
+    @property
+    def columns(self) -> list[int]:
+        """Index of each sensor's input."""
+        return [sensor.input - 1 for sensor in self.sensors]
+
+    @property
+    def strokes(self) -> FloatArray:
+        """Stroke of each ERA [m]."""
+        return np.array([era.stroke for era in self.rig.eras])
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Sensitivity of each sensor, see `WiredSensor`."""
+        return np.array([sensor.sensitivity for sensor in self.sensors])
+
+    def responses(
+        self, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
+    ) -> Responses:
+        """Accelerations per base displacement [1/s²] from those of samples (f, inputs, sources).
+
+        looped (f,): of the loop-back.
+        """
+        plain = values[:, self.columns, : len(self.strokes)] / converters(looped)[:, None, None]
+        return Responses(
+            tuple(sensor.name for sensor in self.sensors),
+            np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
+            frequencies,
+            plain.transpose(0, 2, 1) / self.strokes[:, None] / self.sensitivities,
+        )
+
+    def on_outputs(self, sources: FloatArray) -> FloatArray:
+        """Samples (n, outputs) of the sources (n, eras + 1), the loop-back last."""
+        found = np.zeros((len(sources), self.output))
+        found[:, [*(at - 1 for _, at in self.eras), self.output - 1]] = sources
+        return found
+
+    @property
+    def highest(self) -> float:
+        """The highest level that the rig's limits allow on all ERAs at once."""
+        limits = self.rig.limits
+        return min(limits.level, float(np.sqrt(limits.power / len(self.rig.eras))), 1.0)
+
+    def check(self, level: float) -> None:
+        """Raise InputError for several amplifiers, and a level beyond the rig's limits."""
+        rig = self.rig
+        if len({rig.wiring[era.name].amplifier for era in rig.eras}) > 1:
+            raise InputError(
+                "all ERAs must be on one sound card, got several amplifiers in the rig"
+            )
+        if not 0 < level <= self.highest:
+            raise InputError(
+                f"--level must be above 0 and at most {self.highest:.3g}, as the rig's limits "
+                f"allow, got {level:g}"
+            )
+
+    def check_times(self, *, seconds: float, slew: float) -> None:
+        """Raise InputError for limits in time that samples from memory would not keep.
+
+        seconds: that are played without a pause; slew [1/s]: highest rise of a level.
+        """
+        limits = self.rig.limits
+        for key, is_kept, played in (
+            ("on_time", seconds <= limits.on_time, f"{seconds:.3g} s without a pause"),
+            ("duty", limits.duty >= 1, "one run after the other"),
+            ("slew", slew <= limits.slew, f"ramps of {slew:.3g} per second"),
+        ):
+            if not is_kept:
+                raise InputError(
+                    f"limits.{key} must allow what a sound card plays from memory, {played}, got "
+                    f"{getattr(limits, key):g}; check whether the ERAs bear it, and widen it"
+                )
+
+    def check_frequencies(self, frequencies: FloatArray, *, what: str) -> None:
+        """Raise InputError for frequencies [Hz] beyond the rig's limits; what: has them."""
+        limits = self.rig.limits
+        low, high = limits.frequency_min, limits.frequency_max
+        if frequencies.min() < low or frequencies.max() > high:
+            raise InputError(
+                f"{what} must be within the rig's limits.frequency of {low:g} to {high:g} "
+                f"Hz, got {frequencies.min():g} to {frequencies.max():g} Hz"
+            )

@@ -1,0 +1,237 @@
+"""What cables tell, and what a measurement is refused for, with its cause.
+
+Of the loop-back: delay, converters, lost blocks, and whether inputs have the clock of the outputs.
+Two devices, or an aggregate of two, drift by 10 to 100 millionths. What is played in several runs
+is then no longer orthogonal, and nothing else shows it where the loop-back has the right clock.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from sim.desk.measuring.multisine import PERIOD, Estimate, Multisine
+from sim.sensors.sensor_file import WiredSensor
+
+SILENT = 1e-5
+"""Of full scale, rms: what an input without a signal stays below."""
+
+_MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
+_NEARLY = 0.95
+_STRAIGHT = 0.5  # rad
+_AS_LATE = 0.02  # of the gain; one sample more at 500 Hz and 48 kHz makes 0.065
+_SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
+
+
+def is_whole(periods: FloatArray, *, samples: int) -> bool:
+    """Whether all periods of the loop-back (n,) are alike: no block was lost between them.
+
+    Not so where it is silent, which tells nothing.
+    """
+    each = periods.reshape(-1, samples)
+    size = np.linalg.norm(each[0])
+    differ = np.linalg.norm(each - each[0], axis=1).max()
+    return bool(size > SILENT * np.sqrt(samples) and differ <= _SAME * size)
+
+
+def is_as_late(gain: ComplexArray, before: ComplexArray) -> bool:
+    """Whether two gains (f,) have one delay, which a block lost between two runs changes."""
+    return bool(np.abs(gain - before).max() <= _AS_LATE * np.abs(before).max())
+
+
+def converters(response: ComplexArray) -> ComplexArray:
+    """The loop-back's complex response (f,) with a modulus of 1 in the median.
+
+    Dividing by it takes out the delay, fractions of a sample included, and the shape of filters;
+    gains are left, since those of a level and of a sensitivity are stated.
+    """
+    return np.asarray(response / np.median(np.abs(response)))
+
+
+def latency(response: ComplexArray, frequencies: FloatArray) -> float:
+    """Delay [s] of a response at frequencies [Hz], from 0 to 0.1 s, by the slope of its phase.
+
+    Lines d apart tell delays below 1 / d apart only.
+
+    Raises LinkError where the phase is no straight line, so that nothing is known of the delay.
+    """
+    unit = response / np.abs(response)
+    tried = np.arange(0, _MAX_DELAY, 0.1 / frequencies.max())
+    alike = np.abs(np.exp(2j * np.pi * np.outer(tried, frequencies)) @ unit)
+    # Lines at equal distances have several such delays: the shortest is meant.
+    near = np.flatnonzero(alike > _NEARLY * alike.max())
+    first_group = near[near - near[0] == np.arange(len(near))]
+    nearest = tried[first_group[alike[first_group].argmax()]]
+    rest = unit * np.exp(2j * np.pi * frequencies * nearest)
+    phase = np.angle(rest / rest.mean())
+    slope, first = np.polyfit(frequencies, phase, 1)
+    if np.abs(phase - slope * frequencies - first).max() > _STRAIGHT:
+        raise LinkError(
+            f"loop-back: its phase must be that of a delay up to {1e3 * _MAX_DELAY:g} ms; check "
+            "the cable, and that nothing else feeds this input"
+        )
+    return float(nearest - slope / (2 * np.pi))
+
+
+TOLERANCE = 2e-6
+"""Of a clock; 13 s of measuring turn 500 Hz by 5 degrees."""
+
+_MAX_DRIFT = 1e-3  # a lost block of 64 samples at 48 kHz looks like more
+_ALIKE = 0.999
+_SURE = 5.0  # standard errors
+
+
+def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
+    """Drift of an input's clock relative to the outputs', from whole periods of each run, (n,).
+
+    Least squares of the phase 2 pi f t drift between the first and the last period, t apart,
+    weighted by the power of each line. 0 where that is within its error, or not all that makes
+    periods differ, as a lost block does.
+    """
+    n = multisine.samples
+    first = np.array([multisine.found(each[:n]) for each in runs])
+    last = np.array([multisine.found(each[-n:]) for each in runs])
+    apart = PERIOD * (len(runs[0]) / n - 1)
+    turned = last * first.conj()
+    weights = np.abs(turned)
+    slopes = np.broadcast_to(2 * np.pi * multisine.frequencies * apart, weights.shape)
+    phases = np.angle(turned)
+    moment = max(float((weights * slopes**2).sum()), 1e-300)
+    relative = float((weights * slopes * phases).sum()) / moment
+    rest = phases - slopes * relative
+    error = np.sqrt(float((weights**2 * slopes**2 * rest**2).sum())) / moment
+    alike = np.abs((turned * np.exp(-1j * slopes * relative)).sum()) / max(weights.sum(), 1e-300)
+    size = abs(relative)
+    is_certain = TOLERANCE < size < _MAX_DRIFT and size > _SURE * error and alike > _ALIKE
+    return relative if is_certain else 0.0
+
+
+_FULL = 0.999  # of full scale
+_LOOPED = 0.05  # of a sample that a loop-back brings back at least
+_CROSSTALK = 0.02  # of it, that other outputs may
+_COHERENT = 0.9  # in the median over frequencies
+_MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
+
+
+def check_levels(
+    recorded: FloatArray,
+    sensors: Sequence[WiredSensor],
+    *,
+    cable: tuple[int, int] | None = None,
+) -> None:
+    """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs).
+
+    cable: output and input of the loop-back, to be checked too.
+    """
+    named = {sensor.input: f"sensor {sensor.name}" for sensor in sensors}
+    if cable is not None:
+        named[cable[1]] = "the loop-back"
+    clipped = [name for n, name in named.items() if np.abs(recorded[:, n - 1]).max() >= _FULL]
+    if clipped:
+        raise InputError(
+            f"inputs must stay below full scale, got clipping of {', '.join(clipped)}; turn down "
+            "the gain of the input, and its full_scale_v, or choose a lower --level"
+        )
+    silent = [n for n in named if np.sqrt((recorded[:, n - 1] ** 2).mean()) < SILENT]
+    if len(silent) == len(named):
+        raise LinkError(
+            "all inputs are silent: check that --device is the one that is wired, its outputs and "
+            "inputs not swapped, amplifier and sensor supply switched on"
+        )
+    if silent:
+        hint = ""
+        if cable is not None and cable[1] in silent:
+            hint = f"; the loop-back is a cable from output {cable[0]} to input {cable[1]}"
+        inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
+        raise LinkError(f"silent: {inputs}; check cables and the supply of sensors (IEPE){hint}")
+
+
+def check_wiring(
+    found: Estimate,
+    sensors: Sequence[WiredSensor],
+    eras: Sequence[tuple[str, int]],
+    *,
+    loopback: int,
+    output: int,
+) -> None:
+    """Raise InputError where the loop-back shows inputs or outputs to be swapped.
+
+    eras: name and output of each source, in order; the loop-back is the last one.
+    """
+    came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
+    named = {sensor.input: f"of sensor {sensor.name}" for sensor in sensors}
+    *_, second, first = np.sort(came[loopback - 1])
+    source = int(came[loopback - 1].argmax())
+    if source < len(eras) and first > _LOOPED and second < _CROSSTALK * first:
+        name, at = eras[source]
+        raise InputError(
+            f"input {loopback} must bring back output {output}, got output {at} of ERA {name}: "
+            "outputs are swapped; exchange their cables"
+        )
+    back = int(came[:, -1].argmax()) + 1
+    if back != loopback and came[back - 1, -1] > _LOOPED:
+        raise InputError(
+            f"the loop-back of output {output} must come back at input {loopback}, got it at input "
+            f"{back}, {named.get(back, 'of no sensor')}: inputs are swapped; exchange their cables"
+        )
+    if came[loopback - 1, -1] < _LOOPED:
+        raise InputError(
+            f"input {loopback} must bring back output {output} as the loop-back, got "
+            f"{came[loopback - 1, -1]:.2g} of it; connect them by a cable"
+        )
+    others = came[loopback - 1, : len(eras)]
+    if others.max(initial=0) > _CROSSTALK * came[loopback - 1, -1]:
+        name, at = eras[int(others.argmax())]
+        raise InputError(
+            f"the loop-back must be output {output} alone, got {others.max():.2g} of output {at} "
+            f"of ERA {name} too; check mixers and monitoring of the sound card"
+        )
+
+
+def check_clocks(
+    multisine: Multisine,
+    recorded: Sequence[FloatArray],
+    sensors: Sequence[WiredSensor],
+    *,
+    loopback: int,
+) -> None:
+    """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
+    named = {loopback: "the loop-back"} | {s.input: f"sensor {s.name}" for s in sensors}
+    drifts = {n: certain_drift(multisine, [each[:, n - 1] for each in recorded]) for n in named}
+    found = [
+        f"{1e6 * each:.0f} millionths at {named[n]} (input {n})"
+        for n, each in drifts.items()
+        if each
+    ]
+    if found:
+        raise InputError(
+            f"inputs must have the clock of the outputs, got a drift of {', '.join(found)}; use "
+            "one sound card, or clock all of them by one (word clock, ADAT)"
+        )
+
+
+def check_coherence(
+    found: Estimate, sensors: Sequence[WiredSensor], eras: Sequence[tuple[str, int]]
+) -> None:
+    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing."""
+    columns = [sensor.input - 1 for sensor in sensors]
+    coherence = np.median(found.coherence[:, columns], axis=0)
+    incoherent = [
+        f"{sensor.name} ({each:.2f})"
+        for sensor, each in zip(sensors, coherence, strict=True)
+        if each < _COHERENT
+    ]
+    if incoherent:
+        raise LinkError(
+            f"coherence must be at least {_COHERENT:g} in the median, got {', '.join(incoherent)}; "
+            "check how these sensors are mounted, their cables and mains hum, choose a higher "
+            "--level or more --periods, or delete their lines"
+        )
+    moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
+    for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):
+        if each < _MOVED:
+            raise LinkError(
+                f"output {at} moves nothing: check ERA {name}, its amplifier and its cable"
+            )

@@ -1,0 +1,261 @@
+"""A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
+from model.rig.rig import Rig
+from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.loopback import (
+    check_clocks,
+    check_coherence,
+    check_levels,
+    check_wiring,
+    is_as_late,
+    is_whole,
+    latency,
+)
+from sim.desk.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
+from sim.desk.measuring.sound_card import SoundCard, open_card
+from sim.sensors.sensor_file import read_sensors
+
+_SETTLING = 1.0  # s; T60 of the paper's plate
+_TAIL = 0.05  # s; longer than the ramp
+
+TRIES = 3
+"""Attempts of a run."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What was recorded of a run: whole periods of the settled plate, (n, inputs).
+
+    loopback (f,): complex gain of the cable; is_whole: whether no block was lost, in the last
+    attempt; repeated: attempts before it.
+    """
+
+    recorded: FloatArray
+    loopback: ComplexArray
+    is_whole: bool
+    repeated: int
+
+
+def run_time(periods: int) -> float:
+    """Time [s] of a run of which so many periods are analysed."""
+    return _SETTLING + PERIOD * periods + _TAIL
+
+
+def play_run(
+    desk: Desk,
+    card: SoundCard,
+    multisine: Multisine,
+    number: int,
+    *,
+    periods: int,
+    before: ComplexArray | None,
+    tries: int = TRIES,
+) -> Run:
+    """Play a run, again where blocks were lost in it or since the first one.
+
+    before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
+    for inputs that are clipped or silent.
+    """
+    signal = desk.on_outputs(multisine.signal(number, periods=run_time(periods) / PERIOD))
+    start = round(_SETTLING * multisine.rate)
+    repeated = 0
+    while True:
+        kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
+        check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
+        looped = kept[:, desk.input - 1]
+        gain = multisine.found(looped) / multisine.played(number)[:, -1]
+        # The cable decides: drivers report losses that were none, and miss others.
+        same = is_whole(looped, samples=multisine.samples)
+        same = same and (before is None or is_as_late(gain, before))
+        if same or repeated == tries - 1:
+            return Run(kept, gain, same, repeated)
+        repeated += 1
+
+
+def blocks_lost() -> LinkError:
+    """The error for a run that lost blocks each time."""
+    return LinkError(
+        f"blocks of sound were lost in {TRIES} attempts of a run; end other programs, give "
+        "the sound server real-time priority, or choose larger blocks"
+    )
+
+
+LEVEL = 0.3
+"""Usual largest sample of each output."""
+
+Show = Callable[[Sequence[FloatArray]], None]
+"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Responses with what is known of them.
+
+    coherence (f, sensors), std (f, sensors) relative to the root mean square of the sensor; latency
+    [s] through the sound card; even (sensors,): of a square law; repeated: runs played again since
+    blocks were lost; looped (f,): response of the loop-back.
+    """
+
+    responses: Responses
+    coherence: FloatArray
+    std: FloatArray
+    latency: float
+    even: FloatArray
+    repeated: int
+    looped: ComplexArray
+
+
+@contextmanager
+def open_desk(
+    rig: Rig,
+    sensors_file: Path,
+    device: str,
+    *,
+    level: float | None,
+    frequencies: FloatArray | None,
+    seed: int,
+) -> Iterator[tuple[Desk, SoundCard, Multisine]]:
+    """A rig at an open device, and the multisine for it.
+
+    level: None for 0.3, or less where the rig's limits allow less; frequencies (f,) [Hz], None for
+    odd ones within its limits. Raises InputError, LinkError.
+    """
+    desk = Desk(rig, read_sensors(sensors_file, rig.plate))
+    level = min(LEVEL, desk.highest) if level is None else level
+    desk.check(level)
+    if frequencies is None:
+        frequencies = default_frequencies(rig.limits.frequency_min, rig.limits.frequency_max)
+    desk.check_frequencies(frequencies, what="--frequencies")
+    card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
+    try:
+        yield desk, card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)
+    finally:
+        card.close()
+
+
+def measure(
+    desk: Desk,
+    card: SoundCard,
+    multisine: Multisine,
+    *,
+    periods: int = 2,
+    show: Show = lambda recorded: None,
+) -> Measured:
+    """Play all runs of a multisine and estimate the responses.
+
+    periods: of each run that are analysed. show: called with the runs recorded so far, after each.
+    Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
+    times.
+    """
+    desk.check_times(seconds=run_time(periods), slew=multisine.slew)
+    recorded: list[FloatArray] = []
+    first: ComplexArray | None = None
+    repeated, is_lost = 0, False
+    for number in range(multisine.sources):
+        tries = 1 if is_lost else TRIES
+        run = play_run(desk, card, multisine, number, periods=periods, before=first, tries=tries)
+        first = run.loopback if first is None else first
+        repeated += run.repeated
+        is_lost = is_lost or not run.is_whole
+        recorded.append(run.recorded)
+        show(recorded)
+    found = estimate(multisine, recorded)
+    # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
+    # cause to be told.
+    check_wiring(found, desk.sensors, desk.eras, loopback=desk.input, output=desk.output)
+    check_clocks(multisine, recorded, desk.sensors, loopback=desk.input)
+    if is_lost:
+        raise blocks_lost()
+    check_coherence(found, desk.sensors, desk.eras)
+    looped, columns = found.values[:, desk.input - 1, -1], desk.columns
+    rms = np.sqrt((np.abs(found.values[:, columns, :-1]) ** 2).mean(axis=(0, 2)))
+    return Measured(
+        desk.responses(multisine.frequencies, found.values, looped),
+        found.coherence[:, columns],
+        found.std[:, columns] / rms,
+        latency(looped, multisine.frequencies),
+        found.even[columns],
+        repeated,
+        looped,
+    )
+
+
+_PERIODS = 2
+_TONES = 5
+_LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """Multisine beside stepped tones, of responses above 5 % of the largest at their frequency.
+
+    level_db, phase_deg: root mean square and largest difference; frequencies (n,) [Hz].
+    """
+
+    frequencies: FloatArray
+    level_db: tuple[float, float]
+    phase_deg: tuple[float, float]
+
+    def as_json(self) -> dict[str, object]:
+        """For programs."""
+        return {
+            "frequencies_hz": self.frequencies.tolist(),
+            "level_rms_db": self.level_db[0],
+            "level_max_db": self.level_db[1],
+            "phase_rms_deg": self.phase_deg[0],
+            "phase_max_deg": self.phase_deg[1],
+        }
+
+
+def check_by_steps(
+    desk: Desk,
+    card: SoundCard,
+    measured: Measured,
+    *,
+    level: float,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Stepped:
+    """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks."""
+    known = measured.responses
+    rows = np.unique(np.linspace(0, len(known.frequencies) - 1, _TONES).round().astype(int))
+    frequencies = known.frequencies[rows]
+    values = np.empty((len(rows), desk.input, len(desk.eras) + 1), dtype=complex)
+    for era in range(len(desk.eras)):
+        for row, frequency in enumerate(frequencies):
+            values[row, :, era] = _played(desk, card, era, frequency, level)
+            progress(era * len(rows) + row + 1, len(desk.eras) * len(rows))
+    found = desk.responses(frequencies, values, measured.looped[rows])
+    return _compared(frequencies, known.values[rows], found)
+
+
+def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
+    """Amplitudes (inputs,) by full scale of one ERA; the loop-back shows lost blocks."""
+    tone = Multisine(np.array([frequency]), 1, card.rate, level)
+    signal = tone.signal(0, periods=run_time(_PERIODS))
+    sources = np.zeros((len(signal), len(desk.eras) + 1))
+    sources[:, [era, -1]] = signal
+    heard = card.run(desk.on_outputs(sources)).astype(float)
+    kept = heard[tone.samples : (1 + _PERIODS) * tone.samples]  # once settled
+    if card.gaps or not is_whole(kept[:, desk.input - 1], samples=tone.samples):
+        raise LinkError("blocks of sound were lost between stepped tones; measure again")
+    return np.asarray(tone.found(kept)[0] / tone.played(0)[0])
+
+
+def _compared(frequencies: FloatArray, one: ComplexArray, other: Responses) -> Stepped:
+    size = np.abs(one)
+    ratio = (other.values / one)[size > _LOUD * size.max(axis=(1, 2), keepdims=True)]
+    level, phase = 20 * np.log10(np.abs(ratio)), np.degrees(np.angle(ratio))
+    both = [
+        (float(np.sqrt((each**2).mean())), float(np.abs(each).max())) for each in (level, phase)
+    ]
+    return Stepped(frequencies, both[0], both[1])

@@ -1,0 +1,162 @@
+"""Promises of a table played and measured through a sound card."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+
+import numpy as np
+
+from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.errors import DriverError, LinkError
+from drivers.playing.contents import Tone
+from model.arrays import FloatArray
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.table.promise_at_sensors import (
+    MeasuredVerification,
+    Promise,
+    measured_promise,
+    promises,
+)
+from model.table.table import LocalizationTable
+from model.table.table_check import CheckSettings
+from model.vibration.excitation import Excitation
+from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.loopback import check_levels, is_whole
+from sim.desk.measuring.multisine import ramped
+from sim.desk.measuring.sound_card import SoundCard, open_card
+from sim.plant.fingers import fit_tones
+from sim.sensors.sensor_file import read_sensors
+
+_SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
+_WINDOW = 1.0  # s
+_RAMP = 0.04  # s
+_PLAYED = _SETTLING + _WINDOW + _RAMP  # s
+_TRIES = 3
+_MARK = 1000.0  # Hz; of the loop-back, by which lost blocks show
+_MARK_LEVEL = 0.3
+
+Recorder = Callable[[Promise], FloatArray]
+"""Plays a promise, and returns samples (n, inputs) of the plate that has settled."""
+
+
+def check_table(
+    table: LocalizationTable,
+    rig: Rig,
+    settings: CheckSettings,
+    *,
+    progress: Callable[[int, int], None],
+) -> MeasuredVerification:
+    """Play promises and compare what accelerometers measured.
+
+    Raises InputError, LinkError, both also for sensors that are clipped or silent; CommandError,
+    CommandRefused of an amplifier.
+    """
+    sensors = read_sensors(settings.sensors_file, rig.plate)
+    desk = Desk(rig, sensors)
+    level = desk.highest / 2 if settings.level is None else settings.level
+    desk.check(level)
+    if settings.url is None:
+        desk.check_times(seconds=_PLAYED, slew=np.pi / 2 * level / _RAMP)
+    by_name = {sensor.name: sensor for sensor in sensors}
+    places = {name: (sensor.x, sensor.y) for name, sensor in by_name.items()}
+    found = []
+    with _recorder(desk, settings, level) as (rate, record):
+        for promise in promises(
+            table, places, count=settings.samples, level=level, seed=settings.seed
+        ):
+            excitation = promise.pattern.excitation
+            frequencies = np.unique([tone.frequency for tone in excitation.values()])
+            # A table may have been built of more; an amplifier's ledger refuses them, too.
+            desk.check_frequencies(frequencies, what="frequencies of the table")
+            heard = record(promise)
+            chosen = [by_name[name] for name in promise.sensors]
+            check_levels(heard, chosen)
+            # All tones are fitted together, since their frequencies need not fit into the window.
+            samples = heard[:, [sensor.input - 1 for sensor in chosen]]
+            tones = fit_tones(np.arange(len(samples)) / rate, samples, frequencies.tolist())
+            amplitudes = np.abs(tones / [sensor.sensitivity for sensor in chosen])
+            found.append(measured_promise(table, promise, frequencies, amplitudes))
+            progress(len(found), settings.samples)
+    return MeasuredVerification(tuple(found))
+
+
+@contextmanager
+def _recorder(
+    desk: Desk, settings: CheckSettings, level: float
+) -> Iterator[tuple[float, Recorder]]:
+    """The rate [Hz] of an open card, and an amplifier where that plays; no sample exceeds level."""
+    is_card = settings.url is None
+    card = open_card(
+        settings.device,
+        outputs=desk.output if is_card else 0,
+        inputs=desk.input,
+        limit=level if is_card else 0,
+    )
+    with closing(card):
+        if settings.url is None:
+            yield card.rate, lambda promise: _by_card(card, desk, promise.pattern, level)
+            return
+        rig = desk.rig
+        is_output = not rig.outputs.isdisjoint(rig.amplifiers)
+        with BlockingAmplifier(settings.url, limits=rig.limits, is_output=is_output) as amplifier:
+            amplifier.arm()
+            yield card.rate, lambda promise: _by_amplifier(card, amplifier, rig, promise)
+
+
+def _by_amplifier(
+    card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promise: Promise
+) -> FloatArray:
+    """Record what an amplifier plays."""
+    seconds = _SETTLING + _WINDOW
+    tones = tones_of(rig, promise.pattern.excitation)
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        try:
+            playing = thread.submit(amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP)
+            heard = card.run(np.zeros((round(seconds * card.rate), 0)))
+            playing.result()
+        except BaseException:  # leaving waits for the thread, which feeds the watchdog
+            with suppress(DriverError):
+                amplifier.disarm()
+            raise
+    if card.gaps:
+        raise LinkError("blocks of sound were lost while a pattern played; verify again")
+    return heard[-round(_WINDOW * card.rate) :].astype(float)
+
+
+def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> FloatArray:
+    """Play a pattern from memory: a level is a sample, as of an amplifier whose output it is.
+
+    level: that no output exceeds, the loop-back's included, since cables may be swapped.
+    """
+    excitation = pattern.excitation
+    times = np.arange(round(_PLAYED * card.rate)) / card.rate
+    sources = np.zeros((len(times), len(desk.eras) + 1))
+    for number, era in enumerate(desk.rig.eras):
+        if (tone := excitation.get(era.name)) is not None:
+            angle = 2 * np.pi * tone.frequency * times + tone.phase
+            sources[:, number] = tone.amplitude / era.stroke * np.sin(angle)
+    sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
+    played = desk.on_outputs(ramped(sources, round(_RAMP * card.rate)))
+    start, count = (round(each * card.rate) for each in (_SETTLING, _WINDOW))
+    for _ in range(_TRIES):
+        heard = card.run(played)[start : start + count].astype(float)
+        if is_whole(heard[:, desk.input - 1], samples=count // 4):
+            return heard
+    raise LinkError(
+        f"blocks of sound were lost in {_TRIES} attempts, or no cable leads from output "
+        f"{desk.output} to input {desk.input}; check it, and end other programs"
+    )
+
+
+def tones_of(rig: Rig, excitation: Excitation) -> list[Tone]:
+    """Tones of the channels of a rig's one amplifier."""
+    return [
+        Tone(
+            rig.wiring[name].number,
+            tone.frequency,
+            tone.amplitude / rig.era(name).stroke,
+            float(np.degrees(tone.phase)),
+        )
+        for name, tone in excitation.items()
+    ]

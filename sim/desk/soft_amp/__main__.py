@@ -1,0 +1,123 @@
+"""The process that plays; `sim.desk.soft_amp.supervisor` starts, watches and, if need be, kills it.
+
+    python -m sim.desk.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RECOVERING
+
+SETTINGS as JSON, then descriptors, -1 for none; RECOVERING: 1 if it follows one that lost its
+device. It prints one line of JSON for each event.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from types import FrameType
+
+from drivers.errors import LinkError
+from model.errors import InputError
+from sim.desk.soft_amp.engine import Counters, Engine, counters_in
+from sim.desk.soft_amp.output import Output, open_output
+from sim.desk.soft_amp.settings import Settings
+
+REFUSED, LOST = 2, 75
+_POLL = 0.02  # s
+_RETRY = 0.5  # s
+_FIRST_BLOCK = 5.0  # s
+_FADE = 0.05  # s; ramp, blocks and buffers
+
+
+class _Ended(Exception):
+    """By a signal."""
+
+
+def main() -> None:
+    """Play until a signal comes, or the device has gone."""
+    settings = Settings.from_json(sys.argv[1])
+    counters_file, terminal, listening, parent, recovering = map(int, sys.argv[2:])
+    _end_with_parent()
+    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: that is for the parent
+    counters = counters_in(counters_file)
+    output: Output | None = None
+    engine = None
+
+    def start(rate: int) -> Engine:
+        engine = Engine()
+        engine.start(
+            settings,
+            rate=rate,
+            counters=counters,
+            is_recovering=bool(recovering),
+            terminal=terminal,
+            listening=listening,
+            parent=parent,
+        )
+        return engine
+
+    try:
+        if recovering:  # hosts are to hear of the fault before the device is back
+            assert settings.rate is not None  # noqa: S101  that of the device before
+            engine = start(settings.rate)
+            output = _reopened(settings)
+        else:
+            output = open_output(settings)
+            engine = start(output.rate)
+        output.start(engine)
+        engine.take_over()
+        _wait_for_sound(counters, output)
+        _tell(event="ready", device=output.name, rate=output.rate, block=output.block)
+        while not counters.is_lost and output.is_playing():
+            time.sleep(_POLL)
+        engine.lost()
+        time.sleep(_FADE)
+        os._exit(LOST)  # not by way of a library whose device has gone
+    except _Ended:
+        if engine is not None:
+            engine.end()
+            time.sleep(_FADE)
+        if output is not None:
+            output.close()
+        os._exit(0)
+    except (InputError, LinkError) as problem:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself
+        _tell(event="refused", is_input=isinstance(problem, InputError), reason=str(problem))
+        os._exit(REFUSED)
+
+
+def _reopened(settings: Settings) -> Output:
+    """The device, as soon as it is back."""
+    while True:
+        try:
+            return open_output(settings)
+        except (InputError, LinkError):
+            time.sleep(_RETRY)
+
+
+def _wait_for_sound(counters: Counters, output: Output) -> None:
+    end = time.monotonic() + _FIRST_BLOCK
+    while not counters.is_streaming:
+        if time.monotonic() > end:
+            raise LinkError(f"--device {output.name}: took no sample within {_FIRST_BLOCK:g} s")
+        time.sleep(_POLL)
+
+
+def _tell(**event: object) -> None:
+    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.flush()
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise _Ended
+
+
+def _end_with_parent() -> None:
+    """Be killed with the process that watches, also where that is killed and this one stopped."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+if __name__ == "__main__":
+    main()

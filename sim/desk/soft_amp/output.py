@@ -1,0 +1,255 @@
+"""What an amplifier plays through: ports of a JACK client, or a device of PortAudio."""
+
+import ctypes
+import os
+import resource
+from types import ModuleType
+from typing import Any, TypeAlias
+
+from drivers.errors import LinkError
+from model.errors import InputError
+from sim.desk.libjack import IS_OUTPUT, JackClient, check_free, jack_name, libjack
+from sim.desk.soft_amp.engine import Engine, JackCalls
+from sim.desk.soft_amp.library import address_of
+from sim.desk.soft_amp.settings import Settings, check_rate
+
+CLIENT = "era-soft-amp"
+
+_CALLED_BY_ENGINE = {
+    "buffer": "jack_port_get_buffer",
+    "frame_time": "jack_last_frame_time",
+    "is_realtime": "jack_is_realtime",
+    "port_by_id": "jack_port_by_id",
+    "is_mine": "jack_port_is_mine",
+}
+
+
+class JackOutput:
+    """As many ports as the amplifier has channels, each connected to the next one of a client."""
+
+    def __init__(self, settings: Settings, *, destination: str) -> None:
+        self._client = JackClient(CLIENT)
+        try:
+            self._prepare(settings, destination)
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self, settings: Settings, destination: str) -> None:
+        rate = self._client.rate
+        if settings.rate not in (None, rate):
+            raise InputError(
+                f"--rate must be {rate} Hz, that of the JACK server, got {settings.rate}; start "
+                f"the server with -r {settings.rate}, or omit --rate"
+            )
+        self.rate = check_rate(rate, what="JACK server")
+        self.block = self._client.block
+        if settings.block not in (None, self.block):
+            raise InputError(
+                f"--block must be {self.block} frames, those of the JACK server, got "
+                f"{settings.block}; start the server with -p {settings.block}, or omit --block"
+            )
+        self.name = jack_name(destination)
+        self._inputs = self._client.takers(destination, settings.channels)
+        names = [f"out_{n}" for n in range(1, settings.channels + 1)]
+        self._ports = self._client.register(names, IS_OUTPUT)
+
+    def start(self, engine: Engine) -> None:
+        """Connect, and let JACK call the engine; raises LinkError."""
+        library = libjack()
+        calls = JackCalls(client=self._client.pointer)
+        calls.ports[: len(self._ports)] = self._ports
+        for field, name in _CALLED_BY_ENGINE.items():
+            setattr(calls, field, ctypes.cast(getattr(library, name), ctypes.c_void_p))
+        engine.use_jack(calls)
+        set_ = {
+            "sound_jack_process": library.jack_set_process_callback,
+            "sound_jack_xrun": library.jack_set_xrun_callback,
+            "sound_jack_shutdown": library.jack_on_shutdown,
+            "sound_jack_connect": library.jack_set_port_connect_callback,
+        }
+        for callback, set_callback in set_.items():
+            set_callback(self._client.pointer, address_of(callback), None)
+        self._client.activate()
+        for port, name in zip(self._ports, self._inputs, strict=True):
+            self._client.connect(port, name)
+
+    def is_playing(self) -> bool:
+        """Always, since JACK tells of a loss by its callbacks."""
+        return True
+
+    def close(self) -> None:
+        """Leave the server."""
+        self._client.close()
+
+
+_CHANNELS, _RATE, _UNAVAILABLE = -9998, -9997, -9985  # errors of portaudio.h
+_WITH_PRIORITY, _WITHOUT = 128, 512  # frames of a block
+
+
+def sounddevice() -> ModuleType:
+    """The library; raises InputError where it or PortAudio is missing."""
+    try:
+        import sounddevice as library
+    except ModuleNotFoundError:
+        raise InputError(
+            "PortAudio: python-sounddevice must be installed: pip install 'era-haptics[sound]'"
+        ) from None
+    except OSError:
+        raise InputError(
+            "PortAudio: its library must be installed; Debian: apt install libportaudio2"
+        ) from None
+    return library  # type: ignore[no-any-return]
+
+
+def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
+    """Return what PortAudio says of a device by name or number, which must have these channels.
+
+    Raises InputError, and LinkError for one over JACK that another program plays to: other drivers
+    refuse the second program themselves, JACK adds up what both play.
+    """
+    library = sounddevice()
+    number: int | str = int(device) if device.isdecimal() else device
+    try:
+        found = library.query_devices(number, None if inputs else "output")
+    except (ValueError, library.PortAudioError) as problem:
+        raise InputError(
+            f"--device {device}: {str(problem).splitlines()[0]}; list devices with "
+            "era soft-amp --list"
+        ) from None
+    for what, count in (("output", outputs), ("input", inputs)):
+        offered = found[f"max_{what}_channels"]
+        if offered < count:
+            raise InputError(f"--device {found['name']} must have {count} {what}s, got {offered}")
+    if outputs and "JACK" in library.query_hostapis(found["hostapi"])["name"]:
+        check_free(found["name"], outputs)
+    return found
+
+
+def portaudio_stream(
+    number: int, callback: int, given: int, *, outputs: int, inputs: int = 0, **options: object
+) -> Any:
+    """Start a stream of a device by number, with a callback of C that is given an address.
+
+    Raises PortAudioError.
+    """
+    library = sounddevice()
+    ffi = library._ffi
+    kind = "duplex" if outputs and inputs else "input" if inputs else "output"
+    channels = {"duplex": (inputs, outputs), "input": inputs, "output": outputs}[kind]
+    # The one class that takes a callback of C; for authors of libraries, as it says.
+    stream = library._StreamBase(
+        kind=kind,
+        device=number,
+        channels=channels,
+        dtype="float32",
+        callback=ffi.cast("PaStreamCallback *", callback),
+        clip_off=True,
+        dither_off=True,
+        userdata=ffi.cast("void *", given),
+        **options,
+    )
+    try:
+        stream.start()
+    except BaseException:
+        stream.close(ignore_errors=True)
+        raise
+    return stream
+
+
+def portaudio_devices() -> list[tuple[int, str, int, float]]:
+    """Number, name, output channels and rate [Hz] of each device that plays; InputError."""
+    library = sounddevice()
+    hosts = library.query_hostapis()
+    return [
+        (
+            number,
+            f"{device['name']}, {hosts[device['hostapi']]['name']}",
+            device["max_output_channels"],
+            device["default_samplerate"],
+        )
+        for number, device in enumerate(library.query_devices())
+        if device["max_output_channels"] > 0
+    ]
+
+
+def may_be_realtime() -> bool:
+    """Whether this process may raise the priority of its threads."""
+    limit, _ = (
+        resource.getrlimit(resource.RLIMIT_RTPRIO) if hasattr(resource, "RLIMIT_RTPRIO") else (0, 0)
+    )
+    return limit != 0 or os.geteuid() == 0
+
+
+class PortAudioOutput:
+    """A stream of interleaved floats; the callback is C, without Python."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._library = sounddevice()
+        # A device that came since is not seen otherwise.
+        self._library._terminate()
+        self._library._initialize()
+        self._settings = settings
+        device = portaudio_device(settings.device, outputs=settings.channels)
+        self.name, self._number = device["name"], device["index"]
+        self.rate = check_rate(settings.rate or device["default_samplerate"], what=self.name)
+        self.block = settings.block or (_WITH_PRIORITY if may_be_realtime() else _WITHOUT)
+        try:
+            self._library.check_output_settings(
+                self._number, settings.channels, "float32", samplerate=self.rate
+            )
+        except self._library.PortAudioError as problem:
+            raise self._refused(problem) from None
+        self._stream: Any = None
+
+    def _refused(self, problem: Exception) -> Exception:
+        text, number = str(problem.args[0]), problem.args[1] if len(problem.args) > 1 else 0
+        if number == _RATE:
+            return InputError(f"--rate: {self.name} does not offer {self.rate} Hz; try 48000")
+        if number == _CHANNELS:
+            return InputError(
+                f"--channels: {self.name} does not offer {self._settings.channels} channels"
+            )
+        if number == _UNAVAILABLE:
+            return LinkError(f"--device {self.name}: busy; end the program that plays on it")
+        return LinkError(f"--device {self.name}: cannot be opened: {text}")
+
+    def start(self, engine: Engine) -> None:
+        """Let PortAudio call the engine; raises LinkError."""
+        try:
+            self._stream = portaudio_stream(
+                self._number,
+                address_of("sound_portaudio"),
+                0,
+                outputs=self._settings.channels,
+                samplerate=self.rate,
+                blocksize=self.block,
+                latency="low",
+            )
+        except self._library.PortAudioError as problem:
+            raise self._refused(problem) from None
+
+    def is_playing(self) -> bool:
+        """Whether PortAudio still calls for samples."""
+        try:
+            return bool(self._stream.active)
+        except self._library.PortAudioError:
+            return False
+
+    def close(self) -> None:
+        """Stop at once, and close the device."""
+        if self._stream is not None:
+            self._stream.close(ignore_errors=True)
+            self._stream = None
+
+
+Output: TypeAlias = JackOutput | PortAudioOutput
+"""An open device with its name, rate [Hz] and block [frames], 0 if it varies; see either."""
+
+
+def open_output(settings: Settings) -> Output:
+    """Open the device of an amplifier; InputError, LinkError where it is busy or gone."""
+    kind, _, name = settings.device.partition(":")
+    if kind == "jack":
+        return JackOutput(settings, destination=name)
+    return PortAudioOutput(settings)

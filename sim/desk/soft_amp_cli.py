@@ -1,0 +1,179 @@
+"""`era soft-amp`: an amplifier made of software, played by a sound device."""
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drivers.errors import LinkError
+from model.errors import InputError
+from sim.desk.soft_amp.settings import Law, Protocol, Settings
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from sim.desk.soft_amp.settings import Place
+
+
+def port_option(served: str) -> Any:
+    """The option for a loopback port; served: what is served there."""
+    return typer.Option(
+        metavar="PORT", help=f"Serve {served} on this loopback port; 0: any.", min=0, max=65535
+    )
+
+
+def soft_amp(
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE",
+            help="Play through jack, jack:CLIENT, or a name or number of PortAudio.",
+        ),
+    ] = None,
+    channels: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Channels, 2 to 32; above 16 as two amplifiers."),
+    ] = None,
+    serial: Annotated[
+        bool, typer.Option("--serial", help="Serve the serial protocol on a pseudo-terminal.")
+    ] = False,
+    tcp: Annotated[int | None, port_option("the serial protocol")] = None,
+    modbus_tcp: Annotated[int | None, port_option("Modbus TCP")] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="Link this path to the pseudo-terminal."),
+    ] = None,
+    rate: Annotated[
+        int | None, typer.Option(metavar="HZ", help="Sample rate; that of the device by default.")
+    ] = None,
+    block: Annotated[
+        int | None,
+        typer.Option(
+            metavar="FRAMES",
+            help="Samples of a block; of JACK its own.",
+            min=16,
+            max=8192,
+        ),
+    ] = None,
+    law: Annotated[
+        Law,
+        typer.Option(help="Play the wanted force, or the root of a bias plus half of it."),
+    ] = Law.LINEAR,
+    limit: Annotated[
+        float, typer.Option(metavar="LEVEL", help="Largest sample, as a share of full scale.")
+    ] = 1.0,
+    max_gaps: Annotated[
+        int,
+        typer.Option(
+            metavar="N", help="Gaps in the sound within a second; more are a fault.", min=0, max=63
+        ),
+    ] = 3,
+    serial_number: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Serial number, at most 30 bytes.")
+    ] = None,
+    list_devices: Annotated[bool, typer.Option("--list", help="List devices and exit.")] = False,
+    until_eof: Annotated[
+        bool, typer.Option("--until-eof", help="Exit at the end of standard input.")
+    ] = False,
+) -> None:
+    """Be an amplifier that plays through a sound device. Print its URL; Ctrl-C ends.
+
+    Level 1 is full scale of the device. Silent within 50 ms once its host or itself is killed.
+    """
+    from sim.desk.soft_amp.library import library
+    from sim.desk.soft_amp.supervisor import Supervisor, underruns
+
+    if list_devices:
+        _list()
+        return
+    if device is None or channels is None:
+        missing = "--device" if device is None else "--channels"
+        raise InputError(f"{missing} is missing; era soft-amp --list lists devices")
+    protocol = Protocol.SERIAL if modbus_tcp is None else Protocol.MODBUS
+    settings = Settings(
+        device=device,
+        channels=channels,
+        protocol=protocol,
+        serial_number=_serial_number(serial_number, device=device),
+        rate=rate,
+        block=block,
+        law=law,
+        limit=limit,
+        max_gaps=max_gaps,
+    )
+    library()  # compiled here, where its errors are told
+    with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
+        supervisor = Supervisor(
+            settings, place, report=lambda line: print(f"soft-amp: {line}", file=sys.stderr)
+        )
+        try:
+            opened = supervisor.start()
+            for url in place.urls(settings.amplifiers, protocol=protocol):
+                print(url, flush=True)
+            priority = "real-time" if supervisor.counters.is_realtime & 1 else "ordinary"
+            print(
+                f"soft-amp: {opened['device']}, {channels} channels, {opened['rate']} Hz, blocks "
+                f"of {opened['block']} frames, {priority} priority",
+                file=sys.stderr,
+                flush=True,
+            )
+            with suppress(KeyboardInterrupt):
+                supervisor.watch(until=sys.stdin.fileno() if until_eof else None)
+            counted = underruns(supervisor.counters, rate=opened["rate"])
+            print(f"soft-amp: {counted}", file=sys.stderr)
+        finally:
+            supervisor.end()
+
+
+def _serial_number(given: str | None, *, device: str) -> str:
+    if given is None:
+        import socket
+        import zlib
+
+        return f"SOFT-{zlib.crc32(f'{socket.gethostname()} {device}'.encode()):08X}"
+    if not 1 <= len(given.encode()) <= 30:
+        raise InputError(f"--serial-number must have 1 to 30 bytes, got {len(given.encode())}")
+    return given
+
+
+def _place(
+    *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
+) -> "AbstractContextManager[Place]":
+    from sim.desk.soft_amp.settings import tcp_place, terminal_place
+
+    given = [
+        name
+        for name, is_given in (
+            ("--serial", serial),
+            ("--tcp", tcp is not None),
+            ("--modbus-tcp", modbus_tcp is not None),
+        )
+        if is_given
+    ]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} exclude each other; give one")
+    if link is not None and given not in ([], ["--serial"]):
+        raise InputError(f"--link is of a pseudo-terminal; omit it, or {given[0]}")
+    if tcp is not None:
+        return tcp_place(tcp, protocol=Protocol.SERIAL)
+    if modbus_tcp is not None:
+        return tcp_place(modbus_tcp, protocol=Protocol.MODBUS)
+    return terminal_place(link)
+
+
+def _list() -> None:
+    from sim.desk.libjack import IS_INPUT, jack_devices
+    from sim.desk.soft_amp.output import portaudio_devices
+
+    try:
+        for name, channels in jack_devices(IS_INPUT).items():
+            print(f"{name}: {channels} channels")
+    except (InputError, LinkError) as problem:
+        print(f"no JACK: {problem}", file=sys.stderr)
+    try:
+        for number, name, channels, rate in portaudio_devices():
+            print(f"{number}: {name}: {channels} channels, {rate:g} Hz")
+    except InputError as problem:
+        print(f"no PortAudio: {problem}", file=sys.stderr)

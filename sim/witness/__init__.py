@@ -1,5 +1,0 @@
-"""The witness: it decodes every frame on the wires and reports broken rules.
-
-Messages are read by the one table and codec (`drivers.protocol`, `drivers.codec`), what plays comes
-from `drivers.playback`; the rules are its own, and nothing of the host or of the far ends is here.
-"""

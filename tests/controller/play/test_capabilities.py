@@ -1,0 +1,293 @@
+"""From the rig and its open amplifiers to what can be played, and to the commands that play it."""
+
+import cmath
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from controller.play.capabilities import (
+    EnvelopeSupport,
+    envelope_support,
+    playback_capabilities,
+)
+from controller.play.routing import on_wire, route, thinned, tones_by_era
+from drivers.host.ledger import Ledger
+from drivers.playing.contents import Layer
+from drivers.playing.contents import Tone as Played
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Rig
+from model.structure.attachments import Era
+from model.structure.plate import Material, Plate
+from model.transients.base_motion import BaseEnvelope
+from model.vibration.excitation import Excitation, Tone
+from registry.limits import GuardLimits
+from sim.amplifier.readings import capabilities
+
+LIMITS = GuardLimits(40.0, 500.0, 0.8)
+
+
+@dataclass
+class Wire:
+    """A wire on which a word takes a time [s]."""
+
+    word: float
+
+    def transit(self, words: int) -> float:
+        """In proportion to the words."""
+        return words * self.word
+
+
+@dataclass(eq=False)
+class Line:
+    """A line with a wire."""
+
+    wire: Wire = field(default_factory=lambda: Wire(0.0))
+
+
+class Opened:
+    """An amplifier with some capabilities of its own."""
+
+    def __init__(self, line: Line | None = None, **changed: int) -> None:
+        self.line = line or Line()
+        self.capabilities: Values = {**capabilities(4), **changed}
+        self.ledger = Ledger(LIMITS, self.capabilities)
+
+
+def rig() -> Rig:
+    """Two ERAs on the left amplifier, one on the right."""
+    return Rig(
+        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
+        mesh=Mesh(4, 4, 0.3, 0.2),
+        eras=tuple(
+            Era(name, x, 0.0, 17_000.0, 1.0, 0.0, stroke)
+            for name, x, stroke in (("A", 0.0, 1e-4), ("B", 0.15, 2e-4), ("C", 0.3, 1e-4))
+        ),
+        wiring={"A": Channel("left", 3), "C": Channel("right", 0), "B": Channel("left", 1)},
+        amplifiers={"left": "fake://", "right": "fake://"},
+        limits=LIMITS,
+    )
+
+
+def both(left: Opened | None = None, right: Opened | None = None) -> Mapping[str, Any]:
+    """The two amplifiers of the rig."""
+    return {"left": left or Opened(), "right": right or Opened()}
+
+
+@pytest.mark.parametrize(
+    ("steps", "mode"),
+    [
+        ([(1, 1), (1, 1)], "phased"),
+        ([(1, 1), (1, 18_000)], "switched"),
+        ([(10_000, 1), (1, 1)], "switched"),
+    ],
+)
+def test_capabilities_choose_the_best_common_drive_mode(
+    steps: list[tuple[int, int]], mode: str
+) -> None:
+    """By the steps of level (1e-4) and phase (0.01 degrees) of each amplifier."""
+    left, right = (Opened(level_step=level, phase_step=phase) for level, phase in steps)
+    found = playback_capabilities(rig(), both(left, right))
+    assert found.drive_mode == mode
+    assert found.playable[-1] == mode
+
+
+def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
+    """With those that can be played."""
+    plain = both(Opened(phase_step=18_000), Opened(phase_step=18_000))
+    assert playback_capabilities(rig(), plain, drive_mode="switched").drive_mode == "switched"
+    with pytest.raises(InputError, match=r"switched.*phased"):
+        playback_capabilities(rig(), plain, drive_mode="phased")
+
+
+def test_capabilities_are_the_tightest_limits() -> None:
+    """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
+    left = Opened(frequency_min=1000, level_max=5000)
+    found = playback_capabilities(rig(), both(left, Opened(frequency_max=6000)))
+    assert found.frequencies == (50.0, 300.0)
+    assert found.max_amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
+
+
+@pytest.mark.parametrize(
+    ("words", "is_shared", "expected"),
+    [
+        (10_000, False, (20, 7)),
+        (25 + 4 * 27, False, (20, 7)),
+        (25 + 4 * 26, False, (19, 7)),
+        (22 + 4 * 12, False, (5, 7)),
+        (22 + 4 * 11, False, (11, 0)),
+        (22 + 4 * 1, False, (1, 0)),
+        (22 + 3, False, (0, 0)),
+        (0, False, (0, 0)),
+        (36 + 6 * 12, True, (5, 7)),
+        (36 + 6 * 11, True, (11, 0)),
+    ],
+)
+def test_envelopes_have_as_many_knots_as_wires_carry(
+    words: int, is_shared: bool, expected: tuple[int, int]
+) -> None:
+    """So many words in 10 ms, on a wire for each amplifier, or on one for both.
+
+    By hand: two channels on the left have 22 words of heads, 3 more beyond 120 words, and 4 words
+    for each knot; with the third channel 36 and 6. An ending has 7 knots, an onset at least 5.
+    """
+    lines = [Line(Wire(0.010 / (words + 0.5))) for _ in range(2)]
+    left, right = (Opened(lines[0 if is_shared else number]) for number in range(2))
+    assert envelope_support(rig(), both(left, right)) == EnvelopeSupport(*expected)
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"knots": 19}, (19, 7)),
+        ({"knots": 6}, (6, 0)),
+        ({"knots": 0}, (0, 0)),
+        ({"envelope_step_min": 100}, (0, 0)),
+        ({"set_words": 22 + 4 * 20}, (13, 7)),
+    ],
+)
+def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[int, int]) -> None:
+    """Knots, steps of 5 ms and words of a set, of every amplifier."""
+    found = envelope_support(rig(), both(Opened(**changed)))
+    assert found == EnvelopeSupport(*expected)
+
+
+STROKES = {"A": 1e-4, "B": 2e-4, "C": 1e-4}
+
+
+def test_envelopes_on_the_wire_by_hand() -> None:
+    """Levels in strokes of 1e-4, phases in 0.01 degrees and steps of 0.1 ms, without the last knot.
+
+    Half a turn is the lowest phase that the wire has.
+    """
+    onset = {
+        "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0), 0.01),
+        "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
+    }
+    found, none, ending = on_wire(STROKES, onset, None, {"C": BaseEnvelope(110.0, 0, (5e-5,))})
+    assert (none, ending) == ({}, {"C": Envelope(50, ())})
+    assert found["A"] == Envelope(50, ((2000, 0),))
+    assert found["B"] == Envelope(100, ((5000, 9000), (10000, -18000)))
+
+
+def test_envelopes_round_full_stroke_to_one() -> None:
+    """A rounding error above it would be refused by the ledger."""
+    full = cmath.rect(1e-4 * (1 + 1e-12), 1.0)
+    (found,) = on_wire(STROKES, {"A": BaseEnvelope(110.0, 0, (full, 0))})
+    ((level, _),) = found["A"].knots
+    assert level == 10000
+
+
+def test_thinned_envelope_follows_the_same_lines() -> None:
+    """Six steps of 5 ms become three of 10, whose knots are those of before."""
+    line = BaseEnvelope(110.0, 0, (1.0, 2.0, 4.0, 5.0, 7.0, 6.0))
+    (found,) = thinned({"A": line}, knots=2).values()
+    assert (found.step, found.knots) == (0.01, (2.0, 5.0, 6.0))
+    (whole,) = thinned({"A": line}, knots=5).values()
+    assert whole is line
+
+
+PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
+RIG = Rig(
+    plate=PLATE,
+    mesh=Mesh(4, 4, 0.3, 0.2),
+    eras=tuple(
+        Era(name, x, y, 17_000.0, 1.0, 0.0, stroke)
+        for name, x, y, stroke in (
+            ("SW", 0.0, 0.0, 100e-6),
+            ("SE", 0.3, 0.0, 50e-6),
+            ("NE", 0.3, 0.2, 100e-6),
+        )
+    ),
+    wiring={"SW": Channel("left", 1), "SE": Channel("right", 0), "NE": Channel("left", 0)},
+    amplifiers={"left": "sim://", "right": "sim://"},
+    limits=GuardLimits(40.0, 500.0, 1.0),
+)
+
+
+def test_route_by_hand() -> None:
+    """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; other channels are silent."""
+    layers = route(
+        {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, ramp=0.02
+    )
+    played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
+    silent = Played(0, 40.0, 0.0, skip_ending=True)
+    assert layers == {
+        "left": Layer(0, (played, silent), ramp=0.02),
+        "right": Layer(0, (Played(0, 250.0, pytest.approx(0.4)),), ramp=0.02),
+    }
+
+
+@pytest.mark.parametrize(
+    ("radians", "degrees"),
+    [
+        (0.0, 0.0),
+        (math.pi, 180.0),
+        (-math.pi, -180.0),
+        (1.5 * math.pi, -90.0),
+        (-1.5 * math.pi, 90.0),
+        (6 * math.pi, 0.0),
+        (20 * math.pi + 0.1, math.degrees(0.1)),
+    ],
+)
+def test_route_wraps_phases(radians: float, degrees: float) -> None:
+    """Phases lie within half a turn, of which both ends are one."""
+    command = route({"SE": Tone(100.0, 1e-6, radians)}, RIG, ramp=0)["right"].tones[0]
+    assert command.phase == pytest.approx(degrees)
+
+
+def test_route_applies_no_limits() -> None:
+    """More than full stroke and NaN reach the ledger unchanged."""
+    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, ramp=0)["right"].tones[0]
+    assert over.frequency == 1e9
+    assert over.level == pytest.approx(2.0)
+    assert math.isnan(over.phase)
+
+
+def test_route_refuses_an_unknown_era() -> None:
+    """A pattern of another rig is refused as a whole."""
+    with pytest.raises(InputError, match="got NW"):
+        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, ramp=0)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "kept"),
+    [
+        ({"SW": Tone(110.0, 5e-6), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
+        ({"SW": Tone(110.0, 5e-6, 1.0), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
+        ({"SE": Tone(110.0, 9e-6)}, {"SE"}),
+        ({"SW": Tone(110.0, 5e-6), "SE": Tone(250.0, 9e-6)}, {"SW"}),
+        ({"SW": Tone(110.0, 5e-6), "NE": Tone(110.0, 9e-6)}, set()),
+        ({"SW": Tone(110.01, 5e-6), "SE": Tone(110.01, 9e-6)}, set()),
+        ({"SW": Tone(250.0, 5e-6), "SE": Tone(250.0, 9e-6)}, set()),
+    ],
+)
+def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
+    """A frequency restarts if an ERA joins it."""
+    playing = {name: Played(0, 110.0, 0.5) for name in ("SW", "SE")}
+    layers = route(wanted, RIG, ramp=0, playing=playing)
+    assert {
+        name
+        for name, channel in RIG.wiring.items()
+        for tone in layers[channel.amplifier].tones
+        if tone.channel == channel.number and tone.keep_phase
+    } == kept
+    first = route(wanted, RIG, ramp=0)
+    assert not any(tone.keep_phase for each in first.values() for tone in each.tones)
+
+
+def test_drive_of_eras_by_hand() -> None:
+    """What each ERA plays, without silent ones."""
+    achieved = {
+        "left": [LayerSet(0, 20, 0, (Command(0, 800, 0, 0), Command(1, 2201, 1999, -9000)))],
+        "right": [LayerSet(0, 20, 0, (Command(0, 5000, 4000, 0),))],
+    }
+    assert tones_by_era(achieved, RIG) == {
+        "SW": Played(1, 110.05, 0.1999, -90.0),
+        "SE": Played(0, 250.0, 0.4),
+    }

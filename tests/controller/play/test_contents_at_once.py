@@ -1,0 +1,662 @@
+"""Several fingers, each with a content of its own, on the plate in virtual time."""
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controller.daemon.messages import PlateView
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
+from controller.play.decision import ENDED, Decider
+from controller.play.intent import Target
+from controller.play.joint_answer import query_jointly, unshaped
+from controller.play.observer import Applied
+from controller.play.playing import PlayedContent
+from controller.play.routing import PlateSet
+from controller.touch.contacts import Contact, ContactKey
+from drivers.errors import CommandRefused
+from drivers.host.members import Played
+from drivers.playing.contents import Layer
+from model.arrays import Complex64Array
+from model.errors import InputError
+from model.table.pattern import Pattern
+from set_table import SetTiming
+from several_fingers import (
+    ABOVE,
+    LAYOUT,
+    LEFT,
+    RIGHT,
+    answers_take,
+    fingers_on,
+    playable,
+    table,
+)
+from virtual_loop import in_virtual_time
+
+
+def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:
+    """Let every answer of the thread take a time [s]; returns the running loop."""
+    answers_take(monkeypatch, seconds)
+    return asyncio.get_running_loop()
+
+
+@in_virtual_time
+async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> None:
+    """Measured at the fingertips over the wire, against the answer for the nominal plate."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
+        (applied,) = fingers.applied
+        first, second = (one.content for one in applied.contents.values())
+        assert abs(first.frequency - second.frequency) >= 30
+        assert [each.verdict for each in applied.targets] == ["own", "own"]
+        predicted = {
+            one.content.targets[0][0].key.id: one.pattern.felt_contrast_db
+            for one in applied.contents.values()
+        }
+        assert fingers.contrasts() == pytest.approx(predicted, abs=1.0)
+
+
+@in_virtual_time
+async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() -> None:
+    """Each keeps its layer and what it feels keeps its frequency, unless 3 dB more are promised."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
+        before = {number: one.content for number, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        fingers.at[3] = ABOVE
+        await fingers.hold(0.5)
+        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        assert sorted(one.layer for one in sent) == [0, 1, 2]
+        after = {number: one.content for number, one in fingers.applied[-1].contents.items()}
+        for number, content in before.items():
+            assert after[number].targets[0][0].key == content.targets[0][0].key
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None] * 3
+        kept = [n for n, content in before.items() if after[n].frequency == content.frequency]
+        for one in sent:
+            keeps = {command.keep_phase for command in one.commands}
+            assert keeps == {one.layer in kept}
+
+
+@in_virtual_time
+async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> None:
+    """One set, of its layer alone; what the other feels has the same amplitude before and after."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        (other,) = (n for n, one in fingers.applied[-1].contents.items() if _id(one) == 2)
+        count = len(fingers.committed)
+        del fingers.at[1]
+        await fingers.hold(0.5)
+        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        (one,) = sent
+        assert one.layer != other
+        assert not any(command.level for command in one.commands)
+        assert [each.contact.key.id for each in fingers.applied[-1].targets] == [2]
+        await fingers.hold(3.0)  # renewed alone
+        renewed = [each for _, _, layers in fingers.committed for each in layers if each.renew]
+        assert renewed
+        assert {each.layer for each in renewed} == {other}
+        assert fingers.contrasts() == {}  # only its own content is left
+        fingers.at.clear()
+        count = len(fingers.committed)
+        await fingers.hold(0.1)
+        assert fingers.committed[count][2] == ()  # a Silence of all layers, at once
+
+
+@in_virtual_time
+async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
+    """On a way along which others promise 3 dB more: they play within 0.2 s of rest, once."""
+    async with fingers_on(table(), LAYOUT, at={1: (0.12, 0.10), 2: RIGHT}, held=0.5) as fingers:
+        before, count = _frequencies(fingers.applied[-1]), len(fingers.applied)
+
+        def slide(since: float) -> None:
+            fingers.at[1] = (0.12 - 0.2 * since, 0.10 - 0.175 * since)
+
+        await fingers.hold(0.4, slide)
+        sliding = fingers.applied[count:]
+        assert len(sliding) >= 5
+        assert {_frequencies(each) for each in sliding} == {before}
+        slid = asyncio.get_running_loop().time()
+        await fingers.hold(0.8)
+        (rested,) = fingers.applied[count + len(sliding) :]
+        assert rested.time - slid <= 0.2
+        assert _frequencies(rested) != before
+        assert _worst(rested) >= _worst(sliding[-1]) + 3
+
+
+@in_virtual_time
+async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its layer alone, within 20 ms, though the other moves, which begins anew in its layer."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
+        group, count = fingers.controller.group, len(fingers.committed)
+        with monkeypatch.context() as patched:
+            patched.setattr(type(group), "degraded", ("main",))
+            fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
+            await fingers.hold(0.03)  # what plays is unknown by now
+            del fingers.at[1]
+            lifted = asyncio.get_running_loop().time()
+            await fingers.hold(0.1)
+            ((ended, _, sent),) = fingers.committed[count:]
+            assert [(one.layer, one.renew) for one in sent] == [(layers[1], False)]
+            assert not any(command.level for one in sent for command in one.commands)
+            assert ended - lifted <= 0.020
+        await fingers.hold(0.1)
+        _, _, sent = fingers.committed[count + 1]
+        assert [one.layer for one in sent] == [layers[2]]
+
+
+@in_virtual_time
+async def test_a_refused_content_is_left_out_and_the_other_plays_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two contents are refused together: the newer finger is told why, the other is not silent.
+
+    The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
+    """
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
+        apply, count = fingers.controller.group.apply, len(fingers.committed)
+        (own,), refused, loop = fingers.applied[-1].contents, [], asyncio.get_running_loop()
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            others = [each for each in layers["main"] if each.number != own]
+            if any(tone.level for each in others for tone in each.tones):
+                refused.append(loop.time())
+                raise CommandRefused("too much power")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.3)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 2: "too much power"}
+        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
+        assert [_id(one) for one in fingers.applied[-1].contents.values()] == [1]
+        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
+
+
+@in_virtual_time
+async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
+    """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
+
+    It is never silent, nor refused by the amplifiers.
+    """
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    effects = {**LAYOUT.effects, "click": Click(level=44.0), "loud": Buzz(level=44.0)}
+    layout = SurfaceLayout(regions, effects, elsewhere=None)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
+        begin, (contact,) = asyncio.get_running_loop().time(), fingers.applied[-1].contacts
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.012)
+        player = fingers.controller._intent_source
+        assert isinstance(player, EffectPlayer)
+        player.play("loud", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(0.2)
+        raised = [each for each in fingers.applied if each.time > begin + 0.012]
+        felt = [each for applied in raised for each in applied.targets if each.contact.key.id == 1]
+        assert {each.held_back for each in felt} == {None}
+        assert felt[0].level_db_sl < felt[-1].level_db_sl - 0.5
+        assert not fingers.silenced
+        assert raised[-1].time - begin <= 0.15
+        await fingers.hold(0.3)
+        assert fingers.levels_db_sl()[1] >= 43
+
+
+@in_virtual_time
+async def test_what_is_refused_beside_a_click_is_felt_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The refusal does not say until when; 20 ms after its end the click has faded."""
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
+        apply, refused, loop = fingers.controller.group.apply, [], asyncio.get_running_loop()
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.012)
+        clicked = fingers.applied[-1].time
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            (own,) = [each for each in layers["main"] if each.number == 0] or [Layer(0)]
+            if loop.time() < clicked + 0.06 and any(tone.level for tone in own.tones):
+                refused.append(loop.time())
+                raise CommandRefused("too much power")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
+        await fingers.hold(0.3)
+        assert refused
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
+        assert fingers.applied[-1].time - clicked <= 0.15
+
+
+@in_virtual_time
+async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it() -> None:
+    """Both need 1.1 strokes: it is refused once the click has ended by itself, and once only."""
+    effects = {**LAYOUT.effects, "low": Buzz(level=36.0), "click": Click(level=50.0)}
+    layout = replace(LAYOUT, effects=effects)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
+        player, (contact,) = fingers.controller._intent_source, fingers.applied[-1].contacts
+        assert isinstance(player, EffectPlayer)
+        begin = asyncio.get_running_loop().time()
+        player.play("click", contact, begin, level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(1.0)
+        assert len(fingers.refused) == 1
+        (target,) = fingers.applied[-1].targets
+        assert (target.content, target.held_back) == ("low", None)
+        assert fingers.applied[-1].time - begin <= 0.15
+
+
+@in_virtual_time
+async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        apply, count = fingers.controller.group.apply, len(fingers.committed)
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            if any(not each.tones and not each.renew for each in layers["main"]):
+                raise CommandRefused("an ending is too loud")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        del fingers.at[1]
+        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
+        await fingers.hold(0.3)
+        (_, _, sent), *_ = fingers.committed[count:]
+        assert sorted(any(c.level for c in one.commands) for one in sent) == [False, True]
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
+
+
+@in_virtual_time
+async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One is not renewed, and ends after 2 s; the others go on, and nothing was sent for that.
+
+    Nor does it count as felt once one of the others lifts.
+    """
+    renewal = Decider.renewal
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
+        layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
+
+        def not_one(decider: Decider, now: float) -> dict[int, PlateSet]:
+            return {n: each for n, each in renewal(decider, now).items() if n != layers[1]}
+
+        monkeypatch.setattr(Decider, "renewal", not_one)
+        count = len(fingers.applied)
+        await fingers.hold(2.5)
+        (applied,) = fingers.applied[count:]
+        assert {*applied.contents} == {layers[2], layers[3]}
+        assert applied.latency is None
+        felt = {each.contact.key.id: each.held_back for each in applied.targets}
+        assert felt == {1: ENDED, 2: None, 3: None}
+        del fingers.at[3]
+        await fingers.hold(0.2)
+        assert [*fingers.applied[-1].contents] == [layers[2]]
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: ENDED, 2: None}
+
+
+@in_virtual_time
+async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
+    """What lasts of it begins again; each set since the click is of the one layer."""
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "tick": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
+        contents = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
+        layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        player, contact = fingers.controller._intent_source, fingers.applied[-1].contacts[0]
+        assert isinstance(player, EffectPlayer)
+        player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+        fingers.controller.request_update()
+        await fingers.hold(0.4)
+        changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
+        assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2
+        after = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
+        assert after == contents
+
+
+@in_virtual_time
+async def test_a_click_goes_before_what_lasts_of_other_fingers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An answer to what lasts takes 70 ms and runs already; the click is sent as it has come.
+
+    Its latency counts from its touch, though it has waited.
+    """
+    loop = answering_after(0.07, monkeypatch)
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
+        count, begin = len(fingers.committed), loop.time()
+        fingers.at[1] = (LEFT[0] + 0.02, LEFT[1])
+        await fingers.hold(0.02)
+        fingers.at[3], touched = ABOVE, loop.time()
+        await fingers.hold(0.3)
+        at = min(at for at, _, layers in fingers.committed[count:] if layers[0].layer == 2)
+        assert 0.07 <= at - begin <= 0.075
+        clicked = next(each for each in fingers.applied if len(each.contents) == 3)
+        assert clicked.latency == pytest.approx(at - touched, abs=0.003)
+
+
+@in_virtual_time
+async def test_latency_counts_from_the_change_that_an_answer_is_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A slide of 1.5 s, answers of 0.2 s, too late for a touch: one that runs, then its own."""
+    answering_after(0.2, monkeypatch)
+    async with fingers_on(
+        table(), LAYOUT, breaks="touch", at={1: (0.03, 0.06), 2: RIGHT}, held=0.5
+    ) as fingers:
+        count = len(fingers.applied)
+
+        def slide(since: float) -> None:
+            fingers.at[1] = (0.03 + 0.07 * since, 0.06)
+
+        await fingers.hold(1.5, slide)
+        latencies = [each.latency or 0.0 for each in fingers.applied[count:]]
+        assert len(latencies) >= 3
+        assert min(latencies) >= 0.2
+        assert max(latencies) <= 0.45
+
+
+@in_virtual_time
+async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A finger comes and lifts while the answer for two is computed: the other's set stays."""
+    answering_after(0.2, monkeypatch)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
+        count = len(fingers.committed)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.05)
+        del fingers.at[2]
+        await fingers.hold(0.5)
+        assert len(fingers.committed) == count
+        assert len(fingers.applied) == 1
+
+
+@pytest.mark.parametrize("is_busy", [False, True])
+@in_virtual_time
+async def test_a_finger_that_comes_back_elsewhere_feels_nothing_chosen_for_its_old_place(
+    is_busy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the same id; also while an answer is computed that was asked for before it lifted."""
+    answering_after(0.07, monkeypatch)
+    late = "touch" if is_busy else None
+    async with fingers_on(
+        table(), LAYOUT, breaks=late, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
+    ) as fingers:
+        if is_busy:
+            fingers.at[3] = (ABOVE[0] + 0.01, ABOVE[1])
+            await fingers.hold(0.02)
+        del fingers.at[2]
+        await fingers.hold(0.02)
+        count, fingers.at[2] = len(fingers.applied), (0.27, 0.10)
+        await fingers.hold(0.3)
+        places = {
+            (contact.x, contact.y)
+            for applied in fingers.applied[count:]
+            for one in applied.contents.values()
+            for contact, _ in one.content.targets
+            if contact.key.id == 2
+        }
+        assert places == {fingers.at[2]}
+
+
+@in_virtual_time
+async def test_arming_again_forgets_no_layer_that_plays() -> None:
+    """A finger that lifts just then falls silent, as the other plays on."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        await fingers.controller.arm()
+        del fingers.at[2]
+        await fingers.hold(0.1)
+        sets = {one.layer: one for _, _, sent in fingers.committed[count:] for one in sent}
+        assert not any(command.level for command in sets[layers[2]].commands)
+        assert any(command.level for command in sets[layers[1]].commands)
+
+
+@in_virtual_time
+async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A resting finger slides 4 mm into the region of a click, which the table refuses."""
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
+    async with fingers_on(table(), layout, at={1: LEFT, 2: (0.158, 0.049)}, held=0.5) as fingers:
+        count = len(fingers.committed)
+
+        def refuse(*_: Any, **__: Any) -> None:
+            raise InputError("nothing is felt there")
+
+        monkeypatch.setattr("controller.play.choice.query_table", refuse)
+        fingers.at[2] = (0.162, 0.049)
+        await fingers.hold(0.02)
+        assert len(fingers.committed) == count
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 2: "nothing is felt there"}
+
+
+@in_virtual_time
+async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """40 ms, for all of them, though the answer for it and two fingers beside it takes 60."""
+    loop = answering_after(0.06, monkeypatch)
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
+        count, begin = len(fingers.committed), loop.time()
+        fingers.at[3] = ABOVE
+        await fingers.hold(0.3)
+        (start, is_driven), (end, is_still_driven) = (
+            (at, any(command.level for command in one.commands))
+            for at, _, layers in fingers.committed[count:]
+            for one in layers
+            if one.layer == 2
+        )
+        assert (is_driven, is_still_driven) == (True, False)
+        assert 0.06 <= start - begin <= 0.08
+        assert 0.04 <= end - start <= 0.05
+
+
+@in_virtual_time
+async def test_an_answer_is_shaped_by_the_timing_it_began_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Others are put in place meanwhile, whose timing has no envelopes: what was begun has one."""
+    answering_after(0.03, monkeypatch)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.01) as fingers:
+        fingers.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
+        await fingers.hold(0.3)
+        (applied,) = fingers.applied
+        assert all(one.pattern.onset for one in applied.contents.values())
+
+
+@in_virtual_time
+async def test_an_answer_of_a_former_layout_is_not_played(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A finger joins; the effects change while the answer is computed: only the new ones play."""
+    answering_after(0.07, monkeypatch)
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.5) as fingers:
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.03)
+        player, count = fingers.controller._intent_source, len(fingers.applied)
+        assert isinstance(player, EffectPlayer)
+        bands = [replace(region, band=(200.0, 320.0)) for region in LAYOUT.regions]
+        player.replace(replace(LAYOUT, regions=tuple(bands)))
+        fingers.controller.request_update()
+        await fingers.hold(0.3)
+        (applied,) = fingers.applied[count:]
+        assert len(applied.contents) == 2
+        assert all((one.content.frequency or 0) >= 200 for one in applied.contents.values())
+
+
+@in_virtual_time
+async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A program repeats it every 30 ms, and answers take 50: each is to the play before."""
+    answering_after(0.05, monkeypatch)
+    layout = replace(LAYOUT, effects={**LAYOUT.effects, "long": Buzz(level=14.0, duration=0.5)})
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.3) as fingers:
+        player, count = fingers.controller._intent_source, len(fingers.applied)
+        assert isinstance(player, EffectPlayer)
+        (contact,) = [each for each in fingers.applied[-1].contacts if each.key.id == 1]
+        for _ in range(10):
+            player.play("long", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+            fingers.controller.request_update()
+            await fingers.hold(0.03)
+        names = {
+            one.content.targets[0][1].content
+            for each in fingers.applied[count:]
+            for one in each.contents.values()
+        }
+        assert "long" in names
+
+
+@in_virtual_time
+async def test_what_is_not_served_says_why() -> None:
+    """Of six fingers the four newest have the four layers; the plate cannot serve all of these."""
+    async with fingers_on(table(), LAYOUT, layers=4) as fingers:
+        x = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28)
+        fingers.at = {id: (at, 0.05 + 0.12 * (id % 2)) for id, at in enumerate(x, start=1)}
+        await fingers.hold(0.5)
+        felt = {each.contact.key.id: each for each in fingers.applied[-1].targets}
+        assert felt.keys() == fingers.at.keys()
+        for each in felt.values():
+            assert each.verdict in ("own", "mixed", "shared", "held back")
+            assert (each.held_back is None) == (each.verdict in ("own", "mixed"))
+            assert "(" not in (each.held_back or "")  # no object of the program
+        assert {felt[id].verdict for id in (1, 2)} == {"held back"}  # the earliest
+        assert felt[1].held_back == (
+            "no layer is free: the amplifiers play 4 contents at once; lift a finger"
+        )
+        others = [felt[id] for id in (3, 4, 5, 6) if felt[id].verdict == "held back"]
+        assert others
+        assert all("6 dB of contrast" in (each.held_back or "") for each in others)
+
+
+@in_virtual_time
+async def test_an_answer_that_fails_silences_all_and_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Asked once, not in every turn of the loop; fingers that move are asked for again."""
+    calls = 0
+
+    def fail(*_: Any, **__: Any) -> None:
+        nonlocal calls
+        calls += 1
+        raise ZeroDivisionError("by no finger")
+
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
+        with monkeypatch.context() as patched:
+            patched.setattr("controller.play.choice.query_jointly", fail)
+            fingers.at[2] = RIGHT
+            await fingers.hold(0.5)
+        assert calls == 1
+        (one,) = fingers.committed[-1][2]
+        assert (one.commands, one.renew) == ((), False)  # ends along its ending
+        assert fingers.contrasts() == {}
+        assert fingers.silenced[-1].reason == "ZeroDivisionError: by no finger"
+        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
+        await fingers.hold(0.3)
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None, None]
+
+
+@in_virtual_time
+async def test_status_says_what_each_finger_feels() -> None:
+    """Keys of the API: by finger its content and verdict; by layer what the ERAs play."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
+        applied = fingers.applied[-1]
+        view = PlateView(lambda key: "buzz", applied.contacts, applied)
+        event = view.pattern_event()
+        assert event is not None
+        assert len(event.layers) == 3
+        for contact, (number, one) in zip(event.contacts, applied.contents.items(), strict=True):
+            assert (contact.role, contact.held_back) == ("target", None)
+            promised = contact.robust_felt_contrast_db
+            assert promised is not None
+            assert contact.verdict == ("own" if promised >= 12 else "mixed")
+            assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
+            assert contact.foreign_level_db_sl == pytest.approx(14.0 - promised, abs=2.0)
+            assert contact.frequency_hz == one.content.frequency
+            tones = event.layers[str(number)].values()
+            assert {tone.frequency_hz for tone in tones} == {contact.frequency_hz}
+        assert len({contact.frequency_hz for contact in event.contacts}) == 3
+
+
+def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> None:
+    """Both in one narrow band: the first would have had 3 dB beside it, it 16 itself."""
+    contacts = [
+        Contact(ContactKey("a", n), *at, since=0.0)
+        for n, at in enumerate(((0.06, 0.06), (0.2, 0.1)))
+    ]
+    targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
+    found = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
+    (held_back,) = found.not_served
+    assert held_back.promised_contrast_db is not None
+    assert held_back.promised_contrast_db > 12
+    assert held_back.held_back is not None
+    assert "another finger" in held_back.held_back
+
+
+def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
+    """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    targets = [(each, Target(each.key, 14.0)) for each in contacts]
+    first = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
+    before = {each.key: each for each in first.contents}
+    moved = replace(contacts[0], x=contacts[0].x + 0.01)
+    third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
+    joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
+    second = query_jointly(table(), joined, (), playable(4), before=before, shape=unshaped)
+    places = [(each.x, each.y) for each, _ in joined]
+    fields = table().unit_fields(np.array(places), contacts=places)
+    kept = 0
+    for content in second.contents:
+        then = before.get(content.key)
+        if then is not None and then.frequency == content.frequency:
+            at = places.index((content.targets[0][0].x, content.targets[0][0].y))
+            now, old = (_felt(each.pattern, fields[:, :, at]) for each in (content, then))
+            assert np.angle(now / old) == pytest.approx(0.0, abs=1e-3)
+            kept += 1
+    assert kept
+
+
+def _felt(pattern: Pattern, fields: Complex64Array) -> complex:
+    """Acceleration at a finger of a pattern of one frequency, by each ERA's field (f, eras)."""
+    (frequency,) = {tone.frequency for tone in pattern.excitation.values()}
+    row = int(np.flatnonzero(table().frequencies == frequency)[0])
+    eras = {era.name: (number, era.stroke) for number, era in enumerate(table().eras)}
+    return complex(
+        sum(
+            tone.amplitude / eras[name][1] * np.exp(1j * tone.phase) * fields[row, eras[name][0]]
+            for name, tone in pattern.excitation.items()
+        )
+    )
+
+
+def _frequencies(applied: Applied) -> tuple[float | None, ...]:
+    return tuple(one.content.frequency for one in applied.contents.values())
+
+
+def _worst(applied: Applied) -> float:
+    return min(each.promised_contrast_db or 0.0 for each in applied.targets)
+
+
+def _id(one: PlayedContent) -> int:
+    return one.content.targets[0][0].key.id

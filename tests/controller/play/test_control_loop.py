@@ -1,0 +1,88 @@
+"""The control loop, in virtual time, with amplifiers that record their requests."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from controller.play.observer import Observer
+from controller.touch.frames import Touch, TouchFrame
+from courses import Acted, courses, follow
+from drivers.protocol.records import Values
+from set_chain import FINGER, set_running
+from virtual_loop import in_virtual_time
+
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_control_loop_keeps_to_its_course(name: str) -> None:
+    """Every step is as it is in the file."""
+    follow({"of": Acted, **COURSES[name]}, set_running)
+
+
+def now() -> float:
+    """The loop's time [s]."""
+    return asyncio.get_running_loop().time()
+
+
+@in_virtual_time
+async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_wavers() -> None:
+    """A panel at 100 Hz whose pressure wavers by a third in load, then doubles, then comes back."""
+
+    def press(*loads: float) -> None:
+        touches = (Touch(1, 0.5, 0.5), *(Touch(2, 0.9, 0.9, load=load) for load in loads))
+        chain.deliver(TouchFrame("panel", now(), touches))
+
+    async with set_running() as chain:
+        for base, decisions in ((1.0, 1), (2.0, 2), (1.2, 3)):
+            for number in range(50):
+                press(base * (1.15 if number % 2 else 1 / 1.15))
+                await asyncio.sleep(0.01)
+            assert len(chain.table.asked) == decisions
+        asked = [question.loads for question in chain.table.asked]
+    assert asked == [(), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
+
+
+@pytest.mark.parametrize("later", range(1, 4))
+@in_virtual_time
+async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -> None:
+    """In whichever of the last iterations of the event loop before the exchange ends it comes."""
+    async with set_running("a", "b") as chain:
+        before: list[int] = []  # requests to each amplifier before the lift
+
+        def lift(after: int) -> None:
+            if after:
+                asyncio.get_running_loop().call_soon(lift, after - 1)
+            else:
+                before.extend(len(end.asked) for end in chain.far_ends)
+                chain.put()
+
+        def answer(name: str, values: Values) -> None:
+            if name == "Commit" and not before:  # until its reply arrives
+                asyncio.get_running_loop().call_later(0.002, lift, later)
+
+        await asyncio.sleep(0.046)
+        for end in chain.far_ends:
+            end.delay(0.002)
+        chain.far_ends[-1].answer = answer
+        await chain.leave(0.05, FINGER)
+        for end, count in zip(chain.far_ends, before, strict=True):
+            sent = end.names(count)
+            assert sent.index("Silence") < sent.index("Ping")
+
+
+@in_virtual_time
+async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureFixture) -> None:
+    """Its exceptions are logged; pattern, silence and heartbeats are sent all the same."""
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no disk space for this row")
+
+    observer = Observer(contacts_changed=fail, pattern_applied=fail, silenced=fail)
+    async with set_running(observer=observer) as chain:
+        await chain.leave(0.01, FINGER)
+        await chain.leave(0.2)
+        assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]
+        assert len(chain.far_end.requests("Ping")) > 3
+    assert "no disk space for this row" in caplog.text

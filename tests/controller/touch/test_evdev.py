@@ -1,0 +1,372 @@
+"""Touch panels read from the kernel's input devices, with a pipe for the device."""
+
+import asyncio
+import contextlib
+import errno
+import os
+import struct
+from collections.abc import Callable, Coroutine, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.touch.evdev import (
+    CLOCK,
+    GRAB,
+    PRESSED_KEYS,
+    EvdevSource,
+    InputDevice,
+    eviocgabs,
+    eviocgmtslots,
+    parse_events,
+)
+from controller.touch.frames import TouchFrame, open_source
+from controller.touch.slots import InputEvent, SlotState, as_slot_event
+from model.errors import InputError
+from virtual_loop import run_virtual
+
+EMPTY = SlotState(-1, 0, 0)
+KINDS = {
+    **{"slot": (3, 0x2F), "id": (3, 0x39), "x": (3, 0x35), "y": (3, 0x36)},
+    **{"tool": (3, 0x37), "distance": (3, 0x3B), "pressure": (3, 0x3A), "major": (3, 0x30)},
+}
+
+
+def raw(words: str, *, dropped: bool = False, at: float = 0.0) -> bytes:
+    """A report such as "slot 0 id 7 x 100 y 50" as struct input_event has it on x86-64 and Arm.
+
+    at: its time [s].
+    """
+    pairs = words.split()
+    events = [(*KINDS[key], int(value)) for key, value in zip(pairs[::2], pairs[1::2], strict=True)]
+    events += [(0, 3, 0)] * dropped + [(0, 0, 0)]
+    return b"".join(struct.pack("@qqHHi", int(at), round(at % 1 * 1e6), *event) for event in events)
+
+
+class PipePanel:
+    """A panel of 1000 by 500 with two slots, whose events come through a pipe."""
+
+    def __init__(self) -> None:
+        self.ranges = {0x35: (0, 1000), 0x36: (0, 500), 0x3A: (0, 255)}
+        self.resolutions: dict[int, int] = {}
+        self.current_slot = 0
+        self.state = {0: EMPTY, 1: EMPTY}
+        self.is_gone = 0  # the number of an error
+        self._out, self.into = os.pipe()
+        os.set_blocking(self._out, False)
+
+    def fileno(self) -> int:
+        """Return the pipe's read end."""
+        return self._out
+
+    def slots(self) -> dict[int, SlotState]:
+        """Return the state that a test has set."""
+        if self.is_gone:
+            raise OSError(self.is_gone, "gone")
+        return self.state
+
+    def read(self) -> list[InputEvent]:
+        """Return the events in the pipe."""
+        if self.is_gone:
+            raise OSError(self.is_gone, "gone")
+        try:
+            return list(parse_events(os.read(self._out, 4096)))
+        except BlockingIOError:
+            return []
+
+    def close(self) -> None:
+        """Close both ends."""
+        os.close(self._out)
+        os.close(self.into)
+
+
+async def follow(
+    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]], *, options: str = ""
+) -> list[TouchFrame]:
+    """What a source delivers [s from the start] while something plays; panels are opened in turn.
+
+    An exception that the source raises is raised here. options: of its URL.
+    """
+    seen: list[TouchFrame] = []
+    start = asyncio.get_running_loop().time()
+
+    def deliver(frame: TouchFrame) -> None:
+        assert frame.source == "evdev:p"
+        seen.append(replace(frame, time=round(frame.time - start, 6)))
+
+    def open_panel(path: str, *, grab: bool) -> PipePanel:
+        if not panels:
+            raise InputError("not there")
+        return panels.pop(0)
+
+    source = EvdevSource(f"evdev:p{options}", open_panel=open_panel)
+    running = asyncio.create_task(source.run(deliver))
+    await asyncio.sleep(0)
+    await play()
+    running.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await running
+    return seen
+
+
+def touches_of(frames: Iterable[TouchFrame]) -> list[dict[int, tuple[float, float]]]:
+    """The touches of each frame."""
+    return [{touch.id: (touch.x, touch.y) for touch in frame.touches} for frame in frames]
+
+
+def test_evdev_source_follows_fingers() -> None:
+    """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts.
+
+    Fingers on the panel when it is opened are delivered at once, with the slot of the next event;
+    after SYN_DROPPED the kernel's state counts, as its documentation demands.
+    """
+    panel = PipePanel()
+    panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
+    panel.current_slot = 1
+
+    async def play() -> None:
+        for words in ("x 600", "slot 0 id 7 x 250 y 100", "x 300", "slot 1 id -1"):
+            os.write(panel.into, raw(words))
+            await asyncio.sleep(0.01)
+        panel.state = {0: EMPTY, 1: SlotState(9, 1000, 0)}
+        os.write(panel.into, raw("slot 0 x 900", dropped=True))
+        await asyncio.sleep(0.01)
+
+    assert touches_of(run_virtual(follow([panel], play))) == [
+        {5: (0.5, 0.5)},
+        {5: (0.6, 0.5)},
+        {5: (0.6, 0.5), 7: (0.25, 0.2)},
+        {5: (0.6, 0.5), 7: (0.3, 0.2)},
+        {7: (0.3, 0.2)},
+        {9: (1.0, 0.0)},
+    ]
+
+
+def test_evdev_source_repeats_resting_fingers() -> None:
+    """The kernel's state is polled every 50 ms, well within the contact timeout of 150 ms.
+
+    A lift without an event is noticed then.
+    """
+    panel = PipePanel()
+
+    async def play() -> None:
+        os.write(panel.into, raw("id 7 x 0 y 0"))
+        panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
+        await asyncio.sleep(0.12)
+        panel.state = {0: EMPTY, 1: EMPTY}
+        await asyncio.sleep(0.2)
+
+    seen = run_virtual(follow([panel], play))
+    assert [frame.time for frame in seen] == [0.0, 0.0, 0.05, 0.1, 0.15]
+    assert touches_of(seen) == [{}, *[{7: (0.0, 0.0)}] * 3, {}]
+
+
+def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
+    """Palms, pens and what hovers over the panel are no touches, by events and by polling.
+
+    Tools 1 and 2 are a pen and a palm in the kernel's input-event-codes.h; a distance above zero is
+    a hovering contact, by its multi-touch-protocol.rst.
+    """
+    panel = PipePanel()
+    panel.state = {0: SlotState(5, 500, 250, tool=2), 1: SlotState(6, 500, 250, distance=3)}
+
+    async def play() -> None:
+        for words in (
+            *("slot 0 tool 0", "tool 2", "tool 1", "slot 1 distance 0", "distance 1"),
+            *("id -1 slot 0 id -1", "id 7 tool 2 x 250 y 100", "id 8", "id 9 tool 0"),
+        ):
+            os.write(panel.into, raw(words))
+            await asyncio.sleep(0.001)
+        panel.state = {0: SlotState(9, 250, 100, tool=2), 1: EMPTY}
+        await asyncio.sleep(0.05)
+
+    middle, corner = (0.5, 0.5), (0.25, 0.2)
+    assert touches_of(run_virtual(follow([panel], play))) == [
+        {},
+        *({5: middle}, {}, {}, {6: middle}, {}),
+        *({}, {}, {}, {9: corner}),
+        {},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "resolutions", "load"),
+    [
+        ("", {}, None),
+        ("", {0x3A: 5}, 2 ** (2 / 3)),  # 510 units are 102 g, 1 N: twice a light press
+        ("?light_pressure=510", {}, 1.0),
+        ("?light_pressure=255&grab=yes", {0x3A: 5}, 2 ** (2 / 3)),
+        ("?light_pressure=0", {0x3A: 5}, None),
+        ("?light_pressure=0", {0x3A: 5, 0x35: 10}, 4.0),  # 188 units are 18.8 mm
+        ("?light_major=94", {}, 4.0),
+        ("", {0x35: 10, 0x30: 20}, 1.0),
+    ],
+)
+def test_evdev_source_reports_loads(
+    options: str, resolutions: dict[int, int], load: float | None
+) -> None:
+    """By force where the pressure has a unit or a value of its own, else by size."""
+    panel = PipePanel()
+    panel.resolutions = resolutions
+
+    async def play() -> None:
+        os.write(panel.into, raw("id 7 x 0 y 0 pressure 510 major 188"))
+        await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow([panel], play, options=options))
+    (touch,) = seen[-1].touches
+    assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
+
+
+@pytest.mark.parametrize(
+    ("notices", "number", "words"),
+    [
+        ("by reading", errno.ENODEV, "lost.*plug it in"),
+        ("by polling", errno.ENODEV, "lost.*plug it in"),
+        ("at once", errno.EINVAL, "type A"),
+    ],
+)
+def test_evdev_source_ends_without_a_panel(notices: str, number: int, words: str) -> None:
+    """Within 60 ms of being unplugged, and at once for a panel without slots: EINVAL."""
+    panel = PipePanel()
+    panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
+    panel.is_gone = number if notices == "at once" else 0
+
+    async def play() -> None:
+        await asyncio.sleep(0.01)
+        panel.is_gone = number
+        if notices == "by reading":
+            os.write(panel.into, b"x")  # a device that goes becomes readable
+        await asyncio.sleep(0.05)
+
+    with pytest.raises(InputError, match=words):
+        run_virtual(follow([panel], play))
+
+
+def test_evdev_source_has_the_times_of_the_kernel() -> None:
+    """When an event happened, not when it was read; now, if it is of another clock."""
+    panel = PipePanel()
+
+    async def play() -> None:
+        start = asyncio.get_running_loop().time()
+        await asyncio.sleep(5)
+        for happened in (4.98, 6.0, 3.0):
+            os.write(panel.into, raw("id 7 x 0 y 0", at=start + happened))
+            os.write(panel.into, raw("id -1", at=start + happened))
+        await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow([panel], play))
+    assert [frame.time for frame in seen] == [0.0, 4.98, 4.98, 5.0, 5.0, 5.0, 5.0]
+
+
+def test_ioctl_request_numbers() -> None:
+    """The numbers that the kernel's header gives on x86-64 and Arm, as strace shows them."""
+    assert eviocgabs(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
+    assert eviocgmtslots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
+    assert GRAB == 0x40044590  # EVIOCGRAB
+    assert CLOCK == 0x400445A0  # EVIOCSCLOCKID
+    assert PRESSED_KEYS == 0x80604518  # EVIOCGKEY(96)
+
+
+def test_parse_events_skips_incomplete_events() -> None:
+    """Each complete event has its time, type, code and value."""
+    assert list(parse_events(raw("x -5", at=3.5) + b"\0" * 10)) == [
+        (3.5, 3, 0x35, -5),
+        (3.5, 0, 0, 0),
+    ]
+
+
+def kernel(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    width: int,
+    slots: int = 10,
+    missing: tuple[int, ...] = (),
+    grab: OSError | None = None,
+) -> None:
+    """Let the kernel report a panel with a width; missing: axes that it does not have."""
+
+    def ioctl(descriptor: int, request: int, argument: bytes | int) -> bytes:
+        if request == GRAB:
+            if grab is not None:
+                raise grab
+            return b""
+        if request == CLOCK:
+            raise OSError(errno.EINVAL, "no such clock")
+        if request == PRESSED_KEYS:
+            return bytes(41) + b"\4" + bytes(54)  # bit 0x14a
+        if isinstance(argument, bytes) and request == eviocgmtslots(len(argument)):
+            (axis,) = struct.unpack_from("i", argument)
+            return struct.pack(f"{1 + slots}i", axis, *(axis + slot for slot in range(slots)))
+        highs = {0x2F: slots - 1, 0x3A: 255, 0x30: 0} | dict.fromkeys(missing, 0)
+        axis = request - eviocgabs(0)
+        resolution = {0x35: 12, 0x3A: 3}.get(axis, 0)
+        return struct.pack("6i", axis, 0, highs.get(axis, width), 0, 0, resolution)
+
+    monkeypatch.setattr("controller.touch.evdev.fcntl.ioctl", ioctl)
+
+
+BUSY = OSError(errno.EBUSY, "Device or resource busy")
+
+
+@pytest.mark.parametrize(
+    ("path", "reported", "words"),
+    [
+        ("/dev/null", None, "evtest"),
+        ("/dev/input/event987", None, "by-id"),
+        ("/dev/null", {"width": 1000, "grab": BUSY}, "`sudo fuser -v /dev/null`"),
+        ("/dev/null", {"width": -1}, "0x35.*0 and -1"),
+        ("/dev/null", {"width": 0}, "0x0.*0 and 0.*single-touch"),
+    ],
+)
+def test_input_device_refuses_what_is_no_usable_panel(
+    monkeypatch: pytest.MonkeyPatch, path: str, reported: dict[str, Any] | None, words: str
+) -> None:
+    """Another file, a grabbed panel and an axis without width are refused, and closed."""
+    if reported is not None:
+        kernel(monkeypatch, **reported)
+    before = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(InputError, match=words):
+        InputDevice(path, grab=True)
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+@pytest.mark.parametrize("slots", [10, 1])
+def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch, slots: int) -> None:
+    """It has the ranges of its axes, and the kernel's values of all slots, of an only one, too."""
+    kernel(monkeypatch, width=1000, slots=slots)
+    device = InputDevice("/dev/null")
+    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+    assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3, 0x30: 0}
+    assert len(device.slots()) == slots
+    assert device.slots()[slots - 1] == SlotState(
+        *(axis + slots - 1 for axis in (0x39, 0x35, 0x36, 0x37, 0x3B, 0x3A, 0x30))
+    )
+    device.close()
+
+
+def test_input_device_reads_a_panel_for_a_single_finger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without multi-touch axes: ABS_X, ABS_Y, ABS_PRESSURE and BTN_TOUCH, as those of a slot."""
+    kernel(monkeypatch, width=1000, missing=(0x35, 0x36, 0x3A, 0x2F))
+    device = InputDevice("/dev/null")
+    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+    assert device.slots() == {0: SlotState(0, x=0x0, y=0x1, pressure=0x18)}
+    device.close()
+    events = [(3, 0, 250), (3, 1, 100), (3, 0x18, 9), (1, 0x14A, 1), (1, 0x14A, 0), (0, 0, 0)]
+    assert [as_slot_event((2.5, *event)) for event in events] == [
+        *((2.5, 3, 0x35, 250), (2.5, 3, 0x36, 100), (2.5, 3, 0x3A, 9)),
+        *((2.5, 3, 0x39, 0), (2.5, 3, 0x39, -1), (2.5, 0, 0, 0)),
+    ]
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
+    + [f"evdev:/dev/x?light_pressure={value}" for value in ("", "x", "-1", "nan", "inf")],
+)
+def test_evdev_source_refuses_bad_urls(url: str) -> None:
+    """The error shows the form of the URL."""
+    with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
+        open_source(url)

@@ -1,0 +1,441 @@
+"""TUIO 1.1 cursors over UDP."""
+
+import asyncio
+import logging
+import math
+import re
+import socket
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pythonosc.osc_message_builder import OscMessageBuilder
+
+from controller.touch.frames import Touch, TouchFrame
+from controller.touch.reject_counter import RejectCounter
+from controller.touch.tuio import TuioReader, TuioSource
+from examples.make_touches import tuio_datagram
+from model.errors import InputError
+from tuio_messages import bundle, cursor, frame, free_port, message
+from virtual_loop import in_virtual_time
+
+PEER = ("192.0.2.7", 50000)
+
+
+@pytest.fixture
+def reader() -> TuioReader:
+    """A reader whose log line does not matter."""
+    return TuioReader(RejectCounter(logging.getLogger("test")))
+
+
+def touches(frame: TouchFrame | None) -> list[tuple[int, float, float]]:
+    """What is on the plate, to compare."""
+    assert frame is not None
+    return [(touch.id, touch.x, touch.y) for touch in frame.touches]
+
+
+def counts(reader: TuioReader) -> dict[str, int]:
+    """What the reader has counted."""
+    return dict(reader.rejects.counts)
+
+
+def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
+    """The bytes of a bundle, written out from the OSC 1.0 and TUIO 1.1 specifications, are read."""
+
+    def element(raw: bytes) -> bytes:
+        return struct.pack(">i", len(raw)) + raw
+
+    golden = (
+        b"#bundle\0"
+        + b"\0\0\0\0\0\0\0\1"
+        + element(b"/tuio/2Dcur\0,si\0alive\0\0\0" + b"\0\0\0\x2a")
+        + element(
+            b"/tuio/2Dcur\0,sifffff\0\0\0\0set\0\0\0\0\x2a"
+            b"\x3f\x00\x00\x00\x3e\x80\x00\x00" + bytes(12)
+        )
+        + element(b"/tuio/2Dcur\0,si\0fseq\0\0\0\0\0\0\0\1")
+    )
+    result = reader.read(golden, PEER, now=5.0)
+    sender = "tuio:192.0.2.7:50000"
+    assert result == TouchFrame(sender, 5.0, (Touch(42, 0.5, 0.25),), 3.0, sender)
+
+
+def of(*parts: object, source: str = "table@a") -> bytes:
+    """A bundle of a source with these messages."""
+    return bundle(message("source", source), *parts)
+
+
+def still(*alive: int, fseq: int) -> bytes:
+    """A bundle in which these cursors are alive, and none is set."""
+    return of(message("alive", *alive), message("fseq", fseq))
+
+
+OTHER = ("127.0.0.1", 50001)
+HALF = [(1, 0.5, 0.5)]
+QUARTER = [(1, 0.25, 0.5)]
+NAMES = [(0.1, PEER, frame(source=f"s{number}"), ...) for number in range(16)]
+OTHERS = [(0.1, OTHER, frame(source=f"o{number}"), []) for number in range(8)]
+
+HERE = cursor(1, 0.5, 0.5)
+OBJECT = message("set", 3, 1, 0.5, 0.5, 0.1, address="/tuio/2Dobj")
+POINTER = message(1, 0, 0, 0.5, 0.5, 0.0, 0.0, 0.0, address="/tuio2/ptr")
+NO_OBJECTS = [message(*part, address="/tuio/2Dobj") for part in (["alive"], ["fseq", 7])]
+
+Read = tuple[float, tuple[str, int], bytes, Any]
+"""Time [s], peer, datagram, and the touches that are read: None for no frame, ... for anything."""
+
+COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
+    # One that is alive but not set again stays where it was; one not alive is gone.
+    "unchanged cursors": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), (2, 0.75, 0.5), fseq=1), ...),
+            (
+                0.01,
+                PEER,
+                of(message("alive", 1, 2), cursor(2, 0.5, 0.5), message("fseq", 2)),
+                [*QUARTER, (2, 0.5, 0.5)],
+            ),
+            (0.02, PEER, still(2, fseq=3), [(2, 0.5, 0.5)]),
+            (0.03, PEER, still(fseq=4), []),
+        ],
+    ),
+    # A reordered frame changes nothing, neither positions nor what is alive. A redundant one (-1)
+    # is never late, and does not make the next one late.
+    "late frames": (
+        {"late": 1},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=10), ...),
+            (0.01, PEER, frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), None),
+            (0.02, PEER, still(1, fseq=11), QUARTER),
+            (0.03, PEER, frame(*HALF, fseq=-1), HALF),
+            (0.04, PEER, frame((1, 0.75, 0.5), fseq=12), [(1, 0.75, 0.5)]),
+        ],
+    ),
+    # Counting from 1 again is a restart after a fall by over 100 or after a pause; all is new.
+    "restart by the number": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=5000), ...),
+            (0.001, PEER, still(1, fseq=1), []),
+            (0.001, PEER, frame(*HALF, fseq=2), HALF),
+        ],
+    ),
+    "restart after a pause": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=50), ...),
+            (0.6, PEER, still(1, fseq=1), []),
+            (0.6, PEER, frame(*HALF, fseq=2), HALF),
+        ],
+    ),
+    # They may use the same ids and numbers, behind one address or behind two.
+    "senders are kept apart": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=100, source="a"), QUARTER),
+            (0, PEER, frame(*HALF, fseq=100, source="b"), HALF),
+            (0, OTHER, frame(fseq=100, source="a"), []),
+            (0, PEER, frame((1, 0.75, 0.5), fseq=99, source="c"), [(1, 0.75, 0.5)]),
+            (0, PEER, of(message("alive", 1), message("fseq", 101), source="a"), QUARTER),
+            (0, PEER, of(message("alive", 1), message("fseq", 101), source="b"), HALF),
+        ],
+    ),
+    # The seventeenth sender is refused and counted until one has been quiet for a while.
+    "senders are bounded": (
+        {"too_many_senders": 1},
+        [
+            *((number / 100, PEER, frame(source=f"s{number}"), []) for number in range(16)),
+            (0.2, PEER, frame(source="s16"), None),
+            (0.51, PEER, frame(source="s16"), []),
+        ],
+    ),
+    # Sixteen names that are never quiet keep no other peer out; both have eight in the end.
+    "a peer with all names gives way": (
+        {"too_many_senders": ...},
+        [*[*NAMES, *OTHERS] * 3, (0.1, OTHER, frame(source="o8"), None)],
+    ),
+    # Not a number and off the sensor are the tracker's to judge, which counts them.
+    "positions are passed unchecked": (
+        {},
+        [
+            (
+                0,
+                PEER,
+                frame((1, math.nan, 0.5), (2, 1.5, -3.0)),
+                [(1, pytest.approx(math.nan, nan_ok=True), 0.5), (2, 1.5, -3.0)],
+            )
+        ],
+    ),
+    # A table without objects says so in every frame; one with some, and other protocols, count.
+    "other profiles": (
+        {"profile_2Dobj": 2, "profile_25Dcur": 1, "profile_tuio2": 1, "other_address": 1},
+        [
+            (0, PEER, bundle(*NO_OBJECTS), None),
+            (0, PEER, bundle(message("alive", 3, address="/tuio/2Dobj")), None),
+            (0, PEER, bundle(message("set", 3, 0.5, 0.5, 0.1, address="/tuio/25Dcur")), None),
+            (0, PEER, bundle(message(1, 5, address="/tuio2/frm"), POINTER), None),
+            (0, PEER, bytes(message(1, 0.5, address="/accelerometer").dgram), None),
+            (0, PEER, of(*NO_OBJECTS, OBJECT, message("alive", 1), HERE), HALF),
+        ],
+    ),
+    # The cursors of a bundle with malformed messages are read.
+    "a bundle of good and bad": (
+        {"malformed": 2},
+        [
+            (0, PEER, of(message("set", 1), message("alive", 1), HERE), HALF),
+            (0, PEER, of(message("alive", 1, "2"), cursor(1, 0.25, 0.5)), QUARTER),
+        ],
+    ),
+    # Without any alive message the cursors that a bundle sets are alive.
+    "a sender that never says what is alive": (
+        {},
+        [
+            (0, PEER, of(HERE, cursor(2, 0.75, 0.5)), [*HALF, (2, 0.75, 0.5)]),
+            (0, PEER, of(cursor(2, 0.75, 0.5)), [(2, 0.75, 0.5)]),
+            (0, PEER, still(fseq=1), []),
+            (0, PEER, of(HERE), []),
+        ],
+    ),
+    # As much as UDP carries, but no more messages than ten times as many contacts need.
+    "big bundles": (
+        {"malformed": 1},
+        [
+            (0, PEER, of(message("alive", 1), HERE, message("set", 2, *[0.5] * 12_000)), HALF),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(250))), ...),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(300))), ...),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_reader_follows_its_senders(reader: TuioReader, name: str) -> None:
+    """What is read of each datagram, and what is counted in the end."""
+    expected, datagrams = COURSES[name]
+    for time, peer, datagram, wanted in datagrams:
+        result = reader.read(datagram, peer, now=time)
+        if wanted is not ...:
+            assert (None if result is None else touches(result)) == wanted
+    found = counts(reader)
+    assert found.keys() == expected.keys()
+    assert all(count in (..., found[what]) for what, count in expected.items())
+
+
+def _raw(*sizes_and_parts: tuple[int, bytes]) -> bytes:
+    """A bundle whose element sizes are what one likes."""
+    return b"#bundle\0" + bytes(8) + b"".join(struct.pack(">i", n) + b for n, b in sizes_and_parts)
+
+
+MALFORMED = {
+    "empty": b"",
+    "noise": b"\xff\x00\x13hello",
+    "bundle without a time tag": b"#bundle\0\0",
+    "element of negative size": _raw((-4, b"")),
+    "element of size zero": _raw((0, b"")),
+    "element longer than the datagram": _raw((400, bytes(message("alive", 1).dgram))),
+    "no type tags": b"/tuio/2Dcur\0",
+    "no arguments": bytes(message().dgram),
+    "types without a value": bytes(message("alive", True).dgram),
+    "a type that is unknown": b"/tuio/2Dcur\0,sXi\0\0\0\0alive\0\0\0\0\0\0\1",
+    "a position that is text": bytes(message("set", 1, "0.5", 0.5, 0.0, 0.0, 0.0).dgram),
+    "text without an end": bytes(message("source", "abcd").dgram)[:-4],
+    "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
+    "unknown command": bytes(message("wave", 1).dgram),
+    "an id that is not whole": bytes(message("alive", 1.5).dgram),
+    "a number that is infinite": bytes(message("fseq", math.inf).dgram),
+    "too few arguments": bytes(message("set", 1, 0.5).dgram),
+}
+
+
+@pytest.mark.parametrize("datagram", MALFORMED.values(), ids=MALFORMED.keys())
+def test_reader_counts_malformed_datagrams(
+    reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each is counted and logged, none raises or changes a touch."""
+    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
+    assert reader.read(datagram, PEER, now=0) is None
+    assert counts(reader) == {"malformed": 1}
+    assert [record.name for record in caplog.records] == ["test"]
+    still = bundle(message("source", "table@a"), message("alive", 1, 2), message("fseq", 2))
+    assert touches(reader.read(still, PEER, now=0)) == [(1, 0.25, 0.5)]
+
+
+def typed(tags: str, *values: Any) -> Any:
+    """A message of cursors whose arguments have these types."""
+    builder = OscMessageBuilder("/tuio/2Dcur")
+    for tag, value in zip(tags, values, strict=True):
+        builder.add_arg(value, tag)
+    return builder.build()
+
+
+ALIVE = message("alive", 1)
+REST = (0.0, 0.0, 0.0)
+LIBERAL = {
+    "float ids": bundle(typed("sf", "alive", 1.0), typed("sfff", "set", 1.0, 0.25, 0.5)),
+    "double positions": bundle(ALIVE, typed("siddddd", "set", 1, 0.25, 0.5, *REST)),
+    "int64": bundle(typed("sh", "alive", 1), typed("shff", "set", 1, 0.25, 0.5)),
+    "further arguments": bundle(ALIVE, message("set", 1, 0.25, 0.5, *REST, 0.05, 0.06, "a")),
+    "further types": bundle(
+        ALIVE, typed("siffTFNbi", "set", 1, 0.25, 0.5, True, False, None, b"abcde", 7)
+    ),
+    "impulse, time tag and array": b"/tuio/2Dcur\0,siffI[t]\0\0\0set\0"
+    + struct.pack(">iffQ", 1, 0.25, 0.5, 1),
+    "bundles in a bundle": _raw(*[(len(frame(*QUARTER)), frame(*QUARTER))] * 2),
+    "a name in Latin-1": bundle(ALIVE, cursor(1, 0.25, 0.5))
+    + struct.pack(">i", 28)
+    + b"/tuio/2Dcur\0,ss\0source\0\0T\xfcr\0",
+    "a long name": of(ALIVE, cursor(1, 0.25, 0.5), source="x" * 4000),
+    "a time tag": frame(*QUARTER)[:8] + b"\xff" * 8 + frame(*QUARTER)[16:],
+}
+
+
+@pytest.mark.parametrize("datagram", LIBERAL.values(), ids=LIBERAL.keys())
+def test_reader_is_liberal(reader: TuioReader, datagram: bytes) -> None:
+    """Whatever its types, further arguments, name and bundles: a cursor is where it says."""
+    assert touches(reader.read(datagram, PEER, now=0)) == QUARTER
+    assert not counts(reader)
+
+
+@pytest.mark.parametrize(
+    ("sent", "seconds"),
+    [
+        # by port: one that takes another port for each datagram, another one a moment after
+        ([(1, 5, 0.0), (2, 6, 0.0), (3, 7, 0.0), (4, 5, 0.1), (3, 8, 0.1)], {4}),
+        # a program that is restarted, from another port
+        ([(1, 900, 0.0), (2, 1, 0.6), (2, 2, 0.7)], set()),
+        # two that are not numbered, or number alike, each with the next number
+        ([(1, -1, 0.0), (2, -1, 0.0), (1, -1, 0.1), (2, -1, 0.1)], {1}),
+        ([(1, 1, 0.0), (2, 2, 0.0), (1, 3, 0.1), (2, 4, 0.1)], {1}),
+    ],
+)
+def test_reader_tells_programs_of_one_name_apart(
+    reader: TuioReader, sent: list[tuple[int, int, float]], seconds: set[int]
+) -> None:
+    """By port, frame number and time [s]: those of a second program, counted once, and others."""
+    for number, (port, fseq, now) in enumerate(sent):
+        datagram = frame((port, 0.5, 0.5), fseq=fseq, source="a")
+        result = reader.read(datagram, ("192.0.2.7", port), now=now)
+        assert [id for id, _, _ in touches(result)] == [port]
+        is_second = port in seconds and number > 0
+        assert result is not None
+        assert result.source == f"tuio:192.0.2.7{f':{port}' if is_second else ''}/a"
+    assert counts(reader) == ({"same_name": 1} if seconds else {})
+
+
+def test_reader_knows_that_a_sender_is_mute(reader: TuioReader) -> None:
+    """After 10 s without anything, but not of a panel at rest.
+
+    A sender that repeats itself at rest and falls silent is mute, too.
+    """
+    assert [reader.is_mute(since=0, now=now) for now in (9.9, 10.1)] == [False, True]
+    for now in range(11, 14):
+        reader.read(frame((1, 0.5, 0.5)) if now < 13 else frame(), PEER, now=now)
+    assert not reader.is_mute(since=0, now=100)
+    for now in range(100, 120):
+        reader.read(frame(), PEER, now=now)
+    assert [reader.is_mute(since=0, now=now) for now in (128.9, 129.1)] == [False, True]
+
+
+@given(
+    st.lists(
+        st.integers(0, 9)
+        | st.binary(min_size=1, max_size=40).filter(lambda raw: not raw.startswith((b"/", b"#")))
+    )
+)
+def test_reader_reads_cursors_among_noise(parts: list[int | bytes]) -> None:
+    """Every cursor is read, and every other element is counted."""
+    raw = [each if isinstance(each, bytes) else cursor(each, 0.5, 0.5).dgram for each in parts]
+    reader = TuioReader(RejectCounter(logging.getLogger("test")))
+    result = reader.read(_raw(*((len(each), each) for each in raw)), PEER, now=0)
+    found = set() if result is None else {touch.id for touch in result.touches}
+    assert found == {each for each in parts if isinstance(each, int)}
+    noise = sum(isinstance(each, bytes) for each in parts)
+    assert counts(reader) == ({"malformed": noise} if noise else {})
+
+
+@given(st.binary(max_size=200), st.integers(0, 300))
+def test_reader_never_raises(noise: bytes, cut: int) -> None:
+    """Any bytes are read or counted, alone or within a valid bundle."""
+    reader = TuioReader(RejectCounter(logging.getLogger("test")))
+    good = frame((1, 0.25, 0.5), fseq=1)
+    for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
+        reader.read(datagram, PEER, now=0)
+
+
+@given(
+    st.dictionaries(
+        st.integers(-(2**31), 2**31 - 1),
+        st.tuples(st.floats(0, 1, width=32), st.floats(0, 1, width=32)),
+        max_size=10,
+    )
+)
+def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> None:
+    """What tuio_datagram writes, the reader reads: ids and positions of single precision."""
+    wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
+    datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
+    result = TuioReader(RejectCounter(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
+    assert result is not None
+    assert (result.source, result.time, result.touches) == ("tuio:192.0.2.7/table@a", 2.0, wanted)
+
+
+@in_virtual_time
+async def test_tuio_source_delivers_over_udp() -> None:
+    """A datagram to the bound port becomes a frame at the loop's time."""
+    source = TuioSource(f"tuio:127.0.0.1:{free_port()}")
+    delivered: asyncio.Queue[TouchFrame] = asyncio.Queue()
+    running = asyncio.create_task(source.run(delivered.put_nowait))
+    await asyncio.sleep(0.1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"noise", ("127.0.0.1", source.port))
+        sender.sendto(frame((1, 0.25, 0.5)), ("127.0.0.1", source.port))
+        received = await delivered.get()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert source.rejects.counts == {"malformed": 1}
+    assert received.time == pytest.approx(asyncio.get_running_loop().time(), abs=0.01)
+    assert touches(received) == [(1, 0.25, 0.5)]
+
+
+@in_virtual_time
+async def test_tuio_source_reports_a_taken_port() -> None:
+    """The error names the port and what to do."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
+            await TuioSource(f"tuio:127.0.0.1:{port}").run(lambda frame: None)
+
+
+@pytest.mark.parametrize(
+    ("url", "host", "port"),
+    [
+        ("tuio:", "127.0.0.1", 3333),
+        ("tuio:4000", "127.0.0.1", 4000),
+        ("tuio:192.0.2.1:4000", "192.0.2.1", 4000),
+        ("tuio:[::1]:4000?timeout=0.5", "::1", 4000),
+    ],
+)
+def test_tuio_source_defaults_of_urls(url: str, host: str, port: int) -> None:
+    """A URL without host or port means the loopback and the registered port."""
+    source = TuioSource(url)
+    assert (source.host, source.port) == (host, port)
+
+
+@pytest.mark.parametrize(
+    ("url", "remedy"),
+    [
+        *((url, "tuio:127.0.0.1:3333") for url in ("tuio:host", "tuio:host:65536", "udp:1:2")),
+        *(
+            (f"tuio:{options}", "timeout=SECONDS from 0.15 to 60")
+            for options in ("?timeout=0.1", "?timeout=61", "?timeout=nan", "?timeout=3&a=b", "?a")
+        ),
+    ],
+)
+def test_tuio_source_refuses_bad_urls(url: str, remedy: str) -> None:
+    """A missing port, a timeout out of range and other options are refused with an example."""
+    with pytest.raises(InputError, match=re.escape(remedy)):
+        TuioSource(url)

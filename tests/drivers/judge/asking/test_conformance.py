@@ -1,0 +1,576 @@
+"""Conformance of protocol 3: sound amplifiers pass on every wire, and no verdict is missing."""
+
+import asyncio
+import math
+import os
+import pty
+import random
+import re
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+import era_haptics
+from drivers.errors import CommandError
+from drivers.judge.asking import CHECKS, Result, judge, of_kind
+from drivers.judge.asking.check import Check, CheckResult, Report, run_checks
+from drivers.judge.asking.client import Violation, When
+from drivers.judge.asking.judge import Judge
+from drivers.judge.asking.material import layer
+from drivers.judge.asking.sent import in_words
+from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers
+from drivers.protocol.table import MESSAGES
+from drivers.trace import tracing
+from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.modbus.frames import framed
+from drivers.wires.serial_line.frames import FrameReader, encode_frame
+from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
+from long_form import shortly
+from model.rig.rig import Rig
+from registry import clock
+from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import capabilities
+from sim.bench.bench import Bench, keep_time
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from virtual_loop import VirtualLoop, in_virtual_time
+
+SKIPPED = {
+    "serial": {"sensors", "steps_as_stated", "limited", "readings"},
+    "can": {"sensors", "steps_as_stated", "limited", "readings"},
+    "rtu": {"sensors", "steps_as_stated", "limited", "readings", "events"},
+    "tcp": {"sensors", "steps_as_stated", "limited", "readings", "events"},
+}
+MINUTE = 60.0
+PAGES = Path(era_haptics.__file__).parents[1] / "docs" / "reference"
+
+
+def headings(page: Path) -> set[str]:
+    """Anchors of the headings of a page."""
+    lines = page.read_text("utf-8").splitlines()
+    titles = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
+    return {re.sub(r"[^a-z0-9 -]", "", title).replace(" ", "-") for title in titles}
+
+
+def expect_passed(results: list[CheckResult], skipped: set[str], *, within: float = MINUTE) -> None:
+    """Require that all have passed but those that are skipped, within a minute or another time."""
+    failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
+    assert not failed, failed[0]
+    assert {each.check.name for each in results if each.result == "skipped"} == skipped
+    assert {each.attempts for each in results} == {1}
+    assert sum(each.seconds for each in results) < within
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulated_amplifier_passes(kind: str) -> None:
+    """Every check of its wire; nothing is skipped but what it has not."""
+    results = judged(kind)
+    assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
+    expect_passed(results, SKIPPED[kind])
+
+
+def test_amplifier_with_the_whole_table_passes_loud() -> None:
+    """At 0.9 of full level, where a sum of layers is limited."""
+    results = judged("serial", level=0.9, far=plain())
+    expect_passed(results, SKIPPED["serial"] - {"limited"})
+
+
+@in_virtual_time
+async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
+    """Those at the feet of a rig's actuators, which read what plays."""
+    bench = Bench(coarse_rig, now=clock.now())
+    (far,) = bench.amplifiers.values()
+    assert isinstance(far, Amplifier)
+    running = asyncio.ensure_future(keep_time(bench))
+    results = await results_of("serial", far, ["sensors", "readings"])
+    running.cancel()
+    expect_passed(results, set())
+
+
+class _Coarse(Amplifier):
+    """An amplifier that keeps its own steps, of frequency from its lowest one on, and says so."""
+
+    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+        played = [replace(one, commands=tuple(map(self._rounded, one.commands))) for one in layers]
+        super()._play(played, token, now)
+
+    def _rounded(self, tone: Command) -> Command:
+        if not tone.level:
+            return tone
+        can, limits = self.capabilities, self.capabilities["limits"][tone.channel]
+        lowest, highest = limits["frequency_min"], limits["frequency_max"]
+        step = can["frequency_step"]
+        steps = min(round((tone.frequency - lowest) / step), (highest - lowest) // step)
+        phase = can["phase_step"] * round(tone.phase / can["phase_step"])
+        return replace(
+            tone,
+            frequency=lowest + steps * step,
+            level=can["level_step"] * round(tone.level / can["level_step"]),
+            phase=(phase + 18_000) % 36_000 - 18_000,
+        )
+
+    def _take(self, part: Values, now: float) -> Values:
+        return {**super()._take(part, now), "exact": 0}
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        {"frequency_step": 20, "level_step": 5},
+        {"level_step": 40},
+        {"frequency_step": 7},
+        {"frequency_step": 30, "phase_step": 300},
+        {"frequency_step": 60, "phase_step": 18_000},
+        {"frequency_step": 65_535, "phase_step": 77},
+    ],
+)
+def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> None:
+    """Those that it states: 1 Hz, thousandths or even 0.4 % of full level, half a circle."""
+    far = _Coarse("coarse", channels=2)
+    far.capabilities.update(steps)
+    expect_passed(judged("serial", far=far), SKIPPED["serial"] - {"steps_as_stated"})
+
+
+@pytest.mark.parametrize("knots", [0, 1])
+def test_amplifier_with_the_least_of_all_passes(knots: int) -> None:
+    """One channel and watchdog time, short ramps, and what of its sets such an amplifier has."""
+    far = Amplifier("least", channels=1)
+    least = {"knots": knots, "ramp_max": 1, "set_words": 512, "layers": 4, "voices": 8}
+    times = {"watchdog_min": 500, "watchdog_max": 500, "envelope_step_min": 1000}
+    far.capabilities.update(least | times)
+    far.restart(0.0)
+    short = {"silence_never_later", "stop_ends_all", "clear_too_early", "voices"}
+    shaped = {"after", "onsets", "endings", "endings_amid", "extreme_envelopes"}
+    skipped = SKIPPED["serial"] | short | (set() if knots else shaped)
+    expect_passed(judged("serial", far=far), skipped)
+
+
+def test_level_below_a_step_is_refused() -> None:
+    """An amplifier that has full level alone cannot be driven at a fifth of it."""
+    far = _Coarse("coarse", channels=2)
+    far.capabilities.update(level_step=10_000)
+    with pytest.raises(CommandError, match="at least 1"):
+        judged("serial", ["stop"], far=far)
+
+
+class _PlaysOn(Amplifier):
+    """An amplifier that plays on after Stop."""
+
+    def _silence(self, moment: float, *, ramp: float) -> None:
+        if self.state != "OPERATION_ENABLED":
+            super()._silence(moment, ramp=ramp)
+
+
+def test_nothing_is_run_after_one_that_is_not_silenced() -> None:
+    """The verdict comes within seconds: the checks that follow would drive it."""
+    results = judged("serial", far=_PlaysOn("loud", channels=2))
+    at = [each.result for each in results].index(Result.NOT_RUN)
+    assert results[at - 1].result is Result.FAILED
+    assert {each.result for each in results[at:]} == {Result.NOT_RUN}
+    assert all(results[at - 1].check.name in each.reason for each in results[at:])
+    assert sum(each.seconds for each in results) < 10
+
+
+def test_mute_amplifier_fails() -> None:
+    """The first check says so, and no other is run."""
+    far = plain()
+    far.is_answering = False
+    result, *others = judged("serial", far=far)
+    assert (result.result, result.seen) == (Result.FAILED, "reply to message 1: none within 0.5 s")
+    assert {each.result for each in others} == {Result.NOT_RUN}
+
+
+def _stall(duration: float) -> None:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.now += duration
+
+
+async def _stalled(stalls: list[float], subject: Subject) -> None:
+    """Drive it amid a stall of this program."""
+    await subject.arm()
+    await subject.play(layer(0, subject.tone(), ramp=100))
+    if stalls:
+        _stall(stalls.pop())
+    await subject.follow(0.12)
+
+
+def _tried(stalls: list[float]) -> Check:
+    return Check("stalled", "passes", "", drives=True, kinds=(), run=partial(_stalled, stalls))
+
+
+@in_virtual_time
+async def test_check_is_made_again_where_this_program_was_late() -> None:
+    """Its third attempt, undisturbed, passes: a stall is no fault of the amplifier."""
+    line = JudgedLine("serial", varied())
+    (result,) = await run_checks([(1, _tried([0.11, 1.45]))], line.client, level=0.2)
+    line.close()
+    assert (result.result, result.attempts) == (Result.PASSED, 3)
+
+
+@in_virtual_time
+async def test_machine_that_is_always_late_has_no_verdict() -> None:
+    """It is no failure of the amplifier, and not passed; what follows is checked."""
+    line = JudgedLine("serial", varied())
+    late, good = await run_checks(
+        [(1, _tried([0.11] * 20)), (2, _tried([]))], line.client, level=0.2
+    )
+    line.close()
+    assert (late.result, late.has_verdict, good.result) == ("skipped", False, "passed")
+    assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
+
+
+SLOW = {
+    "serial": [
+        *("lengths", "trips_amid_other_requests", "parts_of_sets", "sets_expire", "valid_for"),
+        *("renew", "after", "endings_amid", "doubled_frames", "tolerated_frames"),
+    ],
+    "tcp": ["pieces", "lengths", "watchdog_ranges", "arms_again", "watchdog_unread", "renew"],
+    "can": ["watchdog_ranges", "network_management"],
+}
+
+
+@pytest.mark.parametrize("kind", SLOW)
+def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 ms each way and back: times are long against it, and what comes late is heard."""
+    monkeypatch.setattr("judged_line.DELAY", 0.02)
+    for found in judged(kind, SLOW[kind]):
+        assert (found.result, found.attempts) == (Result.PASSED, 1), found
+
+
+READ_ALONE = {MESSAGES[name].number for name in ("GetStatus", "GetCaps", "GetFaults")}
+
+
+def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
+    """Let the amplifier of a serial line reply late [s] to all but what is only read."""
+    send = JudgedLine._send
+
+    def late(line: JudgedLine, data: bytes) -> None:
+        (frame,) = FrameReader().feed(data)
+        is_late = frame.type & 0x7F not in READ_ALONE
+        asyncio.get_running_loop().call_later(is_late * delay, send, line, data)
+
+    monkeypatch.setattr(JudgedLine, "_send", late)
+
+
+class _LongWatchdog(Amplifier):
+    """An amplifier that takes a watchdog shorter than 120 ms as one of 1.5 s."""
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        if name == "Arm" and values["watchdog"] < 120:
+            values = {**values, "watchdog": 1500}
+        return super().handle(name, values, now)
+
+
+def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One of 100 ms beside replies that take 12 ms: as stated it passes, else it fails."""
+    obey_late(monkeypatch, 0.012)
+    found = []
+    for kind in (Amplifier, _LongWatchdog):
+        far = kind("short", channels=2)
+        far.capabilities.update(watchdog_min=100)
+        found += judged("serial", ["watchdog_ranges"], far=far)
+    assert [each.result for each in found] == ["passed", "failed"], found
+    assert "watchdog" in found[1].seen
+
+
+def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 25 ms: what is only read, at once, is in time; the rest is not, with its time."""
+    obey_late(monkeypatch, 0.025)
+    read, obeyed = judged("serial", ["replies_in_time", "obeys_in_time"])
+    assert (read.result, obeyed.result) == ("passed", "failed"), obeyed.reason
+    assert float(obeyed.seen.split(": ")[1]) == pytest.approx(25, abs=0.5)  # ms
+
+
+TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "phases", "voices"]
+"""Checks that need this machine, and replies, in time."""
+
+
+@pytest.mark.parametrize("names", shortly([[], TIMED], [TIMED]))
+@pytest.mark.parametrize("kind", ["serial", "tcp"])
+def test_amplifier_that_replies_just_in_time_passes(
+    kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After 9 ms, where 10 are allowed: every check has its verdict."""
+    monkeypatch.setattr("judged_line.DELAY", 0.0045)
+    expect_passed(judged(kind, names), set() if names else SKIPPED[kind], within=1.5 * MINUTE)
+
+
+def test_request_that_comes_after_an_onset_is_no_violation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first question what is achieved takes 300 ms, until the set that waited plays."""
+    delays, write = [0.3], JudgedLine.write
+
+    def late(line: JudgedLine, data: bytes) -> None:
+        (frame,) = FrameReader().feed(data)
+        if frame.type == MESSAGES["GetAchieved"].number and delays:
+            asyncio.get_running_loop().call_later(delays.pop(), write, line, data)
+        else:
+            write(line, data)
+
+    monkeypatch.setattr(JudgedLine, "write", late)
+    (result,) = judged("serial", ["after"])
+    assert (result.result, delays) == (Result.PASSED, []), result.reason
+
+
+async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
+    """Those that only read; the keys of the report are a contract, and all frames are traced."""
+    far, near = pty.openpty()
+    loop = asyncio.get_running_loop()
+    end = SerialAmplifiers({1: plain()}, lambda data: _written(far, data))
+    loop.add_reader(far, lambda: end.receive(os.read(far, 4096), clock.now()))
+    url = f"serial://{os.ttyname(near)}"
+    with tracing(tmp_path / "trace"):
+        report = await judge(url, drives=False)
+    lines = (tmp_path / "trace").read_text().splitlines()
+    assert {">", "<"} <= {word for line in lines for word in line.split()}
+    loop.remove_reader(far)
+    os.close(far)
+    os.close(near)
+    shown = report.to_json()
+    assert (shown["overall"], shown["failed"], shown["level"]) == ("incomplete", 0, 0.0)
+    assert list(shown) == [
+        *("url", "overall", "level", "passed", "failed", "skipped", "not_run", "seconds"),
+        "checks",
+    ]
+    assert list(shown["checks"][0]) == [
+        *("number", "name", "requirement", "place", "result", "reason", "seen", "expected"),
+        *("seconds", "attempts", "sent", "came"),
+    ]
+    assert shown["not_run"] == sum(check.drives for _, check in of_kind("serial"))
+
+
+def _written(far: int, data: bytes) -> None:
+    os.write(far, data)
+
+
+def test_report_says_the_worst() -> None:
+    """One that failed makes all fail; a violation says what must be, and what was seen."""
+    found = Violation("latch", expected=3, seen=4)
+    assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
+    bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found.seen, found.expected)
+    good = CheckResult(CHECKS[1], 2, Result.PASSED)
+    assert Report("x", 0.2, (bad, good), 0).overall == "failed"
+    assert Report("x", 0.2, (good,), 1).overall == "incomplete"
+    report = Report("x", 0.2, (good,), 0)
+    assert (report.overall, report.to_json()["passed"]) == ("passed", 1)
+    assert "driven at up to 20%" in report.summary
+
+
+def test_every_check_says_what_it_requires() -> None:
+    """Once, in a sentence, beside the place of the rule."""
+    names = [check.name for check in CHECKS]
+    assert len({*names}) == len(names)
+    assert all(check.requirement for check in CHECKS)
+    for place in {check.place for check in CHECKS}:
+        page, heading = place.split("#")
+        assert heading in headings(PAGES / page), place
+
+
+def test_page_counts_all_checks_of_a_serial_line() -> None:
+    """Of the firmware, where nothing fails."""
+    page = (PAGES.parent / "how-to" / "write-an-amplifier.md").read_text("utf-8")
+    (counts,) = re.findall(r"^(\d+) passed, 0 failed, (\d+) skipped", page, re.MULTILINE)
+    assert sum(map(int, counts)) == len(of_kind("serial"))
+
+
+RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
+"""To half of full level along 100 ms."""
+
+
+OFF = {
+    **{"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0},
+    **{"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8},
+}
+ARMED = {**OFF, "state": 4, "flags": 1}
+
+
+def armed(watchdog: int) -> Judge:
+    """Return the judge of an amplifier that is armed at 0 s with a watchdog [ms]."""
+    start = When(0.0, 0.0)
+    judge = Judge(capabilities(4), OFF, start)
+    judge.granted("Arm", {"session": 1, "watchdog": watchdog}, {}, start)
+    return judge
+
+
+@pytest.mark.parametrize("age", [70, 20, 85])
+def test_fault_may_come_while_a_status_is_on_its_way(age: int) -> None:
+    """It was asked for at 0.09 s and came at 0.105 s, amid which the watchdog of 0.1 s tripped."""
+    judge = armed(100)
+    judge.check({**ARMED, "watchdog_left": 5}, When(0.09, 0.105))
+    judge.check({**OFF, "state": 7, "fault": 1, "latch": 8}, When(0.105, 0.106))
+    faults = {"faults": [{"fault": 1, "channel": 255, "age": age}]}
+    with nullcontext() if age == 70 else pytest.raises(Violation, match="listed faults"):
+        judge.granted("GetFaults", {}, faults, When(0.17, 0.17))
+
+
+PART = {"token": 1, "now": 1, "index": 0, "parts": 1, "missing": 0, "exact": 1}
+
+
+def expected_by(moment: float, level: float) -> None:
+    """Compare a status that is read a time [s] after such a set was played with what is expected.
+
+    Raises Violation.
+    """
+    start, when = When(0.0, 0.0), When(moment, moment)
+    judge = armed(1000)
+    judge.sets.sent({**PART, "stream": pack_layers([RISE])}, 0.0)
+    judge.granted("Set", {**PART, "session": 1}, {**PART, "staged": 0, "played": 1}, start)
+    left = {"watchdog_left": round(1000 - 1000 * moment), "token": 1}
+    played = {"levels": [round(10_000 * level), 0, 0, 0], "tokens": [1, *[0] * 7]}
+    judge.check({**ARMED, **left, **played}, when)
+
+
+# A raised cosine has risen by (1 - cos 45 degrees)/2 after a quarter, by half after half.
+@pytest.mark.parametrize(("moment", "level"), [(0.025, 0.07322), (0.05, 0.25), (0.15, 0.5)])
+def test_levels_are_those_of_the_page(moment: float, level: float) -> None:
+    """By hand: a set may begin 2 ms late and no more, and a step of rounding is no violation."""
+    expected_by(moment, level)
+    expected_by(moment, level + 0.001)
+    late = 0.25 * (1 - math.cos(math.pi * (moment - 0.0018) / 0.1)) if moment < 0.1 else level
+    expected_by(moment, late)
+    for wrong in (0.02, -0.03):
+        with pytest.raises(Violation, match="level of channel 0"):
+            expected_by(moment, level + wrong)
+
+
+# What goes wrong
+
+
+def altered_reply(
+    monkeypatch: pytest.MonkeyPatch, at: int, alter: Callable[[bytes], bytes]
+) -> None:
+    """Let the amplifiers of lines send something else in place of their reply with a number."""
+    send, count = JudgedLine._send, iter(range(10_000_000))
+
+    def sent(line: JudgedLine, data: bytes) -> None:
+        send(line, alter(data) if next(count) == at else data)
+
+    monkeypatch.setattr(JudgedLine, "_send", sent)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_malformed_reply_fails_one_check_with_its_bytes(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tenth is cut in its middle, and its last byte is wrong; what follows passes."""
+    bad: list[bytes] = []
+
+    def alter(data: bytes) -> bytes:
+        middle = len(data) // 22 * 11  # a whole frame of CAN
+        bad.append(data[:middle] if kind == "can" else data[:middle] + b"\x55\0")
+        return bad[0]
+
+    altered_reply(monkeypatch, 10, alter)
+    names = ["identity", "capabilities", "starts_disarmed", "replies_in_time", "stop"]
+    results = judged(kind, names)
+    (failed,) = (each for each in results if each.result == "failed")
+    shown = b"".join(each.data for each in unpack_frames(bad[0])) if kind == "can" else bad[0]
+    assert shown.hex(" ") in failed.came
+    assert [each.result for each in results].count(Result.PASSED) == len(names) - 1, results
+
+
+def test_failure_shows_the_set_that_was_sent() -> None:
+    """The first set of the page, in words and as its words; levels are a tenth too low."""
+    words = [0x2A17, 0x0102, 0x0002, 0x0004, 0x0014, 0x01F4]
+    words += [0x0008, 0x0898, 0x07D0, 0x0000, 0x0018, 0x0898, 0x044C, 0xDCD8]
+    words += [0x0028, 0x0898, 0x0258, 0x34BC, 0x0038, 0x0898, 0x0190, 0x0802]
+    shown = in_words([words])
+    assert shown.startswith("set 258, staged; layer 0, ramp 20 ms, valid for 500 ms: channel 0 ")
+    assert "channel 0 110 Hz 0.2 at 0 degrees keep_phase, channel 1 110 Hz 0.11 at -90" in shown
+    assert shown.endswith(
+        "= 2A17 0102 0002 0004 0014 01F4 0008 0898 07D0 0000 0018 0898 044C "
+        "DCD8 0028 0898 0258 34BC 0038 0898 0190 0802"
+    )
+    (result,) = judged("serial", ["stop"], far=_PlaysOn("loud", channels=2))
+    assert result.sent.startswith("set 2, staged; layer 0, ramp 0 ms, valid for 0 ms: channel 0 ")
+
+
+def test_one_bad_capability_is_one_failure() -> None:
+    """What needs steps of envelopes is not run and says why; all else has its verdict."""
+    far = varied()
+    far.capabilities.update(envelope_step_min=900)
+    names = ["capabilities", "replies_in_time", "stop", "watchdog", "onsets", "endings", "voices"]
+    results = {each.check.name: each for each in judged("serial", names, far=far)}
+    failed = [name for name, each in results.items() if each.result == "failed"]
+    assert failed == ["capabilities"]
+    assert "900" in results["capabilities"].expected
+    not_run = {name for name, each in results.items() if each.result == "not_run"}
+    assert not_run == {"onsets", "endings", "voices"}
+    assert all("envelope_step_max" in results[name].reason for name in not_run)
+
+
+def test_failed_reading_does_not_bar_what_drives() -> None:
+    """An amplifier without a vendor's name: one failure, and the rest passes."""
+    far = varied()
+    far.identity["vendor"] = ""
+    results = judged("serial", ["identity", "stop", "watchdog"], far=far)
+    assert [each.result for each in results] == ["failed", "passed", "passed"]
+
+
+def garbled(kind: str, rng: random.Random, data: bytes) -> bytes:
+    """Return other bytes, on CAN frames with other data, or frames that are sound but nonsense."""
+    match kind, rng.random() < 0.5:
+        case "can", is_sound:
+            kept = 4 if is_sound else 0
+            frames = [
+                frame._replace(
+                    data=frame.data[:kept] + rng.randbytes(max(len(frame.data) - kept, 0))
+                )
+                for frame in unpack_frames(data)
+            ]
+            return pack_frames(frames)
+        case "serial", True:
+            (frame,) = FrameReader().feed(data)
+            return encode_frame(frame._replace(payload=rng.randbytes(rng.randrange(100))))
+        case (("rtu" | "tcp"), True):
+            head = data[:2] if kind == "rtu" else data[:8]
+            pdu = head[-1:] + rng.randbytes(rng.randrange(60))
+            return framed(head[-2], pdu, int.from_bytes(data[:2]), is_rtu=kind == "rtu")
+    return rng.randbytes(rng.randrange(300))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", shortly([0.003, 0.03, 0.3, 1.0], [0.3]))
+def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of a share of all replies: every check has a result, and the whole has failed."""
+    rng, send = random.Random(5), JudgedLine._send
+
+    def sent(line: JudgedLine, data: bytes) -> None:
+        send(line, garbled(kind, rng, data) if rng.random() < share else data)
+
+    monkeypatch.setattr(JudgedLine, "_send", sent)
+    results = judged(kind)
+    assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
+    assert Report("x", 0.2, tuple(results), 0).overall == "failed"
+    assert sum(each.seconds for each in results) < 2 * MINUTE
+    if share < 0.1:
+        assert [each.result for each in results].count(Result.PASSED) > 10
+
+
+@pytest.mark.parametrize("names", shortly([[], TIMED], [TIMED]))
+@in_virtual_time
+async def test_busy_machine_has_its_verdicts(names: list[str]) -> None:
+    """It stands still every 80 ms on the average, for 30 ms: nothing fails, all has a verdict."""
+    rng, results = random.Random(2), list[CheckResult]()
+
+    async def stand_still() -> None:
+        while True:
+            await asyncio.sleep(rng.expovariate(1 / 0.08))
+            _stall(0.03)
+
+    stalling = asyncio.ensure_future(stand_still())
+    results += await results_of("serial", varied(), names)
+    stalling.cancel()
+    bad = [(each.check.name, each.reason) for each in results if each.result == "failed"]
+    assert not bad
+    assert [each.check.name for each in results if not each.has_verdict] == []
+    assert sum(each.seconds for each in results) < 2 * MINUTE

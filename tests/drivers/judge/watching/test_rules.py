@@ -1,0 +1,225 @@
+"""Rules of the witness: each violation is found; correct traffic and own delays are none."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import amplifier_violations
+import hand_written as hand
+import host_violations
+from drivers.judge.watching.capture import read_capture
+from drivers.judge.watching.witness import Witness
+from hand_written_talk import HALF, Talk
+
+BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
+FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "witness.md"
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_witness_finds_a_broken_rule(name: str) -> None:
+    """The conversation breaks one rule, and no other."""
+    rule, talk = BROKEN[name]
+    assert {*talk().found} == {rule}
+
+
+def test_every_rule_of_the_page_is_found_broken() -> None:
+    """By a conversation of its own."""
+    rules = PAGE.read_text(encoding="utf-8").partition("## The rules")[2].partition("## In tests")
+    listed = set(re.findall(r"^\| (\w+) \|", rules[0], flags=re.M)) - {"name"}
+    assert {rule for rule, _ in BROKEN.values()} == listed
+
+
+@pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])
+def test_request_may_have_waited_in_a_transport(after: float, broken: list[str]) -> None:
+    """A host gives a request up 30 ms after it wrote it, of which its bytes waited for 2 ms."""
+    talk = Talk().armed()
+    talk.sends(hand.SET, hand.part(5, hand.layer(0)))
+    talk.rest(after).sends(hand.GET_STATUS)
+    talk.sequence -= 1
+    talk.rest(0.0005).replies(hand.SET, hand.taken(5))
+    talk.sequence += 1
+    talk.replies(hand.GET_STATUS, hand.status())
+    assert talk.found == broken
+
+
+@pytest.mark.parametrize(("left", "broken"), [(240, []), (231, []), (225, ["watchdog"])])
+def test_watchdog_left_is_as_a_host_allows(left: int, broken: list[str]) -> None:
+    """Within 11 ms, as the page says; 9 ms after Arm 241 ms are left."""
+    talk = Talk().armed().rest(0.008).says(kind=hand.GET_STATUS, left=left)
+    assert talk.found == broken
+
+
+@pytest.mark.parametrize(("delay", "broken"), [(0.0, ["answer"]), (0.1, [])])
+def test_reply_is_not_late_by_the_delay_of_the_witness(delay: float, broken: list[str]) -> None:
+    """It is seen 100 ms after its request, of which this program did not run for that long."""
+    talk = Talk().armed()
+    talk.sends(hand.GET_STATUS)
+    talk.rest(0.1)
+    if delay:
+        talk.witness.delayed(talk.time, delay)
+    talk.replies(hand.GET_STATUS, hand.status(left=199))
+    assert talk.found == broken
+
+
+def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
+    """The older set was accepted before the newer one, as the number of its request shows."""
+    late = Talk().armed().playing().told("faults", "a", are_on=True)
+    late.sends(hand.SET, hand.part(6, hand.layer(0, hand.tone(0, 100, 0.3))))
+    number = late.sequence
+    late.rest(0.04).staged(7, hand.layer(0)).committed(7, tokens=(0, 0, 0, 0), levels=(5000, 0))
+    late.numbered(number).replies(hand.SET, hand.taken(6))
+    assert late.found == []
+
+
+@pytest.mark.parametrize(("kind", "latch"), [(hand.STOP, 2), (hand.DISARM, 1)])
+def test_watchdog_may_be_sooner_than_what_is_on_its_way(kind: int, latch: int) -> None:
+    """It expires 250 ms after Arm, in the 4 ms that the request and its reply take."""
+    talk = Talk().armed().rest(0.246).sends(kind, (5,)).rest(0.004)
+    talk.replies(kind, hand.status(hand.FAULT, fault=hand.WATCHDOG, latch=latch))
+    assert talk.found == []
+
+
+@pytest.mark.parametrize(("kind", "latch"), [(hand.STOP, 2), (hand.DISARM, 1)])
+def test_watchdog_of_unknown_time_may_be_sooner_than_what_is_on_its_way(
+    kind: int, latch: int
+) -> None:
+    """Its Arm was not heard: half of the fade of 5 ms is left as it is told to fall silent."""
+    talk = Talk().identified(hand.ENABLED)
+    talk.exchange(hand.SILENCE, (9, 5), hand.status()).rest(0.02).playing()
+    talk.rest(0.2).sends(kind, (5,)).rest(0.0005)
+    fading: dict[str, Any] = {"fault": hand.WATCHDOG, "latch": latch, "token": 5}
+    talk.replies(kind, hand.status(hand.REACTING, levels=(2500, 0), **fading))
+    assert talk.found == []
+
+
+def test_loop_that_stalls_between_two_commits_sends_the_second_no_more() -> None:
+    """One amplifier plays alone until watchdogs expire, since nothing can be sent."""
+    talk = Talk(names=("m", "n")).armed().armed(address=2)
+    talk.staged(5, amplifier_violations.LOUD)
+    talk.staged(5, amplifier_violations.LOUD, address=2)
+    talk.committed(5, tokens=(5, 0, 0, 0)).told("set_stalled").rest(0.03)
+    assert talk.found == []
+
+
+def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
+    """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
+    talk = Talk().armed().rest(0.4)
+    talk.says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.ARC, latch=1)
+    talk.exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 300))
+    assert talk.found == []
+
+
+def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
+    """An amplifier that was silent under the finger has nothing to end in time."""
+    idle = Talk().armed().told("contacts", [1]).rest(0.01).told("contacts", []).rest(0.01)
+    idle.exchange(hand.DISARM, (100,), hand.status(hand.SWITCHED_ON))
+    assert idle.found == []
+
+
+def test_arm_may_be_withdrawn_before_its_reply() -> None:
+    """It was carried out, so that the set committed last is none."""
+    talk = Talk().armed().playing()
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **FADING)).rest(0.01)
+    talk.sends(hand.ARM, (8, 250))
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, token=0))
+    assert "token" not in talk.found
+
+
+def test_status_behind_a_broadcast_may_precede_a_stop() -> None:
+    """It was written with it, and on Modbus RTU each frame waits for the silence before it."""
+    talk = Talk().armed().playing().told("operator_command", "stop").rest(0.005)
+    playing: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
+    talk.says(kind=hand.GET_STATUS, left=213, tokens=(5, 0, 0, 0), **playing)
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, **playing))
+    assert talk.found == []
+
+
+@pytest.mark.parametrize("later", [0.0, 0.003])
+def test_stop_is_not_awaited_again_while_its_reply_is(later: float) -> None:
+    """The host had begun to stop by itself, of which its operator's stop takes part."""
+    talk = Talk().armed().playing().sends(hand.STOP, (5,))
+    talk.rest(later).told("operator_command", "stop")
+    talk.rest(0.028).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, token=5))
+    assert talk.found == []
+
+
+def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None:
+    """A broadcast for another amplifier of the line reaches it too."""
+    talk = Talk().armed()
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    talk.sends(hand.STOP, (5,), address=0)
+    assert talk.rest(0.3).found == []
+
+
+@pytest.mark.parametrize(("latch", "broken"), [(0, False), (1, True)])
+def test_stop_is_over_where_the_amplifier_has_restarted(latch: int, broken: bool) -> None:
+    """It has latched nothing since, and is armed; one that merely unlatched by itself is not."""
+    talk = Talk().armed()
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    talk.says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=latch)
+    talk.exchange(hand.ARM, (10, 250), hand.status(latch=latch))
+    assert ("stop" in talk.found) is broken
+
+
+@pytest.mark.parametrize(
+    ("state", "broken"), [(hand.SWITCHED_OFF, []), (hand.STOPPED, ["latched", "stop"])]
+)
+def test_stop_that_was_not_heard_is_over_for_a_host_that_opens_the_wire_again(
+    state: int, broken: list[str]
+) -> None:
+    """It was lost on a disturbed wire; one that was heard shows, and must be cleared."""
+    talk = Talk().armed().told("faults", "a", are_on=True)
+    talk.sends(hand.STOP, (5,)).rest(0.3).told("faults", "a", are_on=False)
+    talk.told_of("closed").rest(0.6).told_of("opened").identified(state, latch=1)
+    talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
+    assert sorted({*talk.found}) == broken
+
+
+@pytest.mark.parametrize(("before", "broken"), [(0.06, ["answer"]), (0.0, ["credit"])])
+def test_status_of_an_amplifier_that_is_mute_gives_way(before: float, broken: list[str]) -> None:
+    """What is mute has left a request without a reply; of another one the reply is awaited."""
+    talk = Talk().armed()
+    if before:
+        talk.sends(hand.GET_STATUS).rest(before)
+    talk.sends(hand.GET_STATUS).rest(0.005).says()
+    assert talk.found == broken
+
+
+@pytest.mark.parametrize("to", [1, 0])
+def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
+    """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""
+    talk = Talk().identified()
+    words = (3, 1, 0x3700)
+    if to:
+        talk.exchange(hand.SET_ADDRESS, words, hand.status(hand.SWITCHED_OFF))
+    else:
+        talk.sends(hand.SET_ADDRESS, words, address=0)
+    talk.exchange(hand.GET_STATUS, (), hand.status(hand.SWITCHED_OFF, limited=True), address=3)
+    talk.sends(hand.GET_STATUS, address=3)
+    assert talk.rest(0.04).found == ["plays", "answer"]
+
+
+def test_ramp_of_a_stop_is_clipped() -> None:
+    """65.535 s are those 1000 ms that an amplifier has: half of the level after half a second."""
+    talk = Talk().armed().playing()
+    latched: dict[str, Any] = {"latch": 1, "token": 5}
+    talk.exchange(hand.STOP, (65535,), hand.status(hand.STOPPED, levels=(5000, 0), **latched))
+    talk.rest(0.497).says(hand.STOPPED, kind=hand.GET_STATUS, levels=(2500, 0), **latched)
+    talk.rest(0.6).says(hand.STOPPED, kind=hand.GET_STATUS, **latched)
+    assert [each for each in talk.found if each != "stop"] == []
+
+
+def test_capture_replays_as_it_was_heard(tmp_path: Path) -> None:
+    """What was recorded while a rule was broken breaks it again, with the same frames around."""
+    talk = Talk().armed().playing().says(token=5, levels=(4000, 0), tokens=(5, 0, 0, 0))
+    path = tmp_path / "capture.txt"
+    path.write_text("\n".join(talk.capture), encoding="utf-8")
+    witness = Witness(talk.config)
+    for piece in read_capture(path, wires=witness.wires):
+        witness.record_bytes(piece.wire, piece.direction, piece.time, piece.data)
+    assert [*map(str, witness.finish())] == [*map(str, talk.witness.finish())]
+    assert [one.invariant for one in witness.finish()] == ["plays"]
+    assert witness.frames == len(talk.capture)

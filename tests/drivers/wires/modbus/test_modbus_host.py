@@ -1,0 +1,265 @@
+"""The host's side of Modbus: bytes written by hand, and responses that belong to no request."""
+
+import asyncio
+
+import pytest
+
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers
+from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.wire import Broken, More, Nak, Reply
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from virtual_loop import in_virtual_time
+from words_line import MemoryLine, unaltered
+
+LAYER = LayerSet(0, 20, 500, (Command(3, 2200, 2000, -9000),))
+SET: Values = {
+    **{"session": 9, "token": 7, "index": 0, "parts": 1, "now": 1},
+    "stream": pack_layers([LAYER]),
+}
+# Unit 1; tag 1. The CRCs are those of minimalmodbus.
+ARM = ("Arm", {"session": 9, "watchdog": 250})
+BYTES = {
+    "status": (
+        ("GetStatus", {}),
+        "01 10 0900 0001 02 0001 FE90",
+        "01 10 0900 0001 0255",
+        "01 04 0980 002B B261",
+    ),
+    "arm": (
+        ARM,
+        "01 10 0300 0003 06 0001 0009 00FA 8445",
+        "01 10 0300 0003 804C",
+        "01 04 0380 002B B1B9",
+    ),
+    "set": (  # session, token, part; head, ramp, valid_for; channel 3, 110 Hz, 0.2, -90 degrees
+        ("Set", SET),
+        "01 10 0500 000B 16 0001 0009 0007 0003 0001 0014 01F4 0030 0898 07D0 DCD8 3229",
+        "01 10 0500 000B 8102",
+        "01 04 0580 0005 312D",
+    ),
+}
+
+
+class Peer:
+    """An amplifier of four channels at unit 1, its bytes kept."""
+
+    def __init__(self, *, is_rtu: bool) -> None:
+        self.sent: list[bytes] = []
+        self.amplifier = Amplifier("a", channels=4)
+        self.end = ModbusAmplifiers({1: self.amplifier}, self.sent.append, is_rtu=is_rtu)
+
+    def reply(self, data: bytes, now: float = 0.0) -> bytes:
+        """The bytes with which it responds."""
+        self.sent.clear()
+        self.end.receive(data, now)
+        return b"".join(self.sent)
+
+
+def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply | Nak | Broken:
+    """What becomes of a request to a peer, in its two transactions."""
+    (more,) = wire.received(peer.reply(wire.request(1, name, values)))
+    assert isinstance(more, More)
+    (arrival,) = wire.received(peer.reply(more.data))
+    assert isinstance(arrival, Reply | Nak | Broken)
+    return arrival
+
+
+@pytest.mark.parametrize("case", BYTES)
+def test_request_has_the_bytes_written_by_hand(case: str) -> None:
+    """Write, its response, read; over TCP with 2 transactions of one tag, and no CRC."""
+    (name, values), *frames = BYTES[case]
+    write, echo, read = map(bytes.fromhex, frames)
+    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
+    assert wire.request(1, name, values) == write
+    if name != "Set":
+        assert peer.reply(write) == echo
+    assert wire.received(echo) == [More(read)]
+
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    over_tcp = [
+        number.to_bytes(2) + bytes(2) + (len(frame) - 2).to_bytes(2) + frame[:-2]
+        for number, frame in ((1, write), (1, echo), (2, read))
+    ]
+    assert wire.request(1, name, values) == over_tcp[0]
+    assert wire.received(over_tcp[1]) == [More(over_tcp[2])]
+
+
+def test_as_many_registers_are_read_as_the_reply_can_have() -> None:
+    """Of 4 channels and 8 layers: status 2 + 9 + 4 + 8, achieved 2 + 4 + 4 · 4; faults any."""
+    wire, peer = ModbusWire(0, is_rtu=True, number=0), Peer(is_rtu=True)
+    counts = {"GetStatus": 43, "GetCaps": 68, "GetAchieved": 70, "GetFaults": 122}
+    after = {"GetStatus": 23, "GetCaps": 68, "GetAchieved": 22, "GetFaults": 122}
+    for expected in (counts, after):
+        for name, count in expected.items():
+            values = {"layer": 0} if name == "GetAchieved" else {}
+            (more,) = wire.received(peer.reply(wire.request(1, name, values)))
+            assert isinstance(more, More)
+            assert more.data[4:6] == count.to_bytes(2)
+        assert isinstance(reply_to(wire, peer, "GetCaps", {}), Reply)
+
+
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
+    """Of an earlier read, of an earlier write, doubled, of another unit; the reply still counts."""
+    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
+    (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
+    assert isinstance(more, More)
+    late = peer.reply(more.data)
+    wire.withdraw()
+    echo = peer.reply(wire.request(1, "GetStatus", {}))
+    assert wire.received(late) == []
+    (more,) = wire.received(echo + echo)
+    assert isinstance(more, More)
+    assert wire.received(late + echo) == []
+    assert wire.counters.unexpected_frames == 4
+    response = peer.reply(more.data)
+    of_unit_2 = ModbusWire(0, is_rtu=is_rtu, number=2)
+    assert of_unit_2.request(2, "GetStatus", {})
+    assert of_unit_2.received(echo) == []
+    assert [type(each) for each in wire.received(late + response + response)] == [Reply]
+    assert wire.counters.unexpected_frames == 6
+
+
+@pytest.mark.parametrize(
+    ("exception", "expected"),
+    [
+        (0, []),
+        (1, [Nak("UNKNOWN_TYPE", None)]),
+        (2, [Nak("UNKNOWN_TYPE", None)]),
+        (3, [Nak("BAD_LENGTH", None)]),
+        (4, [Broken("Modbus exception 4")]),
+        (6, [Nak("BUSY", None)]),
+        (10, []),
+        (11, []),
+    ],
+)
+def test_exceptions_are_refusals_or_no_response(exception: int, expected: list[object]) -> None:
+    """Those of a gateway, and one without a code, are none: the request is repeated."""
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    wire.request(1, "GetStatus", {})
+    assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
+
+
+@pytest.mark.parametrize("exception", [1, 2, 3, 4])
+def test_device_without_an_identity_is_no_amplifier(exception: int) -> None:
+    """As another Modbus device at this address, which has no such registers."""
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    wire.request(7, "Hello", {})
+    (arrival,) = wire.received(bytes([0, 1, 0, 0, 0, 3, 7, 0x84, exception]))
+    assert isinstance(arrival, Broken)
+    assert "unit 7 is no amplifier" in arrival.reason
+
+
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
+    """It wrote the same message before the reply was read; the next attempt has it."""
+    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
+    other = ModbusWire(0, is_rtu=is_rtu, number=500)
+    (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
+    assert isinstance(more, More)
+    peer.reply(other.request(1, "GetStatus", {}))
+    assert wire.received(peer.reply(more.data)) == []
+    assert wire.counters.unexpected_frames == 1
+    assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
+
+
+def test_request_of_all_units_has_no_reply() -> None:
+    """Unit 0 on a line; over TCP a write to each unit that is known, whose responses pass."""
+    commit = ("Commit", {"session": 9, "token": 7})
+    wire = ModbusWire(0, is_rtu=True, number=0)
+    frame = wire.request(0, *commit)
+    assert frame[:-2] == bytes.fromhex("00 10 0600 0003 06 0001 0009 0007")
+
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    for unit in (1, 2):
+        wire.request(unit, "GetStatus", {})
+    frames = wire.request(0, *commit)
+    assert [frames[6], frames[13:15], frames[25], len(frames)] == [1, b"\0\x03", 2, 38]
+    for number in (3, 4):
+        echo = bytes([0, number, 0, 0, 0, 6, number - 2, 16, 6, 0, 0, 3])
+        assert wire.received(echo) == []
+    assert wire.counters.unexpected_frames == 0
+
+
+def test_echo_without_a_response_is_named() -> None:
+    """Of the write and of the read that follows it; an adapter of RS-485 may hear itself."""
+    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
+    frame = wire.request(1, "GetStatus", {})
+    (more,) = wire.received(frame + peer.reply(frame))
+    assert isinstance(more, More)
+    assert wire.received(more.data) == []
+    wire.withdraw()
+    assert "request itself came back" in wire.counters.remark
+
+
+def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
+    """Transactions come again after 65 535: then one is a healthy unit's."""
+    wire, peer = ModbusWire(0, is_rtu=False, number=0), Peer(is_rtu=False)
+    wire.request(1, "GetStatus", {})
+    wire.request(0, "Commit", {"session": 9, "token": 7})  # transaction 2, without a response
+    wire._number = 1
+    assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
+
+
+@in_virtual_time
+async def test_damaged_length_costs_one_attempt() -> None:
+    """A write that seems to go on for 255 bytes ends with the pause before its repetition."""
+    end = MemoryLine("rtu", "a")
+    damaged = iter([True])
+
+    def lengthened(name: str, data: bytes) -> list[tuple[float, bytes]]:
+        if next(damaged, False):
+            data = data[:6] + b"\xff" + data[7:]
+        return unaltered(name, data)
+
+    await end.hosts["a"].open()
+    end.inward = lengthened
+    await end.hosts["a"].read_status()
+    assert end.retries == 1
+
+
+@in_virtual_time
+async def test_stop_is_not_sent_over_a_reply() -> None:
+    """On RTU a status of two channels, 8 + 39 characters and two silences, begins 4 ms late."""
+    end = MemoryLine("rtu", "a")
+    host = end.hosts["a"]
+    await host.open()
+    takes = 47 * 11 / 115_200 + 2 * 0.00175 + 0.004
+    end.outward = lambda name, data: [(takes if len(data) > 8 else 0.0, data)]
+    begin = end.loop.time()
+    reading = asyncio.ensure_future(host.read_status())
+    await asyncio.sleep(0.001)
+    assert (await host.stop()).is_confirmed
+    await reading
+    stopped = min(time for time, request in end.sent if request == "1:8")
+    assert stopped - begin >= takes
+    assert (end.retries, end.line.wire.counters.unexpected_frames) == (0, 0)
+
+
+def test_times_on_a_line_are_those_of_its_characters() -> None:
+    """A set of 22 words: 55 + 8 + 8 + 5 + 2 · 5 characters of 11 bits, four silences."""
+    wire = ModbusWire(115_200, is_rtu=True, number=0)
+    assert wire.exchange_time(22, 3) == pytest.approx(86 * 11 / 115_200 + 4 * 0.00175)
+    slow = ModbusWire(9600, is_rtu=True, number=0)
+    assert slow.silence == pytest.approx(3.5 * 11 / 9600)
+    assert ModbusWire(0, is_rtu=False, number=0).exchange_time(22, 3) == 0
+
+
+def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
+    """By hand: to three units 3 · 15 characters at 9600 baud, two echoes of 8, five silences.
+
+    Each echo may begin 10 ms late. A network has no time of its own.
+    """
+    commit = ("Commit", {"session": 9, "token": 7})
+    wire = ModbusWire(9600, is_rtu=False, number=0)
+    for unit in (1, 2, 3):
+        wire.request(unit, "GetStatus", {})
+    wire.request(0, *commit)
+    characters = 3 * 15 + 2 * 8 + 5 * 3.5
+    assert wire.takes == pytest.approx(characters * 11 / 9600 + 2 * 0.01)
+    network = ModbusWire(0, is_rtu=False, number=0)
+    network.request(1, "GetStatus", {})
+    network.request(0, *commit)
+    assert network.takes == 0

@@ -1,0 +1,118 @@
+"""Work in threads, finished or cancelled."""
+
+import asyncio
+import gc
+import subprocess
+import sys
+import threading
+from itertools import islice
+
+import pytest
+
+from registry.garbage_collection import no_long_collections, without_collections
+from registry.pauses import Backoff, pauses
+from registry.threads import in_thread
+
+
+async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
+    """The result exists, but the cancelled task has not received it."""
+    closed = threading.Event()
+    loop = asyncio.get_running_loop()
+
+    def open_port() -> str:
+        opener = threading.current_thread()
+
+        def cancel_next() -> None:
+            opener.join()  # so that what it gives is before the cancellation, and nothing between
+            loop.call_soon(opening.cancel)
+
+        loop.call_soon_threadsafe(cancel_next)
+        return "port"
+
+    opening = asyncio.create_task(
+        in_thread(open_port, name="opening", undo=lambda port: closed.set())
+    )
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert await asyncio.to_thread(closed.wait, 60)
+
+
+def test_result_after_the_end_of_the_loop_is_undone() -> None:
+    """The thread that opened it closes it."""
+    may_open, closed = threading.Event(), threading.Event()
+
+    async def give_up() -> None:
+        opening = asyncio.create_task(
+            in_thread(lambda: may_open.wait(60), name="opening", undo=lambda _: closed.set())
+        )
+        await asyncio.sleep(0)
+        opening.cancel()
+        await asyncio.wait({opening})
+
+    asyncio.run(give_up())
+    may_open.set()
+    assert closed.wait(60)
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        "asyncio.create_task(in_thread(hang, name='hangs'))",
+        "loop.run_in_executor(DaemonThreads(), hang)",
+        "loop.set_default_executor(DaemonThreads()) or loop.run_in_executor(None, hang)",
+    ],
+)
+def test_program_ends_while_work_hangs(start: str) -> None:
+    """Unlike with asyncio's own pool; also where a library would wait at the end for its own."""
+    program = f"""
+import asyncio, atexit, threading
+from registry.threads import DaemonThreads, in_thread, leave_work
+
+hang = threading.Event().wait
+atexit.register(hang)
+atexit.register(leave_work)
+
+async def main():
+    loop = asyncio.get_running_loop()
+    work = {start}
+    await asyncio.sleep(0.1)
+    work.cancel()
+    await asyncio.wait({{work}})
+
+asyncio.run(main())
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_pauses_grow_up_to_a_limit() -> None:
+    """Each twice the one before: 0.1, 0.2, ... 5 s."""
+    assert list(islice(pauses(), 8)) == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0])
+
+
+def test_backoff_resets_after_a_good_minute() -> None:
+    """1, 2, 4, 5, 5 s, and 1 s again after what ran for a minute."""
+    backoff = Backoff(first=1.0, maximum=5.0)
+    assert [backoff.pause(ran_for=59.9) for _ in range(5)] == [1, 2, 4, 5, 5]
+    assert [backoff.pause(ran_for=each) for each in (60.0, 0.0)] == [1, 2]
+
+
+def test_present_objects_are_frozen_during_the_context() -> None:
+    """All objects present at its start, and none afterwards."""
+    with no_long_collections():
+        assert gc.get_freeze_count() > 1000
+    assert gc.get_freeze_count() == 0
+
+
+def test_objects_built_without_collections_are_never_visited() -> None:
+    """Many are frozen; of few nothing is, or the garbage of repeated failures would pile up."""
+    try:
+        for count, is_frozen in ((1_000, False), (100_000, True)):
+            gc.collect()
+            gc.unfreeze()
+            with without_collections():
+                assert not gc.isenabled()
+                built = [[number] for number in range(count)]
+            assert gc.isenabled()
+            assert (gc.get_freeze_count() >= len(built)) is is_frozen
+    finally:
+        gc.unfreeze()

@@ -6,20 +6,15 @@ token stops other users of the machine.
 
 import hmac
 import re
-from typing import TypeAlias
 
-from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from aiohttp import web
 
 from controller.gateway.settings import Settings
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
-_POLICY_VIOLATION = 1008
+_PORT = re.compile(r":[0-9]+\Z")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-
-Refusal: TypeAlias = tuple[int, str]  # HTTP status and reason
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -37,96 +32,92 @@ HEADERS = {
 }
 """Headers of every response: the page loads nothing from elsewhere and cannot be framed."""
 
+_CORS = {
+    "Access-Control-Allow-Methods": "POST",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type",
+    "Access-Control-Max-Age": "600",
+    "Vary": "Origin",
+}
+
 
 class Access:
-    """ASGI middleware that passes on allowed requests and refuses the others.
+    """Refuses requests that are not allowed, and protects responses.
 
     Everything under /api except the OpenAPI description needs the token, and so do the metrics
     outside the loopback: `Authorization: Bearer TOKEN`, or for a WebSocket, where browsers cannot
     set headers, the subprotocol `era-haptics.token.TOKEN` beside `era-haptics.v1`.
     """
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app = app
+    def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._scheme = "https" if settings.is_encrypted else "http"
+        self._origins = {origin.lower() for origin in settings.origins}
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request or WebSocket, then pass it on."""
-        refusal = self._refusal(scope)
-        if refusal is None:
-            await self._app(scope, receive, _with_headers(send))
-        elif scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": refusal[1]})
-        else:
-            status, why = refusal
-            await JSONResponse({"error": why}, status)(scope, receive, _with_headers(send))
-
-    def _refusal(self, scope: Scope) -> Refusal | None:
-        headers = Headers(scope=scope)
-        if _CONTROL.search(scope["path"]):  # routes take a line feed at the end for nothing
-            return 400, "the path must have no control characters"
-        hosts = headers.getlist("host")
+    def check(self, request: web.Request) -> None:
+        """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
+        headers = request.headers
+        # Routes would take an escaped line feed for another path, and ignore the host in a URL.
+        if _CONTROL.search(request.path) or not request.raw_path.startswith("/"):
+            raise web.HTTPBadRequest(text="the target must be a path without control characters")
+        hosts = headers.getall("Host", [])
         if len(hosts) != 1 or not self._is_allowed_host(hosts[0]):
-            return 421, "this Host is not allowed; see --allow-host"
-        origins = headers.getlist("origin")
+            raise web.HTTPMisdirectedRequest(text="this Host is not allowed; see --allow-host")
+        origins = headers.getall("Origin", [])
         if origins and not self._is_allowed_origin(origins, hosts[0]):
-            return 403, "this Origin is not allowed; see --allow-origin"
-        is_link = headers.get("sec-fetch-mode") == "navigate"  # which the user followed
-        if headers.get("sec-fetch-site") == "cross-site" and not (origins or is_link):
-            return 403, "cross-site requests are not allowed"
-        if scope.get("method") == "OPTIONS":  # without effect
-            return None
-        if not self._needs_token(scope["path"]):
-            return None
-        if not self._has_token(headers):
-            return 401, "the token is missing or wrong; open the URL that the gateway printed"
-        return None
+            raise web.HTTPForbidden(text="this Origin is not allowed; see --allow-origin")
+        is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
+        if headers.get("Sec-Fetch-Site") == "cross-site" and not (origins or is_link):
+            raise web.HTTPForbidden(text="cross-site requests are not allowed")
+        is_effective = request.method != "OPTIONS"
+        if is_effective and self._needs_token(request.path) and not self._has_token(request):
+            raise web.HTTPUnauthorized(
+                text="the token is missing or wrong; open the URL that the gateway printed"
+            )
+
+    async def preflight(self, request: web.Request) -> web.Response:
+        """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""
+        if not self._is_elsewhere(request):
+            raise web.HTTPMethodNotAllowed("OPTIONS", ["POST"])
+        return web.Response()
+
+    async def protect(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Add the security headers to a response, and remove the name of the web server."""
+        response.headers.update(HEADERS)
+        response.headers.pop("Server", None)
+        if self._is_elsewhere(request):
+            response.headers.update(_CORS)
+            response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
+
+    def _is_elsewhere(self, request: web.Request) -> bool:
+        """Whether it comes of a page of another, allowed origin."""
+        return request.headers.get("Origin", "").lower() in self._origins
 
     def _is_allowed_host(self, host: str) -> bool:
         """Whether a Host header names this gateway, with any port (a proxy may have another)."""
-        name, colon, port = host.rpartition(":")
-        if not colon or not port.isdecimal():
-            name = host
-        return name.lower() in self._settings.allowed_names
+        return _PORT.sub("", host).lower() in self._settings.allowed_names
 
     def _is_allowed_origin(self, origins: list[str], host: str) -> bool:
         """Whether an Origin is the gateway's own or an allowed one."""
         own = f"{self._scheme}://{host}".lower()
-        allowed = {own, *(origin.lower() for origin in self._settings.origins)}
-        return len(origins) == 1 and origins[0].lower() in allowed
+        return len(origins) == 1 and origins[0].lower() in {own, *self._origins}
 
     def _needs_token(self, path: str) -> bool:
         """Whether a path needs the token, unlike the page and the OpenAPI description."""
-        if path == "/metrics":
-            return not self._settings.is_loopback
-        return path.startswith("/api/") and path != "/api/v1/openapi.json"
+        is_method = path.startswith("/api/") and path != "/api/v1/openapi.json"
+        return is_method or (path == "/metrics" and not self._settings.is_loopback)
 
-    def _has_token(self, headers: Headers) -> bool:
+    def _has_token(self, request: web.Request) -> bool:
         tokens = [
             value.removeprefix("Bearer ")
-            for value in headers.getlist("authorization")
+            for value in request.headers.getall("Authorization", [])
             if value.startswith("Bearer ")
         ]
         tokens += [
             name.strip().removeprefix(_TOKEN_SUBPROTOCOL)
-            for value in headers.getlist("sec-websocket-protocol")
+            for value in request.headers.getall("Sec-WebSocket-Protocol", [])
             for name in value.split(",")
             if name.strip().startswith(_TOKEN_SUBPROTOCOL)
         ]
         return len(tokens) == 1 and hmac.compare_digest(  # in constant time
-            tokens[0].encode(), self._settings.token.encode()
+            tokens[0].encode(errors="surrogateescape"), self._settings.token.encode()
         )
-
-
-def _with_headers(send: Send) -> Send:
-    """Add the security headers to every response."""
-
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            raw = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
-            message["headers"] = [*message.get("headers", []), *raw]
-        await send(message)
-
-    return sending

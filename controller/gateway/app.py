@@ -4,23 +4,17 @@ import asyncio
 import contextlib
 import json
 import math
+import mimetypes
 import operator
 import time
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from aiohttp import HttpVersion11, WSCloseCode, web
+from aiohttp.typedefs import Handler
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic.json_schema import models_json_schema
-from starlette.applications import Starlette
-from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
-from starlette.middleware.cors import CORSMiddleware
-from starlette.requests import ClientDisconnect, HTTPConnection, Request
-from starlette.responses import JSONResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
 
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
@@ -36,11 +30,12 @@ from controller.api.jsonrpc import (
     request_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, SILENCING, Method, StatusResult
+from controller.api.methods import METHODS, SILENCING, Method
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
-from controller.gateway.bridge import KeptLink, bridge, client_name
+from controller.gateway.bridge import bridge
+from controller.gateway.connections import CLIENT_TIMEOUT, connection_of
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -139,7 +134,8 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     }
 
 
-MAX_BODY = 1 << 16  # bytes
+MAX_BODY = 1 << 16  # bytes; of a message as well
+MAX_REQUESTS = 256  # to the daemon at once
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
 MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to the daemon, and in
 # a burst
@@ -147,18 +143,21 @@ MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewe
 # accepts of one process, so that there are always some for the gateway's own
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
-TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
-
+_HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
+_CLOSE_TIMEOUT = 1.0  # s; for a browser to close its side
+_MAX_FILES = 4  # in one turn of the event loop
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `app` is the ASGI application, `run` to be run beside it."""
+    """State shared by the routes; `app` is the application, `run` to be run beside it."""
 
     def __init__(self, settings: Settings) -> None:
         self.field = DrawnField(settings.socket)
+        self._access = Access(settings)
         self._daemon = settings.socket
-        self._session_count = 0
+        self._sessions: set[asyncio.Task[None]] = set()
+        self._places = asyncio.Semaphore(MAX_REQUESTS)
         # Of connections to the daemon, by host.
         self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
         self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
@@ -168,30 +167,22 @@ class Gateway:
         self._reading = asyncio.Lock()
         self._read_at = -math.inf  # s; when the metrics were read
         self._exposition = b""
-        self.app = Starlette(
-            routes=[
-                Mount(
-                    "/api/v1",
-                    routes=[
-                        Route("/openapi.json", JSONResponse(openapi())),
-                        Route("/{method}", self._call, methods=["POST"]),
-                        WebSocketRoute("/ws", self._serve),
-                    ],
-                ),
-                Route("/metrics", self._metrics),
-                Mount("/", StaticFiles(directory=_PAGE, html=True)),
-            ],
-            middleware=[
-                Middleware(Access, settings=settings),
-                Middleware(
-                    CORSMiddleware,
-                    allow_origins=settings.origins,
-                    allow_methods=["POST"],
-                    allow_headers=["Authorization", "Content-Type"],
-                ),
-            ],
-            exception_handlers={HTTPException: _http_error},
+        self._file_permits = asyncio.Semaphore(_MAX_FILES)
+        self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
+        self._files["openapi.json"] = json.dumps(openapi()).encode()
+        self.app = web.Application(middlewares=[self._answer], client_max_size=MAX_BODY)
+        self.app.add_routes(
+            [
+                web.get("/api/v1/{file:openapi.json}", self._file),
+                web.get("/api/v1/ws", self._serve),
+                web.options("/api/v1/{method}", self._access.preflight),
+                web.post("/api/v1/{method}", self._call, expect_handler=_unasked),
+                web.get("/metrics", self._metrics),
+                web.get("/{file:[^/]*}", self._file),
+            ]
         )
+        self.app.on_response_prepare.append(self._access.protect)
+        self.app.on_shutdown.append(self._end_sessions)
 
     async def run(self) -> None:
         """Keep what it has of the daemon for all browsers, until cancelled."""
@@ -199,51 +190,86 @@ class Gateway:
             own.create_task(self.field.run())
             own.create_task(self._keep_connected())
 
+    def may_connect(self, host: str | None) -> bool:
+        """Whether a client's host may open a connection to the daemon; counts it."""
+        return self._rates.of(host).take() and self._rate.take()
+
     async def _keep_connected(self) -> None:
         """Connect again after every loss, so that no stop has to wait for it."""
         while True:
             with contextlib.suppress(RpcError, Unreachable):
                 await self._own.next_event()  # it subscribes to none
 
-    async def _metrics(self, _: Request) -> Response:
+    @web.middleware
+    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Check a request and write its response; only then its connection is idle again.
+
+        A client may have left meanwhile: its stop is carried out all the same.
+        """
+        connection = None if request.transport is None else connection_of(request)
+        if connection is not None:
+            connection.start_response()
+        try:
+            self._access.check(request)
+            response = await handler(request)
+        except web.HTTPException as error:
+            response = web.json_response(
+                {"error": error.text},
+                status=403 if "Upgrade" in request.headers else error.status,
+                headers=[each for each in error.headers.items() if each[0] == "Allow"],
+            )
+        await response.prepare(request)
+        await response.write_eof()
+        if connection is not None:
+            connection.end_response()
+        return response
+
+    async def _file(self, request: web.Request) -> web.Response:
+        """A file of the page, or the description."""
+        name = request.match_info["file"] or "index.html"
+        if name not in self._files:
+            raise web.HTTPNotFound
+        async with self._file_permits:  # of many requests at once some go out in each turn
+            await asyncio.sleep(0)
+        media, _ = mimetypes.guess_type(name)
+        return web.Response(body=self._files[name], content_type=media, charset="utf-8")
+
+    async def _metrics(self, _: web.Request) -> web.Response:
         """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
         async with self._reading:
             if time.monotonic() >= self._read_at + _METRICS_TIME:
-                self._exposition = exposition(await self._status())
+                status = None
+                with contextlib.suppress(RpcError, Unreachable):
+                    status = await self._own.status()
+                self._exposition = exposition(status)
                 self._read_at = time.monotonic()
-        return Response(self._exposition, media_type=CONTENT_TYPE_LATEST)
+        return web.Response(body=self._exposition, headers={"Content-Type": CONTENT_TYPE_LATEST})
 
-    async def _status(self) -> StatusResult | None:
-        """The daemon's status, None without a daemon."""
-        try:
-            return await self._own.status()
-        except (RpcError, Unreachable):
-            return None
-
-    async def _call(self, request: Request) -> Response:
+    async def _call(self, request: web.Request) -> web.Response:
         """Call one method of the API; its parameters are the body."""
-        method = request.path_params["method"]
+        method = request.match_info["method"]
         try:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
-            return JSONResponse(await self._request(request, method, await _body(request)))
+            if self._places.locked():
+                raise web.HTTPServiceUnavailable(text="too many requests at once; try again later")
+            async with self._places:
+                result = await self._request(request, method, await _body(request))
+            return web.json_response(result)
         except RpcError as error:
             failed = json.loads(error_line(None, error))["error"]
             content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
-            return JSONResponse(content, HTTP_STATUS[error.code])
-        except (ClientDisconnect, asyncio.CancelledError):  # cancelled when the gateway ends
-            return Response(status_code=400)  # sent to nowhere
+            return web.json_response(content, status=HTTP_STATUS[error.code])
 
-    async def _request(self, request: Request, method: str, params: bytes) -> Any:
+    async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
         """The daemon's result, over the connection that this one keeps; raises RpcError."""
-        name = client_name("http", request)
+        name = f"http {getattr(request.transport, 'address', request.remote)}"
         try:
             if method in SILENCING:  # over the own connection, from any client
                 return await self._silence(name, method, params)
-            kept: KeptLink = request.state.daemon
-            line = await kept.request(
-                self._daemon, name, method, params, may_open=partial(self.may_connect, request)
-            )
+            may_open = partial(self.may_connect, request.remote)
+            kept = connection_of(request).link
+            line = await kept.request(self._daemon, name, method, params, may_open=may_open)
             return result_of(read_line(line))
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
@@ -257,49 +283,62 @@ class Gateway:
             result = await self._own.call(method, given, METHODS[method].result)
         return result.model_dump(mode="json")
 
-    async def _serve(self, socket: WebSocket) -> None:
+    async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one browser."""
-        if SUBPROTOCOL not in socket.scope["subprotocols"]:
-            await socket.close(1002, f"the subprotocol must be {SUBPROTOCOL}")
-            return
-        if self._session_count >= MAX_SESSIONS or not self.may_connect(socket):
-            await socket.close(TRY_AGAIN_LATER, "too many clients")
-            return
-        self._session_count += 1  # before the first await, so that the limit holds
+        connection = connection_of(request)
+        protocols = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
+        socket = web.WebSocketResponse(
+            protocols=[SUBPROTOCOL],
+            compress=False,  # no decompression bombs
+            heartbeat=_HEARTBEAT,
+            max_msg_size=MAX_BODY + 1,  # the first that is refused
+            timeout=_CLOSE_TIMEOUT,
+        )
+        if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
+            raise web.HTTPForbidden(text="too many clients")
+        is_valid = SUBPROTOCOL in map(str.strip, protocols) and socket.can_prepare(request)
+        if not (is_valid and connection.upgrade()):
+            raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
+        self._sessions.add(request.task)  # before the first await, so that the limit holds
         try:
-            await socket.accept(subprotocol=SUBPROTOCOL)
-            await bridge(socket, self._daemon, self.field)
+            await socket.prepare(request)
+            field = self.field if "field" in request.query else None
+            await bridge(socket, connection.address, self._daemon, field)
+        except asyncio.CancelledError:  # the gateway ends
+            await socket.close(code=WSCloseCode.SERVICE_RESTART)
+            raise
         finally:
-            self._session_count -= 1
+            self._sessions.discard(request.task)
+        return socket
 
-    def may_connect(self, client: HTTPConnection) -> bool:
-        """Whether a client's host may open a connection to the daemon; counts it."""
-        host = "" if client.client is None else client.client.host
-        return self._rates.of(host).take() and self._rate.take()
+    async def _end_sessions(self, _: web.Application) -> None:
+        for session in self._sessions:
+            session.cancel()
 
 
-async def _body(request: Request) -> bytes:
-    """A request's body on one line, by default an empty object; raises HTTPException and RpcError.
+async def _body(request: web.Request) -> bytes:
+    """A request's body on one line, by default an empty object; raises RpcError, web.HTTPException.
 
     It is parsed here, so that lines and columns of an error are those of the body.
     """
-    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media not in ("application/json", ""):
-        raise HTTPException(415, "the content type must be application/json")
-    too_large = HTTPException(413, f"the body must have at most {MAX_BODY} bytes")
-    if int(request.headers.get("content-length", "0")) > MAX_BODY:  # checked to be a number
-        raise too_large
-    body = b""
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > MAX_BODY:
-            raise too_large
-    if body and not media:  # an empty body needs no type
-        raise HTTPException(415, "the content type must be application/json")
+    media = request.headers.get("Content-Type", "").partition(";")[0].strip().lower()
+    if media != "application/json" and (media or request.can_read_body):
+        raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
+    if (request.content_length or 0) > MAX_BODY:
+        raise web.HTTPRequestEntityTooLarge(MAX_BODY)
+    has_expectation = request.headers.get("Expect", "").lower() == "100-continue"
+    if has_expectation and request.version >= HttpVersion11:
+        connection_of(request).write(b"HTTP/1.1 100 Continue\r\n\r\n")
+    try:
+        async with asyncio.timeout(CLIENT_TIMEOUT):
+            body = await request.read()
+    except web.RequestPayloadError as error:
+        raise web.HTTPBadRequest(text="the body is not valid HTTP/1.1") from error
+    except TimeoutError as error:
+        raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")
     return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
 
 
-async def _http_error(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)  # noqa: S101 (registered for this class alone)
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+async def _unasked(_: web.Request) -> None:
+    """Leave it to the route to ask for a body that the client announces (`Expect`)."""

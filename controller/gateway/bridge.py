@@ -9,8 +9,7 @@ import itertools
 from collections.abc import Callable
 from pathlib import Path
 
-from starlette.requests import HTTPConnection
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, read_request
@@ -19,62 +18,66 @@ from controller.api.methods import SILENCING
 from controller.gateway.field import DrawnField
 
 SEND_TIMEOUT = 5.0  # s; for one frame
-_LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
-_MAX_NAME = 80  # characters; as in the API
+_LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for
+# all of them
 
-UNSUPPORTED_DATA = 1003  # close code of RFC 6455
 NO_DAEMON = 4001  # one of those for private use; the page connects again
 
 _numbers = itertools.count(1)
 
 
-async def bridge(socket: WebSocket, daemon: Path, field: DrawnField) -> None:
+async def bridge(
+    socket: web.WebSocketResponse, client: str, daemon: Path, field: DrawnField | None
+) -> None:
     """Pass frames and lines on until the browser or the daemon at a socket closes.
 
+    client: the address of the browser; field: None unless it wants the vibration.
     The first frame is the daemon's reply to a hello, whose id is the browser's name in the daemon's
     log. The daemon carries out what it was sent before the browser left, and lifts its fingers.
     """
     try:
-        link = await DaemonLink.open(daemon, client_name(f"web:{next(_numbers)}", socket))
+        link = await DaemonLink.open(daemon, f"web:{next(_numbers)} {client}")
         with contextlib.closing(link):
             try:
-                await socket.send_text(link.hello.decode())
+                await socket.send_str(link.hello.decode())
                 async with asyncio.TaskGroup() as ways:
                     ways.create_task(_to_daemon(socket, link))
                     ways.create_task(_to_browser(socket, link))
-                    if "field" in socket.query_params:
+                    if field is not None:
                         ways.create_task(_draw(socket, field))
             finally:
                 await _silence(socket, link)
     except* (RpcError, Unreachable):
-        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # closed already
-            await socket.close(NO_DAEMON, "the daemon does not respond")
-    except* (TimeoutError, RuntimeError, WebSocketDisconnect):
+        await socket.close(code=NO_DAEMON, message=b"the daemon does not respond")
+    except* (TimeoutError, ConnectionError):
         pass  # closed, or does not read
 
 
-async def _to_daemon(socket: WebSocket, link: DaemonLink) -> None:
-    """Pass the browser's frames on; raises WebSocketDisconnect."""
-    while True:
-        message = await socket.receive()
-        if message["type"] == "websocket.disconnect":
-            raise WebSocketDisconnect(message["code"])
-        text = message.get("text")
-        if text is None or "\n" in text:
-            await socket.close(UNSUPPORTED_DATA, "send text frames of one line")
-            raise WebSocketDisconnect(UNSUPPORTED_DATA)
-        await link.send(text.encode() + b"\n")
+async def _to_daemon(socket: web.WebSocketResponse, link: DaemonLink) -> None:
+    """Pass the browser's frames on; raises ConnectionResetError at their end."""
+    async for message in socket:
+        if message.type is WSMsgType.TEXT and "\n" not in message.data:
+            await link.send(message.data.encode() + b"\n")
+        else:  # without effect on one that is closed for an invalid frame
+            await socket.close(
+                code=WSCloseCode.UNSUPPORTED_DATA, message=b"send text frames of one line"
+            )
+        await asyncio.sleep(0)  # between two of those that wait others are served
+    raise ConnectionResetError
 
 
-async def _silence(socket: WebSocket, link: DaemonLink) -> None:
+async def _silence(socket: web.WebSocketResponse, link: DaemonLink) -> None:
     """Send the daemon what may silence of the frames that still wait, whoever else is at an end."""
-    with contextlib.suppress(RuntimeError, TimeoutError):  # it has left, or there is no further one
-        async with asyncio.timeout(_LAST_FRAMES):
-            while link.is_open:
-                text = (await socket.receive()).get("text") or ""
-                line = text.encode()
-                if b"\n" not in line and _method_of(line) in SILENCING:
+    loop = asyncio.get_running_loop()
+    end = loop.time() + _LAST_FRAMES
+    with contextlib.suppress(TimeoutError):  # there is no further one
+        async with asyncio.timeout(_LAST_FRAME) as limit:
+            async for message in socket:
+                line = message.data.encode() if message.type is WSMsgType.TEXT else b""
+                if link.is_open and b"\n" not in line and _method_of(line) in SILENCING:
                     link.write(line + b"\n")
+                await asyncio.sleep(0)
+                limit.reschedule(min(end, loop.time() + _LAST_FRAME))
 
 
 def _method_of(line: bytes) -> str:
@@ -84,28 +87,22 @@ def _method_of(line: bytes) -> str:
         return ""
 
 
-async def _to_browser(socket: WebSocket, link: DaemonLink) -> None:
+async def _to_browser(socket: web.WebSocketResponse, link: DaemonLink) -> None:
     """Pass the daemon's lines on; raises Unreachable, and TimeoutError if one is not read."""
     while True:
         line = await link.next_line()
         async with asyncio.timeout(SEND_TIMEOUT):
-            await socket.send_text(line.decode())
+            await socket.send_str(line.decode())
         await asyncio.sleep(0)  # of lines that came together none goes to a browser that has left
 
 
-async def _draw(socket: WebSocket, field: DrawnField) -> None:
+async def _draw(socket: web.WebSocketResponse, field: DrawnField) -> None:
     """Send the plate's vibration, now and whenever it changes."""
     frame = None
     while True:
         frame = await field.newer_than(frame)
         async with asyncio.timeout(SEND_TIMEOUT):
             await socket.send_bytes(frame)
-
-
-def client_name(name: str, connection: HTTPConnection) -> str:
-    """A client's name for the daemon's log, with its address."""
-    address = connection.client
-    return name if address is None else f"{name} {address.host}:{address.port}"[:_MAX_NAME]
 
 
 MAX_KEPT = 8  # connections; the daemon has 32

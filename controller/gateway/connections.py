@@ -1,188 +1,216 @@
-"""HTTP and WebSocket connections of uvicorn, with the bounds that uvicorn lacks.
+"""Connections of clients, and the bounds that the web server lacks.
 
-Silent, slow or non-reading clients cannot exhaust connections or memory.
-Timeouts count from the last complete request, so sending byte by byte gains nothing.
+Silent, slow or non-reading clients cannot exhaust connections or memory. Timeouts count from the
+last complete request, so sending byte by byte gains nothing.
 """
 
 import asyncio
-import re
+import json
+import socket
+import ssl
+from collections.abc import Callable, Hashable
 from typing import Any
 
-import h11
-from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.frames import Frame
+from aiohttp import web
 
+from controller.gateway.access import HEADERS
 from controller.gateway.bridge import KeptLink
-from controller.process.rate_limit import RateLimiter
+from controller.gateway.frames import FrameHeads
 
-MAX_IDLE = 128  # connections that have not sent a complete request
-REQUEST_TIMEOUT = 5.0  # s; for a complete request
-UNREAD_TIMEOUT = 5.0  # s; for reading a response over HTTP
-MAX_UNREAD = 1 << 18  # bytes per WebSocket; bounds pongs; other frames wait until it reads
-MAX_HEAD = 1 << 16  # bytes; of a request over HTTP
-MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
-MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
-CLOSE_TIMEOUT = 1.0  # s; for a WebSocket to close after its last frame
-_SLICE = 1 << 12  # bytes that are processed between checks of the bounds
-_BLANK_LINE = re.compile(rb"\n\r?\n")
-_BARE_OR_FOLDED = re.compile(rb"(?<!\r)\n|\n[ \t]")
+CLIENT_TIMEOUT = 5.0  # s; for a handshake, a complete request, or reading a response
+MAX_WAITING = 128  # connections without a complete request, and as many unread
+MAX_HANDSHAKES = 96  # of TLS; each takes some 400 kB
+_ACCEPT_PAUSE = 0.01  # s; while there is no descriptor
 
-
-class _UnambiguousHttp(h11.Connection):
-    """HTTP whose heads of requests no proxy may take for others."""
-
-    _searched = 0  # bytes without the end of a head
-
-    def next_event(self) -> Any:
-        """The next event; raises RemoteProtocolError, which is answered by 400."""
-        if self.their_state is h11.IDLE:
-            received = self.trailing_data[0]
-            end = _BLANK_LINE.search(received, max(0, self._searched - 3))
-            self._searched = len(received) if end is None else 0
-            if end is not None and _is_ambiguous(received[: end.start() + 1].lower()):
-                raise h11.RemoteProtocolError("ambiguous head")
-        return super().next_event()
+_MALFORMED_BODY = json.dumps({"error": "the request is not valid HTTP/1.1"})
+_MALFORMED = "\r\n".join(
+    [
+        "HTTP/1.1 400 Bad Request",
+        *(f"{name}: {value}" for name, value in HEADERS.items()),
+        "Content-Type: application/json",
+        f"Content-Length: {len(_MALFORMED_BODY)}",
+        "Connection: close",
+        "",
+        _MALFORMED_BODY,
+    ]
+).encode()
+_PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 
 
-class HttpConnection(H11Protocol):
-    """HTTP with timeouts, and a bound on connections without a complete request.
+class Deadlines:
+    """What has to happen within a time, in a bounded number: the oldest expires for a new one."""
 
-    The oldest idle connection is closed for a new one, so thousands of silent connections do not
-    keep a browser out.
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = {}
+
+    def start(self, key: Hashable, expire: Callable[[], object]) -> None:
+        """Start the time of something, anew if it runs already; expire: called at its end."""
+        self.cancel(key)
+        if len(self._all) >= self._limit:
+            oldest, (expire_oldest, _) = next(iter(self._all.items()))
+            self.cancel(oldest)
+            expire_oldest()
+        timer = asyncio.get_running_loop().call_later(CLIENT_TIMEOUT, expire)
+        self._all[key] = expire, timer
+
+    def cancel(self, key: Hashable) -> None:
+        """Cancel it: it has happened."""
+        if key in self._all:
+            self._all.pop(key)[1].cancel()
+
+
+class ClientConnection(asyncio.Protocol):
+    """Stands between a transport and the web server's protocol, and is each of them to the other.
+
+    link: the connection to the daemon that ends with this one.
     """
 
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
-        self.conn = _UnambiguousHttp(h11.SERVER, MAX_HEAD)
-        self._unread: asyncio.TimerHandle | None = None
-        # Of all connections of the server, whose state is one dictionary.
-        self._idle: dict[HttpConnection, asyncio.TimerHandle] = self.app_state.setdefault(
-            "idle", {}
-        )
-        self._daemon = KeptLink(self.app_state.setdefault("links", set()))
-        self.app_state = {**self.app_state, "daemon": self._daemon}  # for requests
+    _transport: Any = None
+
+    def __init__(self, acceptor: "Acceptor") -> None:
+        self.link = KeptLink(acceptor.links)
+        self._acceptor = acceptor
+        self._last = b""  # bytes received
+        self._frames: FrameHeads | None = None
+        self._is_answering = False
+
+    def __getattr__(self, name: str) -> Any:
+        """What the web server needs of a transport, but for what is defined here."""
+        return getattr(self._transport, name)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept it as idle."""
-        super().connection_made(transport)
-        self._start_idle()
+        self._transport = transport
+        self._server = self._acceptor.make_server()  # only now, for a handshake may never end
+        self._acceptor.idle.start(self, transport.abort)
+        self._server.connection_made(self)  # type: ignore[arg-type]
 
-    def handle_events(self) -> None:
-        """Stop the idle timer at a complete request."""
-        try:
-            super().handle_events()
-        except h11.LocalProtocolError:  # invalid data in the body of a request already answered
-            self.transport.abort()
-            return
-        cycle: RequestResponseCycle | None = self.cycle
-        if cycle is not None and not cycle.more_body and not cycle.response_complete:
-            self._end_idle()
-
-    def on_response_complete(self) -> None:
-        """Restart the idle timer."""
-        self._start_idle()
-        super().on_response_complete()
-
-    def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Hand over to a WebSocket."""
-        self._end_idle()
-        self._daemon.close()
-        super().handle_websocket_upgrade(event)
+    def data_received(self, data: bytes) -> None:
+        """Hand data on, unless they are frames that are not allowed."""
+        self._last = (self._last + data[-4:])[-4:]
+        if self._frames is None or self._frames.accept(data):
+            self._server.data_received(data)
+        else:
+            self._transport.write(_PROTOCOL_ERROR)
+            self._transport.abort()  # after a flood it might not be read
 
     def pause_writing(self) -> None:
-        """Start the timeout of a client that does not read."""
-        super().pause_writing()
-        self._unread = self.loop.call_later(UNREAD_TIMEOUT, self.transport.abort)
+        """Start the time for reading."""
+        self._acceptor.unread.start(self, self._transport.abort)
+        self._server.pause_writing()
 
     def resume_writing(self) -> None:
-        """Cancel the timeout of a client that does not read."""
-        super().resume_writing()
-        self._cancel_unread()
+        """End the time for reading, unless it is that of the last bytes."""
+        if not self._transport.is_closing():
+            self._acceptor.unread.cancel(self)
+        self._server.resume_writing()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Cancel all timeouts, and close the connection to the daemon."""
-        self._end_idle()
-        self._daemon.close()
-        self._cancel_unread()
-        super().connection_lost(exc)
+        self._acceptor.idle.cancel(self)
+        self._acceptor.unread.cancel(self)
+        self.link.close()
+        self._server.connection_lost(exc)
 
-    def _start_idle(self) -> None:
-        if self.transport.is_closing():
-            return
-        self._end_idle()
-        while len(self._idle) >= MAX_IDLE:
-            oldest = next(iter(self._idle))
-            oldest._end_idle()
-            oldest.transport.abort()
-        self._idle[self] = self.loop.call_later(REQUEST_TIMEOUT, self.transport.abort)
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Write a response; what the server writes of its own accord is about a malformed head."""
+        if self._is_answering:
+            self._transport.write(data)
+        elif not self._transport.is_closing():
+            self._transport.write(_MALFORMED)
+            self.close()
 
-    def _end_idle(self) -> None:
-        timer = self._idle.pop(self, None)
-        if timer is not None:
-            timer.cancel()
+    def writelines(self, parts: list[bytes]) -> None:
+        """Write a response in parts."""
+        self.write(b"".join(parts))
 
-    def _cancel_unread(self) -> None:
-        if self._unread is not None:
-            self._unread.cancel()
-            self._unread = None
+    def close(self) -> None:
+        """Close it once the client has read all, at the latest after a time."""
+        self._transport.close()
+        self._acceptor.unread.start(self, self._transport.abort)
 
+    def start_response(self) -> None:
+        """Let through what the server writes: it is to a request that it has handed on."""
+        self._acceptor.idle.cancel(self)
+        self._is_answering = True
 
-class WebSocketConnection(WebSocketsSansIOProtocol):
-    """A WebSocket with bounded buffers, fragments and control frames."""
+    def end_response(self) -> None:
+        """Wait for the next request."""
+        self._is_answering = False
+        if not self._transport.is_closing():
+            self._acceptor.idle.start(self, self._transport.abort)
 
-    _controls: RateLimiter | None = None
+    @property
+    def address(self) -> str:
+        """The client's address and port."""
+        peer = self._transport.get_extra_info("peername") or ("unknown", 0)
+        return f"{peer[0]}:{peer[1]}"
 
-    def data_received(self, data: bytes) -> None:
-        """Process data unless too much output is unread."""
-        for start in range(0, len(data), _SLICE):
-            if self.transport.get_write_buffer_size() > MAX_UNREAD:
-                self.transport.abort()
-            if self.transport.is_closing():
-                return
-            super().data_received(data[start : start + _SLICE])
-
-    def handle_ping(self) -> None:
-        """Answer a ping within the rate of control frames."""
-        if self._take_control():
-            super().handle_ping()
-
-    def handle_pong(self, event: Frame) -> None:
-        """Accept a pong within the rate of control frames."""
-        if self._take_control():
-            super().handle_pong(event)
-
-    def handle_cont(self, event: Frame) -> None:
-        """Accept a fragment, of a bounded number: the size of empty ones is no bound."""
-        if len(self.frames) >= MAX_FRAGMENTS:
-            self.transport.abort()
-            return
-        super().handle_cont(event)
-
-    def keepalive_timeout(self) -> None:
-        """Close without waiting for a client that does not answer pings."""
-        super().keepalive_timeout()
-        self.transport.abort()
-
-    async def run_asgi(self) -> None:
-        """Run the application, then close, whether or not the client reads its last frames."""
-        await super().run_asgi()
-        self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
-
-    def _take_control(self) -> bool:
-        """Count a control frame; close if there are too many."""
-        if self._controls is None:
-            self._controls = RateLimiter(MAX_CONTROL_RATE, clock=self.loop.time)
-        is_within = self._controls.take()
-        if not is_within:
-            self.transport.abort()
-        return is_within
+    def upgrade(self) -> bool:
+        """Expect frames, unless some came too early, before this was accepted; whether it does."""
+        self._frames = FrameHeads() if self._last == b"\r\n\r\n" else None
+        return self._frames is not None
 
 
-def _is_ambiguous(head: bytes) -> bool:
-    """Whether a proxy may read the head of a request, in lower case, otherwise.
+def connection_of(request: web.Request) -> ClientConnection:
+    """The connection that a request came by; raises ConnectionResetError after its end."""
+    connection: object = request.transport
+    if not isinstance(connection, ClientConnection):
+        raise ConnectionResetError
+    return connection
 
-    Lines that end with a line feed alone, folded lines, two ways to give the length of the body.
+
+class Acceptor:
+    """Accepts connections of a listening socket for a web server.
+
+    make_server: makes the web server's protocol of a connection; tls: None without.
     """
-    lengths = [name for name in (b"\ncontent-length:", b"\ntransfer-encoding:") if name in head]
-    return len(lengths) > 1 or _BARE_OR_FOLDED.search(head) is not None
+
+    def __init__(
+        self, make_server: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None
+    ) -> None:
+        self.links: set[KeptLink] = set()
+        self.idle = Deadlines(MAX_WAITING)
+        self.unread = Deadlines(MAX_WAITING)
+        self._handshakes = Deadlines(MAX_HANDSHAKES)
+        self.make_server = make_server
+        self._tls = tls
+
+    async def run(self, listening: socket.socket) -> None:
+        """Accept connections until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                accepted, _ = await loop.sock_accept(listening)
+            except OSError:
+                await asyncio.sleep(_ACCEPT_PAUSE)
+                continue
+            task = loop.create_task(self._admit(accepted))
+            self._handshakes.start(task, task.cancel)
+            await asyncio.sleep(0)  # while others wait, accepting never does
+
+    async def _admit(self, accepted: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            if self._tls is not None:
+                await _first_byte(accepted)  # a silent connection takes no memory for TLS
+            await loop.connect_accepted_socket(
+                lambda: ClientConnection(self), accepted, ssl=self._tls
+            )
+        except (OSError, asyncio.CancelledError):
+            accepted.close()
+        finally:
+            self._handshakes.cancel(asyncio.current_task())
+
+
+async def _first_byte(accepted: socket.socket) -> None:
+    """Wait until a client sends something, which is left to be read; raises OSError at its end."""
+    loop, has_come = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(accepted, has_come.set)
+    try:
+        await has_come.wait()
+    finally:
+        loop.remove_reader(accepted)
+    if not accepted.recv(1, socket.MSG_PEEK):
+        raise ConnectionResetError

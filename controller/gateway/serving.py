@@ -1,4 +1,4 @@
-"""The gateway's server process: uvicorn, its socket, and its end within a second."""
+"""The gateway's server process: aiohttp, its socket, and its end within a second."""
 
 import asyncio
 import contextlib
@@ -8,42 +8,25 @@ import re
 import signal
 import socket
 import ssl
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
-import uvicorn
+from aiohttp import web
+from aiohttp.http import HttpProcessingError
 
 from controller.api.admission import allow_many_descriptors
 from controller.gateway.app import Gateway
-from controller.gateway.connections import HttpConnection, WebSocketConnection
+from controller.gateway.connections import CLIENT_TIMEOUT, Acceptor
 from controller.gateway.settings import Settings
 from model.errors import InputError
+from registry.garbage_collection import no_long_collections
 
-_MAX_CONCURRENT = 256  # requests and connections; above it 503
-_MAX_MESSAGE = 1 << 16  # bytes
+_MAX_LINE = 1 << 13  # bytes; of the head of a request
+_MAX_LINES = 64
 _SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
+_RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
+_QUEUE = 512  # connections that wait to be accepted
 _NICENESS = 10  # added, so that the daemon's control loop has priority
-_SHUTDOWN_TIMEOUT = 0.3  # s; for connections to close by themselves
-
-
-class _Server(uvicorn.Server):
-    """Ends within a short time, whatever its clients do; at a signal with an exit status of 0."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Shut down at SIGINT and SIGTERM; else the exit status would be the signal's."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, self.handle_exit, number, None)
-        yield
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Close connections, aborting those that do not close in time."""
-        asyncio.get_running_loop().call_later(_SHUTDOWN_TIMEOUT, self._abort)
-        await super().shutdown(sockets)
-
-    def _abort(self) -> None:
-        for connection in list(self.server_state.connections):
-            connection.transport.abort()
-        self.force_exit = True  # aborting TLS may wait for the peer
+_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
 
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
@@ -51,48 +34,55 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     with contextlib.suppress(OSError):  # a service may be forbidden to
         os.nice(_NICENESS)
     allow_many_descriptors()
-    check_certificate(settings)
+    tls = load_certificate(settings)
     gateway = Gateway(settings)
     listening = listen(settings)
-    config = uvicorn.Config(
+    failures = logging.getLogger(f"{__name__}.requests")
+    failures.addFilter(_is_own_failure)
+    runner = web.AppRunner(
         gateway.app,
-        http=HttpConnection,
-        ws=WebSocketConnection,
-        ws_max_size=_MAX_MESSAGE,
-        ws_ping_interval=10.0,
-        ws_ping_timeout=10.0,
-        ws_per_message_deflate=False,  # no decompression bombs
-        limit_concurrency=_MAX_CONCURRENT,
-        timeout_graceful_shutdown=1,
-        lifespan="off",
-        log_level="error",  # clients can cause warnings without limit
-        access_log=False,
-        server_header=False,
-        proxy_headers=False,  # clients can forge them
-        ssl_certfile=settings.certificate,
-        ssl_keyfile=settings.key,
+        access_log=None,
+        logger=failures,
+        auto_decompress=False,  # no decompression bombs
+        max_line_size=_MAX_LINE,
+        max_field_size=_MAX_LINE,
+        max_headers=_MAX_LINES,
+        lingering_time=CLIENT_TIMEOUT,
+        keepalive_timeout=2 * CLIENT_TIMEOUT,  # the acceptor's comes first
+        shutdown_timeout=_SHUTDOWN_TIMEOUT,
     )
-    # Of texts of clients that are not UTF-8, each of which it logs.
-    logging.getLogger("uvicorn.error").addFilter(
-        lambda record: not (record.exc_info and record.exc_info[0] is UnicodeDecodeError)
-    )
-    server = _Server(config)
-    own = asyncio.create_task(gateway.run())
-    # It never ends by itself: one that fails ends the process, which then says why.
-    own.add_done_callback(lambda _: server.handle_exit(signal.SIGTERM, None))
+    await runner.setup()
+    assert runner.server is not None  # noqa: S101 (it is set up)
+    over = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, over.set)
+    # It never ends by itself: a part that fails ends the process, which then says why.
+    own = asyncio.gather(gateway.run(), Acceptor(runner.server, tls).run(listening))
+    own.add_done_callback(lambda _: over.set())
     announce(listening.getsockname()[1])
-    await server.serve(sockets=[listening])
+    with no_long_collections():  # of connections that a storm leaves, nothing else is visited
+        await over.wait()
+    listening.close()
+    await runner.cleanup()
     own.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await own
 
 
-def check_certificate(settings: Settings) -> None:
-    """Check that certificate and key can be read and match; raises InputError."""
+def _is_own_failure(record: logging.LogRecord) -> bool:
+    """Whether it is not of a client, which has left or sends what is not HTTP."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, OSError | HttpProcessingError)
+
+
+def load_certificate(settings: Settings) -> ssl.SSLContext | None:
+    """Load certificate and key, None without; raises InputError unless they match."""
     if settings.certificate is None:
-        return
+        return None
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
+        tls.load_cert_chain(
             *(settings.certificate, settings.key),
             password="",  # without it OpenSSL would prompt for one
         )
@@ -103,24 +93,27 @@ def check_certificate(settings: Settings) -> None:
             f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}); give a "
             "certificate chain and its key, both PEM, the key without password"
         ) from error
+    return tls
 
 
 def listen(settings: Settings) -> socket.socket:
     """Listen on a socket of its own; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    # With IPPROTO_TCP given asyncio sets TCP_NODELAY; without it a response's body waits 40 ms for
-    # the acknowledgement of its head.
-    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Inherited by accepted connections; the system's default limit is some megabytes.
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        listening.bind((settings.host, settings.port))
-        listening.listen()
+        listening = socket.create_server(
+            (settings.host, settings.port),
+            family=family,
+            backlog=_QUEUE,
+            dualstack_ipv6=family == socket.AF_INET6,
+        )
     except OSError as error:
-        listening.close()
         raise InputError(
-            f"cannot listen on {settings.host} port {settings.port} ({error.strerror}); stop the "
-            "other program or give another port (--listen)"
+            f"cannot listen on {settings.host} port {settings.port} "
+            f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
+            "(--listen)"
         ) from error
+    # Inherited by accepted connections; the system's default limits are some megabytes.
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    listening.setblocking(False)
     return listening

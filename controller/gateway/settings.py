@@ -124,7 +124,7 @@ def read_token(path: Path) -> str:
     return content.decode().strip()
 
 
-_LIBRARIES = ("prometheus_client", "starlette", "uvicorn", "websockets")
+_LIBRARIES = ("aiohttp", "prometheus_client")
 
 
 def require_gateway() -> None:

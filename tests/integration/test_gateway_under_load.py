@@ -25,6 +25,7 @@ from gateway_bench import (
     RawWebSocket,
     frame,
     gateway_process,
+    has_ended,
     http,
     real_daemon,
     upgrade,
@@ -41,8 +42,8 @@ ENABLED = "OPERATION_ENABLED"
 IMPATIENT = """
 import sys
 from controller.cli.main import main
-from controller.gateway import bridge, connections
-connections.REQUEST_TIMEOUT = connections.UNREAD_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
+from controller.gateway import app, bridge, connections
+app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
 sys.exit(main())
 """
 """`era` with shorter timeouts of the gateway."""
@@ -129,22 +130,6 @@ def deaf_connection(gateway: GatewayProcess) -> socket.socket:
     made.settimeout(60)
     made.connect(("127.0.0.1", gateway.port))
     return made
-
-
-def has_ended(connection: socket.socket) -> bool:
-    """Whether the other side has closed, without reading."""
-    try:
-        connection.send(b"")
-        return bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) or _is_reset(
-            connection
-        )
-    except OSError:
-        return True
-
-
-def _is_reset(connection: socket.socket) -> bool:
-    """By the kernel's state of the connection: 1 is established, see tcp_states.h of Linux."""
-    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 1
 
 
 def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayProcess) -> None:

@@ -179,9 +179,9 @@ def _at_home(folder: Path) -> Iterator[None]:
         os.environ.update(environment)
 
 
-def _without_uvicorn(stack: contextlib.ExitStack, _: io.StringIO) -> None:
-    stack.callback(sys.modules.__setitem__, "uvicorn", import_module("uvicorn"))
-    sys.modules["uvicorn"] = None  # type: ignore[assignment]  # as where it is not installed
+def _without_aiohttp(stack: contextlib.ExitStack, _: io.StringIO) -> None:
+    stack.callback(sys.modules.__setitem__, "aiohttp", import_module("aiohttp"))
+    sys.modules["aiohttp"] = None  # type: ignore[assignment]  # as where it is not installed
 
 
 def _disarmed(stack: contextlib.ExitStack) -> Client:
@@ -212,7 +212,7 @@ def _stopped_once_armed(stack: contextlib.ExitStack, out: io.StringIO) -> None:
 
 
 _BEFORE: dict[str, Callable[[contextlib.ExitStack, io.StringIO], None]] = {
-    "without_uvicorn": _without_uvicorn,
+    "without_aiohttp": _without_aiohttp,
     "armed_by_another": _armed_by_another,
     "stopped_once_armed": _stopped_once_armed,
 }

@@ -245,11 +245,17 @@ class GatewayProcess:
         """The port it listens on."""
         return int(self.host.rpartition(":")[2])
 
-    def connect(self) -> socket.socket:
+    def trust(self, certificate: Path) -> None:
+        """Connect by TLS, and trust one certificate."""
+        self.context = ssl.create_default_context(cafile=certificate)
+
+    def connect(self, timeout: float = PATIENCE) -> socket.socket:
         """A TCP connection, or a TLS one."""
         name = self.host.rpartition(":")[0].strip("[]")
-        plain = socket.create_connection((name, self.port), timeout=PATIENCE)
-        return plain if self.context is None else self.context.wrap_socket(plain)
+        plain = socket.create_connection((name, self.port), timeout=timeout)
+        if self.context is None:
+            return plain
+        return self.context.wrap_socket(plain, server_hostname=name)
 
     def log(self) -> str:
         """Its standard error so far."""
@@ -390,6 +396,7 @@ def http(
     media: str | None = "application/json",
     more: Sequence[str] = (),
     length: int | None = None,
+    timeout: float = PATIENCE,
 ) -> HttpResponse:
     """Send a request that would be granted but for the given changes."""
     lines = [f"{method} {target} HTTP/1.1", "Connection: close"]
@@ -397,12 +404,13 @@ def http(
     lines += [f"Authorization: Bearer {each}" for each in ([TOKEN] if token is None else token)]
     lines += [] if media is None else [f"Content-Type: {media}"]
     lines += [*more, f"Content-Length: {len(body) if length is None else length}"]
-    return raw(gateway, "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
+    head = "\r\n".join(lines).encode("latin-1")
+    return raw(gateway, head + b"\r\n\r\n" + body, timeout=timeout)
 
 
-def raw(gateway: GatewayProcess, data: bytes) -> HttpResponse:
+def raw(gateway: GatewayProcess, data: bytes, *, timeout: float = PATIENCE) -> HttpResponse:
     """Send bytes; the response until the gateway closes."""
-    with gateway.connect() as connection:
+    with gateway.connect(timeout) as connection:
         received = b""
         # It may close before it has received everything.
         with contextlib.suppress(ConnectionError):
@@ -448,7 +456,7 @@ class RawWebSocket:
         )
         self._protocol.key = _KEY
         self._events: list[Event] = []
-        origin = f"http://{gateway.host}"
+        origin = gateway.url.removesuffix("/")
         self.connection.sendall(upgrade(gateway, target=target, origin=origin))
         head = self._event()
         assert isinstance(head, Response), "no handshake"
@@ -507,6 +515,22 @@ class RawWebSocket:
 def frame(payload: bytes, *, first: int = 0x81) -> bytes:
     """A client's frame."""
     return Frame(Opcode(first & 0x0F), payload, fin=bool(first & 0x80)).serialize(mask=True)
+
+
+def has_ended(connection: socket.socket) -> bool:
+    """Whether the other side has closed, without reading."""
+    try:
+        connection.send(b"")
+        return bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) or _is_reset(
+            connection
+        )
+    except OSError:
+        return True
+
+
+def _is_reset(connection: socket.socket) -> bool:
+    """By the kernel's state of the connection: 1 is established, see tcp_states.h of Linux."""
+    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 1
 
 
 UNCONFIRMED = {

@@ -119,7 +119,7 @@ def test_daemon_imports_no_package_of_other_commands() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout.split()
     assert "scipy.linalg" in modules
-    assert not set(modules) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "starlette"}
+    assert not set(modules) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "aiohttp"}
 
 
 def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(

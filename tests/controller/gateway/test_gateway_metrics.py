@@ -1,7 +1,10 @@
 """What the gateway reads once for all: metrics of the daemon, and the field that is drawn."""
 
 import asyncio
+import contextlib
+import signal
 import struct
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import NamedTuple
 from unittest.mock import AsyncMock, Mock
@@ -9,8 +12,9 @@ from unittest.mock import AsyncMock, Mock
 import httpx
 import numpy as np
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
 from prometheus_client.parser import text_string_to_metric_families
-from starlette.responses import PlainTextResponse
 
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
@@ -21,6 +25,7 @@ from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
+from controller.gateway.serving import serve
 from controller.gateway.settings import Settings
 from daemon_bench import PATIENCE, ready_daemon, until
 from gateway_bench import ScriptedDaemon
@@ -78,15 +83,35 @@ async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
         is_token_user_supplied=True,
         extra_hosts=("panel.local",),
     )
-    transport = httpx.ASGITransport(Access(PlainTextResponse("era_up 1"), settings))
-    async with httpx.AsyncClient(transport=transport, base_url="https://panel.local") as client:
-        for path, token, expected in (
-            ("/metrics", "wrong", 401),
-            ("/metrics%0A", "wrong", 400),
-            ("/metrics", settings.token, 200),
-        ):
-            response = await client.get(path, headers={"Authorization": f"Bearer {token}"})
-            assert response.status_code == expected
+    access = Access(settings)
+    for path, token, expected in (
+        ("/metrics", "wrong", 401),
+        ("/metrics%0A", "wrong", 400),
+        ("/metrics", settings.token, 200),
+    ):
+        headers = {"Host": "panel.local", "Authorization": f"Bearer {token}"}
+        status = 200
+        try:
+            access.check(make_mocked_request("GET", path, headers=headers))
+        except web.HTTPException as refused:
+            status = refused.status
+        assert status == expected
+
+
+@contextlib.asynccontextmanager
+async def served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: AsyncMock
+) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of a gateway in this process whose daemon has a status; it ends at SIGTERM."""
+    monkeypatch.setattr(app.AsyncClient, "status", status)
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    settings = Settings(socket=tmp_path / "era.sock")
+    serving = asyncio.create_task(serve(settings, announce=port.set_result))
+    async with httpx.AsyncClient(base_url=f"http://localhost:{await port}") as client:
+        yield client
+    signal.raise_signal(signal.SIGTERM)
+    await serving
 
 
 async def test_metrics_are_read_once_for_all(
@@ -94,16 +119,32 @@ async def test_metrics_are_read_once_for_all(
 ) -> None:
     """However many read them within half a second."""
     status = AsyncMock(side_effect=Unreachable)
-    monkeypatch.setattr(app.AsyncClient, "status", status)
     monkeypatch.setattr(app, "_METRICS_TIME", 1e9)
-    transport = httpx.ASGITransport(app.Gateway(Settings(socket=tmp_path / "era.sock")).app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+    async with served(tmp_path, monkeypatch, status) as client:
         for _ in range(3):
             assert "era_up 0.0" in (await client.get("/metrics")).text
         assert status.await_count == 1
         monkeypatch.setattr(app, "_METRICS_TIME", 0.0)
         await client.get("/metrics")
     assert status.await_count == 2
+
+
+async def test_failure_of_the_gateway_is_answered_and_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Unlike what is no HTTP, and with the security headers."""
+    failing = AsyncMock(side_effect=ZeroDivisionError)
+    async with served(tmp_path, monkeypatch, failing) as client:
+        response = await client.get("/metrics")
+        _, writer = await asyncio.open_connection(client.base_url.host, client.base_url.port)
+        writer.write(b"evil\r\n\r\n")
+        await client.get("/metrics")
+        writer.close()
+    assert response.status_code == 500
+    assert response.headers["x-frame-options"] == "DENY"
+    assert "server" not in response.headers
+    errors = [each.exc_info[0] for each in caplog.records if each.exc_info]
+    assert errors == [ZeroDivisionError] * 2
 
 
 TONE = PlayedTone(frequency_hz=110.0, level=0.5, phase_deg=0.0)

@@ -1,26 +1,31 @@
 """`era gateway` as a process: how it begins, what it refuses, TLS, and its end within a second."""
 
 import asyncio
+import contextlib
 import errno
 import os
 import signal
 import socket
-import ssl
 import subprocess
 from pathlib import Path
 from unittest.mock import AsyncMock
 
 import pytest
+from aiohttp import web
 
 from controller.gateway.app import Gateway
-from controller.gateway.serving import check_certificate, listen, serve
+from controller.gateway.connections import MAX_HANDSHAKES, Acceptor
+from controller.gateway.serving import listen, load_certificate, serve
 from controller.gateway.settings import Settings, read_token
-from daemon_bench import PATIENCE
+from daemon_bench import PATIENCE, until
+from gateway_attacks import make_certificate
 from gateway_bench import (
     TOKEN,
     RawWebSocket,
     ScriptedDaemon,
+    frame,
     gateway_process,
+    has_ended,
     http,
     raw,
     upgrade,
@@ -39,19 +44,7 @@ def openssl() -> str:
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A self-signed certificate of localhost, and its key."""
-    folder = tmp_path_factory.mktemp("tls")
-    certificate, key = folder / "panel.pem", folder / "panel.key"
-    subprocess.run(
-        [
-            *(openssl(), "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
-            *("-nodes", "-days", "1", "-subj", "/CN=localhost"),
-            *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
-            *("-keyout", str(key), "-out", str(certificate)),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    return certificate, key
+    return make_certificate(tmp_path_factory.mktemp("tls"))
 
 
 def test_gateway_exits_at_sigint_with_open_connections(
@@ -84,6 +77,13 @@ def test_gateway_exits_at_sigint_with_open_connections(
         assert gateway.log() == ""
 
 
+STOP = (
+    b"POST /api/v1/stop HTTP/1.1\r\nHost: %s\r\nContent-Length: 0\r\nAuthorization: Bearer "
+    + TOKEN.encode()
+    + b"\r\n\r\n"
+)
+
+
 def test_gateway_serves_tls(
     daemon: ScriptedDaemon, tmp_path: Path, pair: tuple[Path, Path]
 ) -> None:
@@ -95,30 +95,33 @@ def test_gateway_serves_tls(
         assert gateway.url.startswith("https://localhost:")
         plain = f"POST /api/v1/stop HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
         assert raw(gateway, plain).status == 0
-        gateway.context = _Verified(certificate)
+        with contextlib.ExitStack() as stack:
+            half = [stack.enter_context(gateway.connect()) for _ in range(3 * MAX_HANDSHAKES)]
+            for each in half:
+                each.sendall(b"\x16\x03\x01\x02\x00\x01")  # the beginning of a handshake
+            wait_for(
+                lambda: sum(not has_ended(each) for each in half) <= MAX_HANDSHAKES,
+                timeout=PATIENCE / 6,
+            )
+        gateway.trust(certificate)
         wait_for_daemon(gateway)
         assert http(gateway).status == 200
         assert http(gateway, more=[f"Origin: https://{gateway.host}"]).status == 200
         assert http(gateway, more=[f"Origin: http://{gateway.host}"]).status == 403
         assert raw(gateway, upgrade(gateway, origin=f"http://{gateway.host}")).status == 403
+        daemon.calls.clear()
+        for _ in range(20):  # clients that leave at once, and politely by TLS
+            with gateway.connect() as connection:
+                connection.sendall(STOP % gateway.host.encode())
+        for _ in range(3):
+            with RawWebSocket(gateway) as ws:
+                waiting = frame(b" " * 60_000 + b"{}") + frame(b'{"jsonrpc":"2.0","method":"stop"}')
+                ws.connection.sendall(waiting)
+        wait_for(lambda: daemon.methods.count("stop") == 23)
         with gateway.connect() as connection:
             connection.sendall(upgrade(gateway, origin=f"https://{gateway.host}"))
             assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")
             assert gateway.terminate() == 0
-
-
-class _Verified(ssl.SSLContext):
-    """Trusts one certificate, of localhost."""
-
-    def __new__(cls, certificate: Path) -> "_Verified":
-        return super().__new__(cls, ssl.PROTOCOL_TLS_CLIENT)
-
-    def __init__(self, certificate: Path) -> None:
-        self.load_verify_locations(certificate)
-
-    def wrap_socket(self, plain: socket.socket) -> ssl.SSLSocket:  # type: ignore[override]
-        """Wrap as a client of localhost."""
-        return super().wrap_socket(plain, server_hostname="localhost")
 
 
 def test_gateway_prints_an_ipv6_url_with_a_random_token(
@@ -140,17 +143,18 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> None:
     """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
-    accepted: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
     listening = listen(Settings(socket=tmp_path / "era.sock", host=host, port=0))
-    async with await asyncio.start_server(
-        lambda _, writer: accepted.put_nowait(writer), sock=listening
-    ):
-        _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
-        theirs = await accepted.get()
-        connection = theirs.get_extra_info("socket")
-        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-        for writer in (ours, theirs):
-            writer.close()
+    server = web.Server(AsyncMock())
+    accepting = asyncio.create_task(Acceptor(server, None).run(listening))
+    _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
+    await until(lambda: bool(server.connections))
+    theirs = server.connections[0].transport
+    assert theirs is not None
+    assert theirs.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    accepting.cancel()
+    await server.shutdown()
+    ours.close()
+    listening.close()
 
 
 def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
@@ -172,7 +176,7 @@ def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path,
     text.write_text("no certificate")
     for first, second in ((certificate, other), (certificate, locked), (text, text)):
         with pytest.raises(InputError, match=f"{first} and {second}.*without password"):
-            check_certificate(Settings(socket=tmp_path, certificate=first, key=second))
+            load_certificate(Settings(socket=tmp_path, certificate=first, key=second))
 
 
 def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
@@ -266,7 +270,7 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
         raise InputError("reached")
 
     monkeypatch.setattr("os.nice", forbidden)
-    monkeypatch.setattr("controller.gateway.serving.check_certificate", reached)
+    monkeypatch.setattr("controller.gateway.serving.load_certificate", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
 

@@ -4,10 +4,10 @@ import asyncio
 import socket
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
 from unittest.mock import AsyncMock, Mock
 
 import pytest
+from aiohttp import WSMessage, WSMsgType
 
 from controller.api import link
 from controller.api.async_client import AsyncClient
@@ -15,7 +15,6 @@ from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import API_VERSION
 from controller.gateway import bridge
-from controller.gateway.field import DrawnField
 from daemon_bench import PATIENCE
 from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon
 
@@ -117,21 +116,27 @@ async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
     assert not kept
 
 
+LEFT = WSMessage(WSMsgType.CLOSED, None, None)
+
+
 class DeafBrowser:
     """A WebSocket of a browser that reads the first frame only, and has sent others."""
 
-    client = None
-    query_params: tuple[()] = ()
-
     def __init__(self) -> None:
-        self.frames: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self.frames: asyncio.Queue[WSMessage] = asyncio.Queue()
         self.sent = 0
 
-    async def receive(self) -> dict[str, Any]:
-        """The next frame."""
-        return await self.frames.get()
+    def __aiter__(self) -> "DeafBrowser":
+        return self
 
-    async def send_text(self, _: str) -> None:
+    async def __anext__(self) -> WSMessage:
+        """The next frame."""
+        message = await self.frames.get()
+        if message is LEFT:
+            raise StopAsyncIteration
+        return message
+
+    async def send_str(self, _: str) -> None:
         """Send the first frame; the others wait."""
         self.sent += 1
         if self.sent > 1:
@@ -178,9 +183,9 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     stop = '{"jsonrpc":"2.0","id":9,"method":"st\\u006fp"}'
     play = '{"jsonrpc":"2.0","id":8,"method":"play","params":{"effect":"stop","x_m":0,"y_m":0}}'
     for text in [touch] * 1000 + [stop, play]:
-        browser.frames.put_nowait({"type": "websocket.receive", "text": text})
+        browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, text, ""))
     async with asyncio.timeout(PATIENCE):
-        await bridge.bridge(browser, path, DrawnField(path))  # type: ignore[arg-type]
+        await bridge.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
         lines = await read
     opened.abort()
     await asyncio.sleep(0)
@@ -188,15 +193,39 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     assert lines[-1] == stop.encode()
 
 
+async def test_others_have_a_turn_after_each_frame(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames of a browser wait."""
+    path, read = busy_daemon
+    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.5)
+    opened = await link.DaemonLink.open(path, "browser")
+    monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+    browser = DeafBrowser()
+    for _ in range(100):
+        browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, "{}", ""))
+    bridging = asyncio.create_task(bridge.bridge(browser, "", path, None))  # type: ignore[arg-type]
+    turns = 0
+    async with asyncio.timeout(PATIENCE):
+        while not browser.frames.empty():
+            await asyncio.sleep(0)
+            turns += 1
+        browser.frames.put_nowait(LEFT)
+        await bridging
+        await read
+    opened.abort()
+    await asyncio.sleep(0)
+    assert turns >= 100
+
+
 class LeavingBrowser(DeafBrowser):
     """A WebSocket of a browser that leaves when it is sent its second frame."""
 
-    async def send_text(self, _: str) -> None:
+    async def send_str(self, _: str) -> None:
         """Send a frame without waiting; the event loop sees next that the browser has left."""
         self.sent += 1
         if self.sent == 2:
-            left = {"type": "websocket.disconnect", "code": 1006}
-            asyncio.get_running_loop().call_soon(self.frames.put_nowait, left)
+            asyncio.get_running_loop().call_soon(self.frames.put_nowait, LEFT)
 
 
 async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
@@ -215,7 +244,7 @@ async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
     async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
         opened = await link.DaemonLink.open(path, "browser")
         monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
-        await bridge.bridge(browser, path, DrawnField(path))  # type: ignore[arg-type]
+        await bridge.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
     opened.abort()
     await asyncio.sleep(0)
     assert 2 <= browser.sent < 10

@@ -1,0 +1,424 @@
+"""Attacks on a gateway over TLS, and whether a stop of a fresh client gets through meanwhile.
+
+    python tests/support/gateway_attacks.py [--seconds S] [--only NAME ...] [--program ERA]
+
+Prints a row for each: stops within half a second, the slowest, the most processor time of the
+gateway within one (all that it does meanwhile), its memory before and at most, and what became of
+the attackers. Each attack is a process of its own, as is the gateway; all
+attackers come from one host, and those over a WebSocket have the token.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import os
+import resource
+import socket
+import ssl
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+from gateway_bench import (
+    ERA,
+    TOKEN,
+    GatewayProcess,
+    frame,
+    gateway_process,
+    http,
+    real_daemon,
+    upgrade,
+    wait_for_daemon,
+)
+from installed_program import installed_program
+
+LIMIT = 0.5  # s; for a stop
+_INTERVAL = 0.2  # s; between stops
+_PATIENCE = 2.0  # s; for a stop, and for memory to settle
+_CONNECTING = 8.0  # s
+_HALF_HELLO = b"\x16\x03\x01\x02\x00\x01"
+_TOUCH = b'{"jsonrpc":"2.0","method":"touch","params":{"source":"p","touches":[]}}'
+_HELLO = b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}'
+
+
+def make_certificate(folder: Path) -> tuple[Path, Path]:
+    """A self-signed certificate of localhost, and its key."""
+    certificate, key = folder / "panel.pem", folder / "panel.key"
+    subprocess.run(
+        [
+            *(installed_program("openssl", package="openssl"), "req", "-x509", "-newkey", "ec"),
+            *("-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "1"),
+            *("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
+            *("-keyout", str(key), "-out", str(certificate)),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    return certificate, key
+
+
+class Attacker:
+    """Attacks one gateway for a time [s]."""
+
+    def __init__(self, port: int, certificate: str, seconds: float) -> None:
+        self.seconds = seconds
+        self._port = port
+        self._tls = ssl.create_default_context(cafile=certificate)
+        self._upgrade = upgrade(SimpleNamespace(host=f"localhost:{port}"))  # type: ignore[arg-type]
+
+    async def many(self, count: int, attack: Callable[[int], Awaitable[str]]) -> str:
+        """So many at once; how many had which outcome."""
+        tasks = []
+        for number in range(count):
+            tasks.append(asyncio.create_task(self._outcome(attack(number))))
+            await asyncio.sleep(0.002)
+        outcomes = Counter(await asyncio.gather(*tasks))
+        return ", ".join(f"{count} {outcome}" for outcome, count in outcomes.most_common())
+
+    async def none(self, _: int) -> str:
+        """Nothing, for comparison."""
+        await asyncio.sleep(self.seconds)
+        return ""
+
+    async def half_handshake(self, _: int) -> str:
+        """The first bytes of a handshake."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", self._port)
+        writer.write(_HALF_HELLO)
+        return await self._held(reader, writer)
+
+    async def thousands(self) -> str:
+        """Half handshakes, a thousand in a second, all held."""
+        held: list[socket.socket] = []
+        for number in range(4000):
+            made = self._connect()
+            held.append(made)
+            asyncio.get_running_loop().call_later(0.01, _send, made)
+            if number % 10 == 9:
+                await asyncio.sleep(0.01)
+        await asyncio.sleep(self.seconds / 3)
+        for made in held:
+            made.close()
+        return f"{len(held)} opened"
+
+    async def storm(self) -> str:
+        """Two thousand connections in a second, each closed after 20 ms."""
+        begin = time.monotonic()
+        count = 0
+        while time.monotonic() < begin + self.seconds:
+            for _ in range(20):
+                asyncio.get_running_loop().call_later(0.02, self._connect().close)
+            count += 20
+            await asyncio.sleep(max(0, begin + count / 2000 - time.monotonic()))
+        return f"{count / self.seconds:.0f} in a second"
+
+    async def slow_head(self, _: int) -> str:
+        """A head by the byte."""
+        return await self._trickle(b"GET / HTTP/1.1\r\n")
+
+    async def slow_body(self, number: int) -> str:
+        """A body by the byte, with the token or without."""
+        token = "Authorization: Bearer " + TOKEN if number % 2 else "X: y"
+        head = f"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\n{token}\r\n"
+        media = "Content-Type: application/json\r\n"
+        return await self._trickle(f"{head}{media}Content-Length: 5000\r\n\r\n".encode())
+
+    async def idle(self, _: int) -> str:
+        """Nothing after a request."""
+        reader, writer = await self._open()
+        writer.write(b"GET /none HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        return await self._held(reader, writer)
+
+    async def large_head(self, number: int) -> str:
+        """A line of 100 KB, two hundred lines, or lines without end."""
+        lines = (
+            [b"X-a: " + b"x" * 100_000 + b"\r\n\r\n"],
+            [b"X-a: " + b"x" * 500 + b"\r\n"] * 200 + [b"\r\n"],
+            [b"X-a: " + b"x" * 500 + b"\r\n"] * 100_000,
+        )[number % 3]
+        return await self._send_all([b"GET / HTTP/1.1\r\nHost: localhost\r\n", *lines])
+
+    async def large_body(self, number: int) -> str:
+        """A hundred megabytes, sized or chunked, with the token or without."""
+        head = "POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        head += f"Authorization: Bearer {TOKEN}\r\n" if number % 2 else ""
+        if number % 4 < 2:
+            body = [b"Content-Length: 100000000\r\n\r\n"] + [b" " * 65536] * 1526
+        else:
+            body = [b"Transfer-Encoding: chunked\r\n\r\n"]
+            body += [b"10000\r\n" + b" " * 65536 + b"\r\n"] * 1526
+        return await self._send_all([head.encode(), *body])
+
+    async def unread_pages(self, _: int) -> str:
+        """Two hundred requests for the page, whose responses are not read."""
+        _, writer = await self._open()
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        writer.write(b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
+        end = time.monotonic() + self.seconds
+        while time.monotonic() < end and not writer.transport.is_closing():
+            writer.write(b"\r\n")  # fails once it is closed
+            await asyncio.sleep(0.2)
+        return _end(writer)
+
+    def frames(
+        self, data: bytes, *, first: bytes = b"", reads: bool = False
+    ) -> Callable[[int], Awaitable[str]]:
+        """Frames without pause over a WebSocket, whose own frames are read or not."""
+
+        async def flood(_: int) -> str:
+            reader, writer = await self._open()
+            writer.write(self._upgrade)
+            assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
+            if not reads:
+                writer.transport.pause_reading()  # type: ignore[attr-defined]
+            discarding = asyncio.create_task(_discard(reader)) if reads else None
+            writer.write(first)
+            with contextlib.suppress(TimeoutError, ConnectionError, ssl.SSLError):
+                async with asyncio.timeout(self.seconds):
+                    while not writer.transport.is_closing():
+                        writer.write(data)
+                        await writer.drain()
+                        await asyncio.sleep(0)
+            if discarding is not None:
+                discarding.cancel()
+            return _end(writer)
+
+        return flood
+
+    async def _open(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        async with asyncio.timeout(_CONNECTING):
+            return await asyncio.open_connection("localhost", self._port, ssl=self._tls)
+
+    def _connect(self) -> socket.socket:
+        made = socket.socket()
+        made.setblocking(False)
+        with contextlib.suppress(OSError):
+            made.connect(("127.0.0.1", self._port))
+        return made
+
+    async def _outcome(self, attack: Awaitable[str]) -> str:
+        try:
+            return await attack
+        except (OSError, asyncio.IncompleteReadError):
+            return "refused"
+
+    async def _held(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
+        """Whether a connection is still there at the end."""
+        with contextlib.suppress(TimeoutError, ConnectionError):
+            async with asyncio.timeout(self.seconds):
+                await _discard(reader)
+                return _end(writer, "closed")
+        return _end(writer)
+
+    async def _trickle(self, data: bytes) -> str:
+        reader, writer = await self._open()
+        writer.write(data)
+        discarding = asyncio.create_task(_discard(reader))
+        end = time.monotonic() + self.seconds
+        while time.monotonic() < end and not discarding.done():
+            writer.write(b" ")
+            await asyncio.sleep(0.5)
+        return _end(writer, "closed" if discarding.done() else "held")
+
+    async def _send_all(self, parts: Sequence[bytes]) -> str:
+        """The status of the response to a request in parts."""
+        reader, writer = await self._open()
+        with contextlib.suppress(ConnectionError, ssl.SSLError):
+            for part in parts:
+                writer.write(part)
+                await asyncio.wait_for(writer.drain(), self.seconds)
+        try:
+            async with asyncio.timeout(self.seconds):
+                return (await reader.read(4096))[9:12].decode() or "closed"
+        except (ConnectionError, ssl.SSLError):
+            return "closed"
+        finally:
+            writer.transport.abort()
+
+
+def _send(made: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        made.send(_HALF_HELLO)
+
+
+async def _discard(reader: asyncio.StreamReader) -> None:
+    with contextlib.suppress(ConnectionError, ssl.SSLError):
+        while await reader.read(1 << 16):
+            pass
+
+
+def _end(writer: asyncio.StreamWriter, outcome: str = "") -> str:
+    found = outcome or ("closed" if writer.transport.is_closing() else "held")
+    writer.transport.abort()
+    return found
+
+
+ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
+    "none": lambda a: a.many(1, a.none),
+    "600 half handshakes": lambda a: a.many(600, a.half_handshake),
+    "4 000 half handshakes, 1 000/s": lambda a: a.thousands(),
+    "2 000 connections/s": lambda a: a.storm(),
+    "300 slow heads, a byte per 0.5 s": lambda a: a.many(300, a.slow_head),
+    "200 slow bodies, half with the token": lambda a: a.many(200, a.slow_body),
+    "400 connections idle after a request": lambda a: a.many(400, a.idle),
+    "12 heads of 100 KB, or endless": lambda a: a.many(12, a.large_head),
+    "8 bodies of 100 MB, sized or chunked": lambda a: a.many(8, a.large_body),
+    "200 connections, 200 pages each unread": lambda a: a.many(200, a.unread_pages),
+    "8 WebSockets, empty fragments": lambda a: a.many(
+        8, a.frames(frame(b"", first=0x00) * 5000, first=frame(b"", first=0x01))
+    ),
+    "8 WebSockets, pings, nothing read": lambda a: a.many(
+        8, a.frames(frame(b"x" * 100, first=0x89) * 1000)
+    ),
+    "8 WebSockets, pongs": lambda a: a.many(8, a.frames(frame(b"", first=0x8A) * 5000)),
+    "20 WebSockets, replies unread": lambda a: a.many(20, a.frames(frame(_HELLO) * 500)),
+    "8 WebSockets, texts of 2 bytes": lambda a: a.many(
+        8, a.frames(frame(b"{}") * 5000, reads=True)
+    ),
+    "8 WebSockets, touches": lambda a: a.many(8, a.frames(frame(_TOUCH) * 500, reads=True)),
+}
+
+
+@dataclass
+class Stop:
+    """A stop by a fresh client: whether it was carried out, how long [s] it and the gateway took.
+
+    processor: time of the gateway's event loop on a processor from its beginning to its end, which
+    other programs do not lengthen.
+    """
+
+    is_done: bool
+    duration: float
+    processor: float
+
+
+@dataclass
+class Outcome:
+    """What an attack did to a gateway."""
+
+    stops: list[Stop]
+    memory_before: float  # MB
+    memory_most: float  # MB
+    attackers: str
+
+    def row(self, name: str) -> str:
+        """As a row of a table."""
+        in_time = sum(each.is_done and each.duration <= LIMIT for each in self.stops)
+        slowest = max(each.duration for each in self.stops)
+        processor = max(each.processor for each in self.stops)
+        return (
+            f"| {name} | {in_time} of {len(self.stops)} | {1e3 * slowest:.0f} "
+            f"| {1e3 * processor:.0f} | {self.memory_before:.0f} → {self.memory_most:.0f} "
+            f"| {self.attackers} |"
+        )
+
+
+def attack(gateway: GatewayProcess, name: str, certificate: Path, seconds: float) -> Outcome:
+    """Attack a gateway, and stop all the while."""
+    outcome = Outcome([], _memory(gateway), _memory(gateway), "")
+    arguments = (name, str(gateway.port), str(certificate), str(seconds))
+    attacking = subprocess.Popen(
+        [sys.executable, __file__, "--attack", *arguments], stdout=subprocess.PIPE, text=True
+    )
+    over = threading.Event()
+    watching = threading.Thread(target=_watch, args=(gateway, outcome, over))
+    watching.start()
+    try:
+        while attacking.poll() is None:
+            begin = time.monotonic()
+            outcome.stops.append(_stop(gateway))
+            time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
+        assert attacking.stdout is not None
+        outcome.attackers = attacking.stdout.read().strip()
+    finally:
+        over.set()
+        watching.join()
+        attacking.kill()
+        attacking.communicate()
+    return outcome
+
+
+def _stop(gateway: GatewayProcess) -> Stop:
+    """Stop by a fresh client."""
+    begin, processor = time.monotonic(), _processor(gateway)
+    is_done = False
+    with contextlib.suppress(OSError):
+        is_done = http(gateway, "/api/v1/stop", body=b"", timeout=_PATIENCE).status == 200
+    return Stop(is_done, time.monotonic() - begin, _processor(gateway) - processor)
+
+
+def _processor(gateway: GatewayProcess) -> float:
+    """Time of its main thread on a processor [s]."""
+    return int(Path(f"/proc/{gateway.process.pid}/schedstat").read_text().split()[0]) / 1e9
+
+
+def _watch(gateway: GatewayProcess, outcome: Outcome, over: threading.Event) -> None:
+    while not over.wait(0.03):
+        outcome.memory_most = max(outcome.memory_most, _memory(gateway))
+
+
+def _memory(gateway: GatewayProcess) -> float:
+    """Resident memory [MB]."""
+    pages = int(Path(f"/proc/{gateway.process.pid}/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+@contextmanager
+def attacked_gateway(
+    folder: Path, daemon: Path, program: Sequence[str | Path] = (ERA,)
+) -> Iterator[tuple[GatewayProcess, Path]]:
+    """A gateway over TLS, connected to its daemon, and its certificate."""
+    certificate, key = make_certificate(folder)
+    tls = ("--certificate", str(certificate), "--key", str(key))
+    with gateway_process(folder, daemon, *tls, program=program) as gateway:
+        gateway.trust(certificate)
+        wait_for_daemon(gateway)
+        yield gateway, certificate
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--only", nargs="*", default=list(ATTACKS))
+    parser.add_argument("--program", default=ERA)
+    given = parser.parse_args(arguments)
+    _print("| attack | stops within 0.5 s | slowest, ms | processor, ms | memory, MB | attackers |")
+    _print("|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder, real_daemon(Path(folder)) as daemon:
+        for name in given.only:
+            with attacked_gateway(Path(folder), daemon, (given.program,)) as (gateway, trusted):
+                _print(attack(gateway, name, trusted, given.seconds).row(name))
+
+
+def _attack(name: str, port: str, certificate: str, seconds: str) -> None:
+    logging.disable()
+    os.nice(10)  # as the gateway; attackers elsewhere would take none of its processor
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    attacker = Attacker(int(port), certificate, float(seconds))
+
+    async def run() -> str:
+        return await ATTACKS[name](attacker)
+
+    _print(asyncio.run(run()))
+
+
+def _print(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--attack"]:
+        _attack(*sys.argv[2:])
+    else:
+        main(sys.argv[1:])

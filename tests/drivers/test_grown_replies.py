@@ -8,7 +8,7 @@ from drivers.by_hand.reaching import status_rows
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from drivers.protocol.table import MESSAGES, QUANTITIES, STATUS
-from firmware_header import header
+from firmware_records import records_header
 from grown_status import LATER, WORD
 from grown_status import age as age
 from hand_written_talk import HALF, Talk
@@ -74,10 +74,10 @@ def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
 
 @pytest.mark.parametrize("age", ["same"], indirect=True)
 def test_pages_and_files_have_what_is_added(age: str) -> None:
-    """At the end of its row and sheet; the places of the header stay as they are."""
+    """At the end of its row, of the sheet, and of what the firmware sends."""
     assert " · later_voltage (added) |" in records()
     assert f"[2002sub{_OLDER + 1:X}]\nParameterName=later_voltage\n" in eds_text()
-    assert "STATUS_LEVELS = 9, STATUS_WORDS = 9, STATUS_CHANNELS_SHIFT" in header()
+    assert "from->layers);\n    PUT(words, from->later_voltage);\n}" in records_header()
 
 
 def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:

@@ -10,7 +10,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "python-api.md"
 @pytest.mark.parametrize(
     "fact",
     [
-        "Raises InputError for a missing, damaged or foreign file.",  # errors of a function
+        "Raises InputError for a missing, damaged or foreign file, with",  # errors of a function
         "slew [1/s]: highest rise of a level;",  # units of a class's fields
         "peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]",  # shapes
         "- `disarm() -> None`: Fall silent, then switch the high voltage off.",  # a method

@@ -150,9 +150,11 @@ def _drawn(rng: random.Random, toward: Toward) -> list[FaultWindow]:
     if drawn < 0.25:
         return []
     delay = rng.choice((0.005, 0.04, _MAX_DELAY))
+    shares = {fault: rng.choice((0.0, 0.1, 0.3, 0.6)) for fault in _FRAME_FAULTS}
     return [
-        FaultWindow(fault=fault, share=rng.choice((0.0, 0.1, 0.3, 0.6)), toward=toward, delay=delay)
-        for fault in _FRAME_FAULTS
+        FaultWindow(fault=fault, share=share, toward=toward, delay=delay)
+        for fault, share in shares.items()
+        if share
     ]
 
 

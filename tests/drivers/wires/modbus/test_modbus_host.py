@@ -3,11 +3,11 @@
 import asyncio
 
 import pytest
-from drivers.wires.modbus.registers import HEAD
 
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.protocol.table import MESSAGES, STATUS
+from drivers.wires.modbus.frames import HEAD
 from drivers.wires.modbus.host import ModbusWire
 from drivers.wires.wire import Broken, More, Nak, Reply
 from sim.amplifier.contract import Amplifier

@@ -87,7 +87,8 @@ def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
 
 
 def test_files_that_pages_name_are_there() -> None:
-    """In any folder of the project; decisions name what was there when they were made."""
+    """In any folder, and tests by their bare names; decisions name what was there at the time."""
+    tests = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
     folders = "|".join(path.name for path in ROOT.iterdir() if path.is_dir())
     named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
     gone = {
@@ -97,7 +98,9 @@ def test_files_that_pages_name_are_there() -> None:
         for name in named.findall(page.read_text("utf-8"))
         if not (ROOT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
     }
+    pages = [page.read_text("utf-8") for page in PAGES if "decisions" not in page.parts]
     assert gone == set()
+    assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
 
 
 PAGE = (ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")

@@ -51,7 +51,7 @@ class Lines:
         """Return the amplifier of a URL, its line open, nothing sent; see `Amplifier`.
 
         A line that was lost is opened anew; amplifiers of the lost one stay lost. Raises
-        CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
+        CommandError for text that is no URL, LinkError for a line that cannot be opened, or an
         address that is taken by one of another name; one of this name gives way.
         """
         address, before = address_of(url), self._opened

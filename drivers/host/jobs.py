@@ -123,7 +123,7 @@ class Later(NamedTuple):
 
 
 class Member(Protocol):
-    """An amplifier on a line, which is told of what is sent to it and what comes from it."""
+    """An amplifier on a line, which notes what is sent to it and what comes from it."""
 
     name: str
     address: int

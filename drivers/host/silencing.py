@@ -31,7 +31,7 @@ class Silencing:
     def start(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
-        """Start a stop or disarm, which goes on to its end whoever is cancelled meanwhile."""
+        """Start a stop or disarm, which goes on to its end whatever is cancelled meanwhile."""
         task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -159,7 +159,7 @@ class Wire(Protocol):
     delay: float
     """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
     is_kept: bool = False
-    """Whether a frame is sent again until somebody takes it, as by an adapter on a CAN bus."""
+    """Whether a frame is sent again until another node takes it, as by an adapter on a CAN bus."""
     takes: float = 0.0
     """How long what was sent last takes to arrive [s]; 0 over a network."""
     blocked: str = "the port takes no bytes: check flow control and the adapter"

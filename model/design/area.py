@@ -65,7 +65,7 @@ def area_of(where: str, plate: Plate) -> Area:
     """The area of a name, a picture or a file of polygons.
 
     Raises InputError for a picture that cannot be read or has other proportions than the plate, and
-    for a file that is none.
+    for another kind of file.
     """
     length, width = plate.length, plate.width
     if where in (EDGE, ANYWHERE):

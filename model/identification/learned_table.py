@@ -46,7 +46,7 @@ class LearnedTable:
     def resumed(cls, table: LocalizationTable, known: Known, *, file: Path) -> Self:
         """A table with what was learned of it before, if its file is there.
 
-        Raises InputError for a file that is none, OtherPlate for one of another table or of other
+        Raises InputError for another kind of file, OtherPlate for one of another table or of other
         parameters.
         """
         if not file.exists():

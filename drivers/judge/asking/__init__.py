@@ -87,7 +87,7 @@ CLIENTS: Mapping[str, Callable[[int], Client]] = {
 async def opened(url: str) -> AsyncIterator[Client]:
     """The client of an amplifier by its URL while its line is open, and its board has started.
 
-    Raises CommandError for a URL that is none, LinkError for a line that cannot be opened.
+    Raises CommandError for text that is no URL, LinkError for a line that cannot be opened.
     """
     address = address_of(url)
     protocol = str(address.settings["protocol"])
@@ -124,7 +124,7 @@ async def judge(
 
     drives: also what arms it and drives its channels, at this level of full level at most.
     on_result: called with each result. before: report of checks that are not run again. Raises
-    CommandError for a URL that is none, LinkError for a line that cannot be opened or is lost.
+    CommandError for text that is no URL, LinkError for a line that cannot be opened or is lost.
     """
     results = () if before is None else before.results
     known = {each.number for each in results}

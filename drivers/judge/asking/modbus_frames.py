@@ -68,7 +68,7 @@ class ModbusClient(Client):
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False)
 
     def hear(self, data: bytes) -> bytes:
-        """Take responses from bytes, also what is none; those of a gateway are left out."""
+        """Take responses from bytes, also other bytes; those of a gateway are left out."""
         for adu in self._reader.feed(data):
             is_own = adu.unit == self.address or not adu.pdu
             if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY:

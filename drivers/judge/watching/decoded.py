@@ -84,7 +84,7 @@ class Notice:
 
     carried out: the amplifier has carried the request of a key out; read on: the host goes on with
     it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
-    has reset it. other host: its request, by name. damaged: a frame that is none, and why.
+    has reset it. other host: its request, by name. damaged: invalid bytes, and why.
     started_at: when the first of its frames passed, infinite where it is one [s].
     """
 

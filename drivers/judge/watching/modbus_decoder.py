@@ -56,7 +56,7 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _Transaction:
-    """One whose response is missing; request: None where that is none."""
+    """One whose response is missing; request: None where it is no request."""
 
     adu: Adu
     key: Hashable

@@ -132,7 +132,7 @@ _SILENCE = 1.0  # s; twenty heartbeats of an amplifier
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames, and with an error where text ends in BEL or is none;
+    on_data: called with packed frames, and with an error where text ends in BEL or is no text;
     on_other: with other text; hello: goes before frames while none has come for a second, since an
     adapter may have restarted, as by the opening of its port; cut_off: ends a line of which a port
     that was blocked has dropped the rest; goodbye: sent before it is closed.

@@ -109,7 +109,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
 
 @in_virtual_time
 async def test_lease_is_lost_with_the_daemon_that_gave_it(tmp_path: Path) -> None:
-    """Another one at the same socket is not armed; who waits for events is told, as who calls."""
+    """Another one at the same socket is not armed; waiting for events fails as calls do."""
     async with far_end(tmp_path) as far, contextlib.AsyncExitStack() as armed:
         async with daemon_at(far, tmp_path) as bench, await bench.client() as first:
             await until_state(first, READY)

@@ -89,7 +89,7 @@ class Panel(TouchSource):
         return None if self.name != "z" else str(1 / 0)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver a frame, of a touch that is and one that is none."""
+        """Deliver a frame, of a valid touch and an invalid one."""
         deliver(TouchFrame(self.name, 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
         if self.error is not None:
             raise self.error

@@ -184,7 +184,7 @@ STATUS = Record(
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
-    # Later ones, as _reading("supply_voltage", 1, 65535, 100, "V", "status", is_added=True)
+    # Later readings: _reading(..., "status", "page", is_added=True), the views where it is shown.
 )
 READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.views is not None]
 """Fields of Status that are values in a unit for people."""

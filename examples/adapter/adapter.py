@@ -20,7 +20,7 @@ from typing import Protocol
 
 from drivers.playing.playback import Voice
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import FEATURES, QUANTITIES, STATUS_FLAGS
+from drivers.protocol.table import FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
@@ -82,7 +82,8 @@ class AdaptedAmplifier(Amplifier):
 
     def status(self, now: float) -> Values:
         """Return the status with what the device may still play, without what is not measured."""
-        status = {**super().status(now), "high_voltage": 0, "temperature": 250}
+        not_measured = {each.name: None for each in STATUS.added}
+        status = {**super().status(now), **not_measured, "high_voltage": 0, "temperature": 250}
         pairs = zip(status["levels"], self.device_levels, strict=True)
         status["levels"] = [level or _LEVEL.to_wire(played) for level, played in pairs]
         if any(status["levels"]):

@@ -110,7 +110,8 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
     """The files of tests that changed files reach, by path: 0 in their folder, then by imports.
 
     Of a file that is no module those are 0 that name it, then come those of its folder. Of as many
-    imports those of a near folder come first, and those that take long last.
+    imports those of a near folder come first, and those that take long last; before all of them
+    come tests that are changed themselves.
     """
     start: dict[str, int] = {}
     for path in changed:
@@ -127,10 +128,10 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
     if "conftest" in start:
         distances = dict.fromkeys(_tests(), 1) | distances
 
-    def place(test: str) -> tuple[int, int, bool, str]:
+    def place(test: str) -> tuple[bool, int, int, bool, str]:
         common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
         shared = max(len(Path(each).parts) for each in common)
-        return distances[test], -shared, Path(test).name in SLOWEST, test
+        return test not in changed, distances[test], -shared, Path(test).name in SLOWEST, test
 
     order = sorted((path for path in _tests() if path in distances), key=place)
     return {path: distances[path] for path in order}

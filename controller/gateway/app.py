@@ -296,7 +296,11 @@ class Gateway:
         )
         if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
             raise web.HTTPForbidden(text="too many clients")
-        is_valid = SUBPROTOCOL in map(str.strip, protocols) and socket.can_prepare(request)
+        is_valid = SUBPROTOCOL in map(str.strip, protocols) and not request.can_read_body
+        try:
+            is_valid = is_valid and bool(socket.can_prepare(request))
+        except ValueError:  # of a key that is not ASCII
+            is_valid = False
         if not (is_valid and connection.upgrade()):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
         self._sessions.add(request.task)  # before the first await, so that the limit holds

@@ -71,7 +71,6 @@ class ClientConnection(asyncio.Protocol):
     def __init__(self, acceptor: "Acceptor") -> None:
         self.link = KeptLink(acceptor.links)
         self._acceptor = acceptor
-        self._last = b""  # bytes received
         self._frames: FrameHeads | None = None
         self._is_answering = False
 
@@ -88,7 +87,6 @@ class ClientConnection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand data on, unless they are frames that are not allowed."""
-        self._last = (self._last + data[-4:])[-4:]
         if self._frames is None or self._frames.accept(data):
             self._server.data_received(data)
         else:
@@ -148,9 +146,13 @@ class ClientConnection(asyncio.Protocol):
         return f"{peer[0]}:{peer[1]}"
 
     def upgrade(self) -> bool:
-        """Expect frames, unless some came too early, before this was accepted; whether it does."""
-        self._frames = FrameHeads() if self._last == b"\r\n\r\n" else None
-        return self._frames is not None
+        """Expect frames, unless some came too early, before this was accepted; whether it does.
+
+        The server keeps what came behind the head, which may end as a head does.
+        """
+        is_early = bool(self._server._message_tail)  # type: ignore[attr-defined]
+        self._frames = None if is_early else FrameHeads()
+        return not is_early
 
 
 def connection_of(request: web.Request) -> ClientConnection:

@@ -20,6 +20,7 @@ What a broken network delivers later than that is not accounted for.
 _CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
 _NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for
 _NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
+_READ_MAX = 4096  # bytes at once; others have their turn between
 _UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
@@ -43,7 +44,7 @@ async def open_connection(
         ) from error
 
 
-class _Connection(asyncio.Protocol):
+class _Connection(asyncio.BufferedProtocol):
     """A TCP connection."""
 
     def __init__(
@@ -51,6 +52,7 @@ class _Connection(asyncio.Protocol):
     ) -> None:
         self._endpoint = endpoint
         self._on_data = on_data
+        self._buffer = bytearray(_READ_MAX)
         self._on_loss = on_loss
         self._is_closed = self.is_made = False
         self._transport: asyncio.Transport  # set when connected
@@ -68,9 +70,12 @@ class _Connection(asyncio.Protocol):
             timeout = round(1000 * NETWORK_DELAY)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
         if not self._is_closed:
-            self._on_data(data)
+            self._on_data(bytes(self._buffer[:nbytes]))
 
     def connection_lost(self, exc: Exception | None) -> None:
         if not self._is_closed:

@@ -53,6 +53,7 @@ EXCEPTIONS: Mapping[int, str] = {
 """Refusals that exceptions stand for."""
 
 _RTU_MIN, _RTU_MAX = 4, 256  # bytes; unit, function and CRC at least
+_TRIES_MAX = 512  # places at which a frame is looked for at once; noise has no end
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
 _COUNT_MAX = {3: 125, 4: 125, WRITE: 123}  # registers by function
@@ -219,6 +220,7 @@ class AduReader:
     def _split_rtu(self, data: bytes, request: Message | None, *, waits: bool) -> list[Adu]:
         found: list[Adu] = []
         start, rest = 0, -1  # where a frame is looked for, and where one may become whole
+        tries = 0
         while start < len(data):
             size = self._size(data[start : start + _RTU_MAX])
             is_whole = 0 < size <= len(data) - start
@@ -230,12 +232,15 @@ class AduReader:
                 found.append(adu)
                 data, start, rest, self._is_lost = data[start + size :], 0, -1, False
                 continue
-            may_end = size == 0 and waits and not is_behind  # by a pause
+            is_short = len(data) <= _RTU_MAX
+            may_end = size == 0 and waits and not is_behind and is_short  # by a pause
             if rest < 0 and (size > len(data) - start or may_end):
                 rest = start
-            if rest == start and waits and not is_behind and len(data) <= _RTU_MAX:
+            if rest == start and waits and not is_behind and is_short:
                 break
-            start += 1
+            start, tries = start + 1, tries + 1
+            if tries >= _TRIES_MAX:
+                start = max(start, len(data) - _RTU_MAX)
         rest = len(data) if rest < 0 else rest
         if rest:
             found.append(Adu(0, b"", raw=data[:rest]))

@@ -94,7 +94,8 @@ class ModbusWire(Wire):
         self._last: _Request | None = None  # that was replied to, and how
         self._replied = Response()
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False, is_host=True)
-        self._damaged = b""  # behind the last valid frame
+        self._damaged = b""  # behind the last valid frame, no more than tells it from a frame
+        self._damaged_size = 0  # bytes of it
         self._unawaited: set[int] = set()  # transactions whose responses are passed over
         self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
 
@@ -206,8 +207,9 @@ class ModbusWire(Wire):
     def _count_damaged(self, data: bytes) -> None:
         """Count bytes that are no frame, once between two frames."""
         self.counters.invalid_frames += not self._damaged
-        self._damaged += data
-        what = f"{len(self._damaged)} bytes that are no valid frame came "
+        self._damaged_size = len(data) + (self._damaged_size if self._damaged else 0)
+        self._damaged = (self._damaged + data[: _FRAME_MAX + 5])[: _FRAME_MAX + 5]
+        what = f"{self._damaged_size} bytes that are no valid frame came "
         what += f"({self._damaged[:8].hex(' ')})"
         if self._request is not None and self._damaged == self._request.frame:
             what = "the request itself came back, and nothing else"

@@ -339,10 +339,33 @@ def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: 
         assert ws.close_code() in codes
 
 
-def test_websocket_with_frames_before_its_acceptance_is_refused(gateway: GatewayProcess) -> None:
-    """Which would not be checked."""
-    sent = upgrade(gateway) + frame(REQUEST)
-    assert raw(gateway, sent).status == 403
+@pytest.mark.parametrize(
+    "early",
+    [
+        pytest.param(frame(REQUEST), id="whole"),
+        pytest.param(b"\x89\x80\r\n\r\n", id="whole, as the end of a head"),
+        pytest.param(b"\x89\x8a\r\n\r\n", id="begun, as the end of a head"),
+    ],
+)
+def test_websocket_with_frames_before_its_acceptance_is_refused(
+    gateway: GatewayProcess, early: bytes
+) -> None:
+    """Which would not be checked; from the rest of one begun all others would be misread."""
+    assert raw(gateway, upgrade(gateway) + early).status == 403
+
+
+@pytest.mark.parametrize(
+    "more", [["Content-Length: 100"], ["Transfer-Encoding: chunked"], ["Sec-WebSocket-Key: \xe9"]]
+)
+def test_websocket_with_a_body_or_a_key_that_is_not_ascii_is_refused(
+    gateway: GatewayProcess, more: list[str]
+) -> None:
+    """Without a record in the log."""
+    lines = upgrade(gateway).decode().split("\r\n")
+    kept = [each for each in lines if not each.startswith(more[0].partition(":")[0])]
+    with gateway.connect() as connection:
+        connection.sendall("\r\n".join([*kept[:-2], *more, "", ""]).encode())
+        assert connection.recv(1 << 16)[9:12] == b"403"
 
 
 def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:

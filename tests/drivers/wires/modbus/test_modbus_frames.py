@@ -6,6 +6,7 @@ import random
 import pytest
 from pymodbus.logging import Log
 
+from drivers.wires.modbus import frames
 from drivers.wires.modbus.frames import (
     Adu,
     AduReader,
@@ -136,3 +137,33 @@ def test_damaged_bytes_raise_and_log_nothing(caplog: pytest.LogCaptureFixture) -
     assert exception_to(16, 3) == b"\x90\x03"
     Log.error("of a library")
     assert caplog.records == []
+
+
+@pytest.mark.parametrize("noise", [b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"])
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("part", [250, 1 << 18])
+def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
+    noise: bytes, waits: bool, part: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of its bytes is there once, and the frame behind it is found."""
+    tried = 0
+
+    def counted(frame: bytes) -> Adu | None:
+        nonlocal tried
+        tried += 1
+        return checked(frame)
+
+    checked = frames._checked
+    monkeypatch.setattr(frames, "_checked", counted)
+    reader = AduReader(is_rtu=True, of_requests=waits, waits=waits)
+    data = (noise * (1 << 18))[: 1 << 18]
+    found: list[Adu] = []
+    for at in range(0, len(data), part):
+        tried = 0
+        found += reader.feed(data[at : at + part])
+        assert len(reader.rest) <= 256
+        assert tried <= 1024
+    response = bytes.fromhex("01 10 06 00 00 03 80 80")
+    found += reader.end() + reader.feed(WHOLE if waits else response)
+    assert b"".join(each.raw for each in found) == data + found[-1].raw
+    assert [each.raw for each in found if each.pdu] == [WHOLE if waits else response]

@@ -34,6 +34,7 @@ _MALFORMED = "\r\n".join(
         _MALFORMED_BODY,
     ]
 ).encode()
+_END_OF_HEAD = b"\r\n\r\n"
 _PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 
 
@@ -73,6 +74,8 @@ class ClientConnection(asyncio.Protocol):
         self._acceptor = acceptor
         self._frames: FrameHeads | None = None
         self._is_answering = False
+        self._last = b""  # bytes of a head
+        self._behind: int | None = None  # bytes received since the end of a head, None before it
 
     def __getattr__(self, name: str) -> Any:
         """What the web server needs of a transport, but for what is defined here."""
@@ -87,6 +90,13 @@ class ClientConnection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand data on, unless they are frames that are not allowed."""
+        if self._behind is None:
+            self._last += data
+            _, end, behind = self._last.partition(_END_OF_HEAD)
+            self._last = b"" if end else self._last[1 - len(_END_OF_HEAD) :]
+            self._behind = len(behind) if end else None
+        else:
+            self._behind += len(data)
         if self._frames is None or self._frames.accept(data):
             self._server.data_received(data)
         else:
@@ -135,7 +145,7 @@ class ClientConnection(asyncio.Protocol):
 
     def end_response(self) -> None:
         """Wait for the next request."""
-        self._is_answering = False
+        self._is_answering, self._behind, self._last = False, None, b""
         if not self._transport.is_closing():
             self._acceptor.idle.start(self, self._transport.abort)
 
@@ -146,13 +156,9 @@ class ClientConnection(asyncio.Protocol):
         return f"{peer[0]}:{peer[1]}"
 
     def upgrade(self) -> bool:
-        """Expect frames, unless some came too early, before this was accepted; whether it does.
-
-        The server keeps what came behind the head, which may end as a head does.
-        """
-        is_early = bool(self._server._message_tail)  # type: ignore[attr-defined]
-        self._frames = None if is_early else FrameHeads()
-        return not is_early
+        """Expect frames, unless some came too early, before this was accepted; whether it does."""
+        self._frames = FrameHeads() if self._behind == 0 else None
+        return self._frames is not None
 
 
 def connection_of(request: web.Request) -> ClientConnection:

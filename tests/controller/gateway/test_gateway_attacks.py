@@ -5,6 +5,7 @@ gateway is a process connected to a daemon that records its calls.
 """
 
 import json
+import socket
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
@@ -366,6 +367,18 @@ def test_websocket_with_a_body_or_a_key_that_is_not_ascii_is_refused(
     with gateway.connect() as connection:
         connection.sendall("\r\n".join([*kept[:-2], *more, "", ""]).encode())
         assert connection.recv(1 << 16)[9:12] == b"403"
+
+
+def test_websocket_is_accepted_byte_by_byte_after_a_page(gateway: GatewayProcess) -> None:
+    """Its head ends with its last byte, wherever the bytes were divided."""
+    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
+    with gateway.connect() as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.sendall(first)
+        assert b"</svg>" in connection.recv(1 << 16)
+        for byte in upgrade(gateway):
+            connection.sendall(bytes([byte]))
+        assert connection.recv(1 << 16)[9:12] == b"101"
 
 
 def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:

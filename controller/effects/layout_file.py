@@ -173,7 +173,9 @@ def _check_use(
     elif is_for_motion and not effect.is_for_motion:
         validation.add(path, f"{name} is not for motion; put it under on_press or on_release")
     elif path[-1] == "on_release" and not effect.has_end:
-        validation.add(path, f"{name} must end by itself; give it a duration")
+        can_end = "duration" in type(effect).model_fields
+        remedy = "give it a duration" if can_end else "choose an effect that does"
+        validation.add(path, f"{name} must end by itself; {remedy}")
 
 
 def _region(name: str, section: RegionSection) -> Region:

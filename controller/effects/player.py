@@ -128,8 +128,10 @@ class EffectPlayer:
             return f"{name} came too soon after those of other fingers; touch there again"
         if key in self._sensing:
             return f"{name} is felt by the newest finger outside of all regions; lift that one"
-        if name:
+        if name and self.layout.effects[name].is_for_motion:
             return f"{name} is not felt at rest; move the finger"
+        if name:
+            return f"{name} pauses; it goes on by itself"
         if finger.ended:
             return f"{finger.ended} ended; touch there again"
         return "no effect plays there; touch again, in a region that has one"

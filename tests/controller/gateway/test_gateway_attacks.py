@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import httpx
 import pytest
 
-from controller.gateway.frames import MAX_FRAGMENTS
+from controller.gateway.frames import MAX_FRAGMENTS, FrameHeads
 from gateway_bench import (
     ARM,
     TOKEN,
@@ -319,6 +319,169 @@ MISUSES: dict[str, tuple[Misuse, set[int]]] = {
     "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), FLOOD),
     "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), FLOOD),
     "not masked": (lambda ws: ws.connection.sendall(b"\x81\x02{}"), {1002}),
+    "invalid UTF-8": ({"body": b'{"owner": "\xff\xfe", "lease_s": 5}'}, {400}),
+    "pickle": ({"body": b"\x80\x04}\x94."}, {400}),
+    "lease too long": ({"body": b'{"owner": "me", "lease_s": 1e6}'}, {422}),
+    "raised limit": ({"body": b'{"owner": "me", "lease_s": 5, "level_max": 9}'}, {422}),
+    "escape codes in a name": ({"body": b'{"owner": "\\u001b[2J", "lease_s": 5}'}, {422}),
+    # methods
+    "method of Python": ({"target": "/api/v1/__class__"}, {404}),
+    "method of the WebSocket": ({"target": "/api/v1/subscribe"}, {404}),
+    "escape codes in a method": ({"target": "/api/v1/%1b%5b2J"}, {400}),
+    "line feed in a method": ({"target": "/api/v1/arm%0aERROR:%20lost"}, {400}),
+    "GET": (get("/api/v1/arm"), {405}),
+    "OPTIONS": (get("/api/v1/arm", "OPTIONS"), {405}),
+}
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_http_request_is_refused(gateway: GatewayProcess, name: str) -> None:
+    """With the right status, and without the content of a file."""
+    changes, statuses = ATTACKS[name]
+    response = http(gateway, **filled(changes, gateway))
+    assert response.status in statuses, response
+    assert b"root:" not in response.body
+    assert b"import" not in response.body
+
+
+CHUNKED = (
+    b"POST /api/v1/arm HTTP/1.1\r\nHost: HOST\r\nAuthorization: Bearer "
+    + TOKEN.encode()
+    + b"\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
+)
+
+GRANTED = CHUNKED.replace(
+    b"Transfer-Encoding: chunked", b"Connection: close\r\nContent-Length: %d" % len(ARM)
+)
+GRANTED += ARM
+
+
+@pytest.mark.parametrize(
+    ("data", "statuses"),
+    [
+        pytest.param(
+            b"POST /api/v1/arm HTTP/1.0\r\nContent-Length: 0\r\n\r\n", {421}, id="no host"
+        ),
+        pytest.param(CHUNKED + (b"10000\r\n" + b" " * 65536 + b"\r\n") * 8, {413}, id="chunks"),
+        pytest.param(bytes(range(256)) * 40 + b"\r\n\r\n", {400}, id="noise"),
+    ],
+)
+def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: set[int]) -> None:
+    """Without Host, a chunked body without end, no HTTP, and heads that a proxy may misread."""
+    assert raw(gateway, filled(data, gateway)).status in statuses
+
+
+LENGTH = b"Content-Length: %d" % len(ARM)
+AMBIGUOUS = {
+    "line feeds alone": GRANTED.replace(b"\r\n", b"\n"),
+    "one line feed alone": GRANTED.replace(TOKEN.encode() + b"\r\n", TOKEN.encode() + b"\n"),
+    "one carriage return alone": GRANTED.replace(b"Type: ", b"Type: x\rX-a: "),
+    "folded line": GRANTED.replace(b"Type: ", b"Type:\r\n "),
+    "two ways to give the length": GRANTED.replace(
+        LENGTH, b"Transfer-Encoding: chunked\r\n" + LENGTH
+    ),
+    "two lengths": GRANTED.replace(LENGTH, b"Content-Length: 3\r\n" + LENGTH),
+    "length with a sign": GRANTED.replace(b"Length: ", b"Length: +"),
+    "negative length": GRANTED.replace(b"Length: ", b"Length: -"),
+    "unknown encoding": GRANTED.replace(LENGTH, b"Transfer-Encoding: xchunked"),
+    "tab before the colon": GRANTED.replace(b"Length: ", b"Length\t: "),
+    "space before the colon": GRANTED.replace(b"Length: ", b"Length : "),
+}
+
+
+@pytest.mark.parametrize("name", AMBIGUOUS)
+def test_head_that_a_proxy_may_misread_is_refused(gateway: GatewayProcess, name: str) -> None:
+    """After a request that is served, and in pieces; without the client's text or a server's name.
+
+    With the security headers, as all responses, and in JSON.
+    """
+    head, _, body = filled(AMBIGUOUS[name], gateway).partition(b"\r\n\r\n")
+    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
+    with gateway.connect() as connection:
+        connection.sendall(first)
+        assert b"</svg>" in connection.recv(1 << 16)
+        connection.sendall(head[:-1])
+        assert http(gateway, target="/api/v1/openapi.json", method="GET").status == 200
+        connection.sendall(head[-1:] + b"\r\n\r\n" + body)
+        received = b""
+        while part := connection.recv(1 << 16):
+            received += part
+    head, _, body = received.lower().partition(b"\r\n\r\n")
+    assert head.startswith(b"http/1.1 400 ")
+    assert b"\r\nx-frame-options: deny\r\n" in head
+    assert b"\r\ncontent-security-policy: default-src 'none'" in head
+    assert json.loads(body).keys() == {"error"}
+    for text in (b"aiohttp", b"server:", b"content-type: \r\n", TOKEN.encode(), b"xchunked"):
+        assert text not in received.lower()
+
+
+def test_body_is_asked_for_only_with_the_token(gateway: GatewayProcess) -> None:
+    """Before its 100 Continue everything of the head is checked; then the request is granted."""
+    head, body = filled(GRANTED, gateway).split(b"\r\n\r\n")
+    for sent, status in (
+        (head.replace(TOKEN.encode(), b"x" * len(TOKEN)), b"401"),
+        (head.replace(b"application/json", b"text/plain"), b"415"),
+        (head.replace(b"v1/arm", b"v1/nosuch"), b"404"),
+        (head.replace(b"/arm", b"/arm/arm"), b"4"),
+    ):
+        with gateway.connect() as connection:
+            connection.sendall(sent + b"\r\nExpect: 100-continue\r\n\r\n")
+            assert connection.recv(1 << 16)[9:12].startswith(status)
+    with gateway.connect() as connection:
+        connection.sendall(head.replace(b"arm", b"forget") + b"\r\nExpect: 100-continue\r\n\r\n")
+        assert connection.recv(1 << 16) == b"HTTP/1.1 100 Continue\r\n\r\n"
+        connection.sendall(body.replace(b"owner", b"elsee"))
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
+
+
+OWN = f"era-haptics.token.{TOKEN}"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"host": "evil.example"},
+        {"protocols": ["era-haptics.v1"]},
+        {"protocols": ["era-haptics.v1", "era-haptics.token.x"]},
+        {"protocols": ["era-haptics.v1", OWN, OWN]},
+        {"protocols": ["era-haptics.v1"], "target": f"/api/v1/ws?token={TOKEN}"},
+        {"protocols": [OWN]},
+        {"protocols": []},
+        {"target": "/api/v1/arm"},
+    ],
+    ids=str,
+)
+def test_websocket_is_refused(gateway: GatewayProcess, changes: dict[str, Any]) -> None:
+    """A foreign origin or host, a missing, wrong or repeated token, no subprotocol, other paths."""
+    assert raw(gateway, upgrade(gateway, **changes)).status == 403
+
+
+Misuse: TypeAlias = Callable[[RawWebSocket], None]
+
+REQUEST = b'{"jsonrpc": "2.0", "id": 1, "method": "arm", "params": ' + ARM + b"}"
+
+FLOOD = {0, 1002}  # the gateway does not wait until the close frame is read
+
+MISUSES: dict[str, tuple[Misuse, set[int]]] = {
+    "binary": (lambda ws: ws.send(b"\x00\x01", first=0x82), {1003}),
+    "too large": (lambda ws: ws.send(b" " * ((1 << 16) + 1)), {1009}),
+    "too large in fragments": (
+        lambda ws: ws.connection.sendall(
+            frame(b" " * 40_000, first=0x01) + frame(b" " * 40_000, first=0x80)
+        ),
+        {1009},
+    ),
+    "fragments without end": (
+        lambda ws: ws.connection.sendall(
+            frame(b"", first=0x01) + frame(b"", first=0x00) * (2 * MAX_FRAGMENTS)
+        ),
+        FLOOD,
+    ),
+    "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), FLOOD),
+    "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), FLOOD),
+    "not masked": (lambda ws: ws.connection.sendall(b"\x81\x02{}"), {1002}),
     "not masked, after frames in pieces": (
         lambda ws: [
             ws.connection.sendall(part)
@@ -329,6 +492,13 @@ MISUSES: dict[str, tuple[Misuse, set[int]]] = {
     "invalid UTF-8": (lambda ws: ws.send(b"\xff\xfe"), {1007}),
     "two lines": (lambda ws: ws.send(REQUEST + b"\n" + REQUEST), {1003}),
 }
+
+
+async def test_heads_of_frames_are_checked_however_the_bytes_are_divided() -> None:
+    """A valid frame, then the head of one that is not masked, byte by byte."""
+    heads, sent = FrameHeads(), frame(b" " * 300) + b"\x81\x7e\x01\x2c"
+    allowed = [heads.accept(bytes([byte])) for byte in sent]
+    assert allowed == [True] * (len(sent) - 1) + [False]
 
 
 @pytest.mark.parametrize("name", MISUSES)

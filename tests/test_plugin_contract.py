@@ -15,9 +15,9 @@ from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.touch.contacts import Contact, ContactKey
-from controller.touch.frames import open_source
-from controller.touch.tuio import TuioSource
+from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import open_source
+from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
 from drivers.wires.serial_line.host import SerialAddress

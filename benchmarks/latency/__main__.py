@@ -44,7 +44,7 @@ from benchmarks.latency.session import (  # noqa: E402
     rest_one,
     taps,
 )
-from controller.touch.frames import Touch  # noqa: E402
+from controller.sources.touch import Touch  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"
 TOUCHES = 300

@@ -18,7 +18,7 @@ from benchmarks.latency.far_side import FarSide
 from benchmarks.latency.machine import DAEMON_NICE, TIMEOUT, EndedEarly, running
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Unreachable
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -30,7 +30,7 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
-from controller.touch.contacts import CONTACT_TIMEOUT
+from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 from registry import clock

@@ -17,7 +17,7 @@ from controller.play.chooser import Requested
 from controller.play.content import Selection
 from controller.play.intent import Target
 from controller.play.table_query import fingers_of, requests_of
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted

@@ -7,7 +7,7 @@ from controller.effects.effect import Effect, Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.intent import Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 
 _REPORT = 0.01  # s; between two reports of the panel
 _WATCHED = 3.0  # s; of an effect that changes with time

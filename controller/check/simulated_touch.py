@@ -10,7 +10,7 @@ from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.chooser import Chooser
 from controller.play.intent import Target
 from controller.play.table_query import TableAnswer, query_table
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError

@@ -158,7 +158,7 @@ def touch(
     import asyncio
 
     from controller.cli.shown import show_status
-    from controller.touch.capture import read_capture, replay_capture
+    from controller.sources.capture import read_capture, replay_capture
     from model.config.points import parse_point
 
     if (at is None) == (replay is None):

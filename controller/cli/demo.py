@@ -63,7 +63,7 @@ def demo(
 
     from controller.demo.pictures import write_pictures
     from controller.demo.run import WIRES, Scene, example_scenes, run_demo, run_live
-    from controller.touch.capture import read_capture
+    from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.table_cache import cached_table
 

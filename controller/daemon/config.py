@@ -10,7 +10,7 @@ from controller.daemon.config_sections import CalibrationSection, DaemonSection,
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.process.socket_lock import check_socket_path
-from controller.touch.frames import (
+from controller.sources.touch import (
     TouchCalibration,
     TouchSource,
     fitted,

@@ -10,8 +10,8 @@ from typing import Literal
 from controller.api.schema import TouchInputStatus
 from controller.api.topics import InputsEvent
 from controller.daemon.config import TouchInput
-from controller.touch.frames import ALIGNED, TouchFrame, TouchSource
-from controller.touch.reject_counter import RejectCounter
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from model.errors import InputError
 from registry import clock
 from registry.pauses import Backoff

@@ -31,7 +31,7 @@ from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
 from controller.play.observer import Applied, Silenced
 from controller.play.routing import Drive
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from drivers.counters import LinkStatistics
 from drivers.host.amplifier import Amplifier
 from drivers.host.feeding import Stopped

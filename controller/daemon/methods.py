@@ -48,8 +48,8 @@ from controller.operation.states import (
 )
 from controller.play.loop import Controller
 from controller.play.table_query import MAX_DB_SL
-from controller.touch.contacts import Contact
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.contacts import Contact
+from controller.sources.touch import Touch, TouchFrame
 from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable

@@ -35,7 +35,7 @@ from controller.effects.player import EffectPlayer
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
 from controller.play.observer import Applied, Observer, Silenced
-from controller.touch.contacts import Change, Contact, ContactKey
+from controller.sources.contacts import Change, Contact, ContactKey
 from registry import clock
 
 _MAX_MESSAGE = 1000  # characters

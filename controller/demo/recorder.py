@@ -20,7 +20,7 @@ from controller.demo.touch_row import (
 from controller.play.content import HELD_BACK, Prediction
 from controller.play.observer import Applied, Observer, Silenced
 from controller.play.playing import PlayedContent
-from controller.touch.contacts import Change, Contact, ContactKey
+from controller.sources.contacts import Change, Contact, ContactKey
 from model.transients.measures import ONSET_WINDOW
 from registry import clock
 

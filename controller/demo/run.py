@@ -23,7 +23,7 @@ from controller.operation.states import DaemonState
 from controller.process.log import LogThread, start_log
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
-from controller.touch.capture import RecordedDatagram, read_capture, replay_capture
+from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
 from drivers.errors import LinkError
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -11,7 +11,7 @@ from controller.effects.effect import (
     SteadyRun,
 )
 from controller.play.intent import Pulse
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
 

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar
 
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, SteadyRun
 from controller.play.intent import Pulse
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
 

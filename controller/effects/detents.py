@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
 from controller.play.intent import Pulse
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import LENGTH, TIME
 

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 from controller.effects.detents import Notches
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
 from controller.effects.region import Region
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import ANGLE, TIME
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator
 from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
 from controller.play.intent import Pulse, Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.errors import InputError

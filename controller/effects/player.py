@@ -9,7 +9,7 @@ from controller.effects.effect import EffectRun, NoSensation, Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.intent import NO_CONTACTS, HapticIntent, Pulse, Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one

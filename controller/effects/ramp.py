@@ -14,7 +14,7 @@ from controller.effects.effect import (
     Sensation,
 )
 from controller.play.intent import Pulse
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, TIME
 from model.finger.perception import STRONG_DB_SL

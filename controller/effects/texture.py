@@ -14,7 +14,7 @@ from controller.effects.effect import (
     NoSensation,
     Sensation,
 )
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, SPEED
 

@@ -25,7 +25,7 @@ from controller.learning.messages import Answers, Estimate, Note, Ready, Refresh
 from controller.learning.settled_readings import SettledReadings
 from controller.play.loop import Controller
 from controller.play.observer import Applied, Observer
-from controller.touch.contacts import Change, Contact
+from controller.sources.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig

@@ -16,7 +16,7 @@ import numpy as np
 
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.play.observer import Applied
-from controller.touch.contacts import Contact
+from controller.sources.contacts import Contact
 from drivers.errors import DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.sensors import Reading, finish_reading, start_reading

@@ -21,7 +21,7 @@ from controller.play.joint_answer import (
     unshaped,
 )
 from controller.play.table_query import TableAnswer, query_table
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.choice import NEARLY
 from model.errors import InputError
 from model.finger.perception import decibels

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from controller.play.intent import Pulse, Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern

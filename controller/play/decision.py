@@ -16,7 +16,7 @@ from controller.play.intent import FADED_AFTER, IntentSource, Pulse
 from controller.play.playing import PlayedContent, Playing, all_left
 from controller.play.routing import FADE_RAMP, PlateSet, SetBuilder
 from controller.play.selection import Selector
-from controller.touch.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from model.rig.rig import Rig

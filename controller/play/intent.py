@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.perception import STRONG_DB_SL

@@ -17,7 +17,7 @@ from controller.play.capabilities import PlaybackCapabilities, amplitudes_of
 from controller.play.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
 from controller.play.intent import Target
 from controller.play.table_query import fingers_of, question_of, requests_of
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import Complex64Array
 from model.choice import NEARLY
 from model.finger.perception import decibels

@@ -12,9 +12,9 @@ from controller.play.decision import RELEASE_RAMP, Decider, Decision
 from controller.play.intent import IntentSource
 from controller.play.observer import Observer, applied_by, silenced_by
 from controller.play.routing import PlateSet
-from controller.touch.contacts import Change, ContactTracker
-from controller.touch.frames import TouchFrame
-from controller.touch.reject_counter import RejectCounter
+from controller.sources.contacts import Change, ContactTracker
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import TouchFrame
 from drivers.errors import (
     CommandError,
     CommandRefused,

@@ -8,7 +8,7 @@ from controller.play.content import Prediction, not_served
 from controller.play.decision import Decision
 from controller.play.playing import PlayedContent
 from controller.play.routing import Drive
-from controller.touch.contacts import Change, Contact, ContactKey
+from controller.sources.contacts import Change, Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing

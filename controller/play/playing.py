@@ -12,7 +12,7 @@ from typing import Any
 from controller.play.content import Content
 from controller.play.intent import Target
 from controller.play.routing import Drive, PlateSet, restarted_by, tones_by_era
-from controller.touch.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
+from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.sets import is_vibrating

@@ -21,7 +21,7 @@ from controller.play.content import (
     not_served,
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
 from model.table.answer import MAX_SEPARATE
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.intent import Target, band_of_table
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError

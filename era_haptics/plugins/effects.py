@@ -3,7 +3,7 @@
 from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation, effect_kind
 from controller.effects.region import Region
 from controller.play.intent import Pulse
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME
 

@@ -3,10 +3,10 @@
 `open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
 """
 
-from controller.touch.contacts import Change, Contact, ContactKey, ContactTracker
-from controller.touch.datagrams import Datagram, Datagrams, listen
-from controller.touch.frames import Touch, TouchFrame, TouchSource, open_source
-from controller.touch.reject_counter import RejectCounter
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.datagrams import Datagram, Datagrams, listen
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
 from model.errors import InputError
 from registry.clock import now
 

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.real_time
 @pytest.fixture(autouse=True)
 def resting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fingers that stay until they lift: a busy machine may repeat their frames too late."""
-    monkeypatch.setattr("controller.touch.contacts.CONTACT_TIMEOUT", 60.0)
+    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
 
 
 async def started(

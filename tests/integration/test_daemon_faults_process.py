@@ -21,7 +21,7 @@ import pytest
 import patient_daemon
 from controller.api.async_client import AsyncClient
 from controller.play.selection import GIVEN_UP
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon
 from daemon_process import (
     ERA,

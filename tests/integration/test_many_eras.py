@@ -9,7 +9,7 @@ import pytest
 import model
 from controller.demo.run import Scene, example_scenes, run_demo
 from controller.effects.layout_file import load_layout
-from controller.touch.capture import read_capture
+from controller.sources.capture import read_capture
 from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table

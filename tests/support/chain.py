@@ -14,7 +14,7 @@ from typing import Any, Self, cast
 
 from controller.play.loop import Controller
 from controller.play.observer import Applied, Observer, Silenced
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from drivers.judge.watching.witness import OperatorCommand
 from drivers.opening import Lines
 from drivers.protocol.records import Values

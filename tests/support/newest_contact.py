@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from controller.play.intent import NO_CONTACTS, HapticIntent, Target
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.finger.perception import STRONG_DB_SL
 
 

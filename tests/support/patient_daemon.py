@@ -12,7 +12,7 @@ import pytest
 from controller.cli.main import main
 from controller.daemon.daemon import Daemon
 from controller.play.loop import Controller
-from controller.touch import contacts
+from controller.sources import contacts
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.line import Line

@@ -9,7 +9,7 @@ import asyncio
 import math
 from functools import partial
 
-from controller.touch.frames import TouchFrame
+from controller.sources.touch import TouchFrame
 from drivers.protocol.records import Values
 from drivers.protocol.table import MESSAGES, STATES
 from rig_on_wire import FarSide, after_each

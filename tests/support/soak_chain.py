@@ -16,7 +16,7 @@ from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Trigger
 from controller.play.observer import Applied, Observer
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from model.rig.rig import Rig
 from model.table.timing import Timing

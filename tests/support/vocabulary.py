@@ -81,7 +81,7 @@ RETIRED_IN_DRIVERS = {
 
 DRIVER_PACKAGES = ("controller/", "drivers/", "era_haptics/", "registry/")
 
-CONTACT_PACKAGES = ("controller/touch/", "controller/play/", "sim/")
+CONTACT_PACKAGES = ("controller/sources/", "controller/play/", "sim/")
 """Where `lease`, the word of arming, would mean the timeout of a contact."""
 
 ALLOWED = {

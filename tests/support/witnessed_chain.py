@@ -15,7 +15,7 @@ from typing import Any
 
 import hand_written as hand
 from chain import Chain
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.judge.watching.capture import Violation
 from drivers.judge.watching.witness import OperatorCommand

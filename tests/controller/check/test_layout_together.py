@@ -21,7 +21,7 @@ from controller.play.chooser import Chooser
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
 from controller.play.selection import Selector
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Rectangle
 from model.table.answer import answer
 from model.table.effect_level import EffectLevels

@@ -11,7 +11,7 @@ from controller.api.place import default_socket
 from controller.daemon.config import load_daemon_config
 from controller.daemon.config_kind import DAEMON
 from controller.daemon.config_sections import DaemonSection
-from controller.touch.frames import Touch
+from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
 from model.rig.file import example_rig_path, load_rig

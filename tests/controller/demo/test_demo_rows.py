@@ -25,7 +25,7 @@ from controller.demo.touch_row import (
 )
 from controller.play.content import Prediction, not_served
 from controller.play.observer import Applied, Silenced
-from controller.touch.contacts import Change, Contact, ContactKey
+from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger.perception import detection_threshold

@@ -11,7 +11,7 @@ from controller.effects.effect import NoSensation, Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Circle, Polygon, Rectangle
 
 CENTRE = (0.2, 0.1)

@@ -20,7 +20,7 @@ from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.texture import Texture
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Circle, Polygon, Rectangle
 
 

@@ -19,7 +19,7 @@ from controller.play.joint_answer import query_jointly, unshaped
 from controller.play.observer import Applied
 from controller.play.playing import PlayedContent
 from controller.play.routing import PlateSet
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer

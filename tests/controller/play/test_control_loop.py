@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from controller.play.observer import Observer
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from courses import Acted, courses, follow
 from drivers.protocol.records import Values
 from set_chain import FINGER, set_running

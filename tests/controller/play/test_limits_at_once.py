@@ -11,7 +11,7 @@ from controller.play.content import Selection
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.joint_answer import query_jointly, unshaped
 from controller.play.selection import Selector
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.table.effect_level import EffectLevels
 from several_fingers import LEFT, RIGHT, playable, table
 

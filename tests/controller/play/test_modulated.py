@@ -14,7 +14,7 @@ from controller.play.content import Content, Targets
 from controller.play.intent import Pulse, Target
 from controller.play.playing import PlayedContent, Playing
 from controller.play.routing import PlateSet
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from model.config.shapes import Rectangle
 from model.table.pattern import Pattern

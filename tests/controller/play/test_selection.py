@@ -13,7 +13,7 @@ from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
 from controller.play.table_query import strongest
-from controller.touch.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact, ContactKey
 from model.errors import InputError
 from model.finger.perception import DEFAULT_THRESHOLD
 from model.structure.plate import Material, Plate

@@ -15,8 +15,8 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.decision import ENDED
 from controller.play.intent import HapticIntent, Target
-from controller.touch.contacts import Change, Contact, ContactTracker
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.contacts import Change, Contact, ContactTracker
+from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import QUANTITIES
 from model.table.pattern import Pattern

@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
-from controller.touch.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
-from controller.touch.datagrams import Datagram, Peer, listen
-from controller.touch.frames import Touch, TouchFrame, TouchSource, number_option
-from controller.touch.osc import Argument, OscError, osc_messages, read_message
-from controller.touch.reject_counter import RejectCounter
+from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
+from controller.sources.datagrams import Datagram, Peer, listen
+from controller.sources.osc import Argument, OscError, osc_messages, read_message
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
 from model.errors import InputError
 from registry import clock
 

@@ -15,8 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from urllib.parse import parse_qsl
 
-from controller.touch.frames import Touch, TouchFrame, TouchSource, number_option
-from controller.touch.slots import (
+from controller.sources.slots import (
     ABS_MT_POSITION_X,
     ABS_MT_POSITION_Y,
     ABS_MT_PRESSURE,
@@ -33,6 +32,7 @@ from controller.touch.slots import (
     as_slot_event,
     light_press,
 )
+from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
 from model.errors import InputError
 
 _READ, _WRITE = 2, 1

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from controller.touch.evdev import (
+from controller.sources.evdev import (
     CLOCK,
     GRAB,
     PRESSED_KEYS,
@@ -22,8 +22,8 @@ from controller.touch.evdev import (
     eviocgmtslots,
     parse_events,
 )
-from controller.touch.frames import TouchFrame, open_source
-from controller.touch.slots import InputEvent, SlotState, as_slot_event
+from controller.sources.slots import InputEvent, SlotState, as_slot_event
+from controller.sources.touch import TouchFrame, open_source
 from model.errors import InputError
 from virtual_loop import run_virtual
 
@@ -305,7 +305,7 @@ def kernel(
         resolution = {0x35: 12, 0x3A: 3}.get(axis, 0)
         return struct.pack("6i", axis, 0, highs.get(axis, width), 0, 0, resolution)
 
-    monkeypatch.setattr("controller.touch.evdev.fcntl.ioctl", ioctl)
+    monkeypatch.setattr("controller.sources.evdev.fcntl.ioctl", ioctl)
 
 
 BUSY = OSError(errno.EBUSY, "Device or resource busy")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from controller.touch.frames import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from controller.cli.main import run
 from controller.effects.layout_file import load_layout
-from controller.touch.capture import (
+from controller.sources.capture import (
     HEADER,
     MAX_BYTES,
     RecordedDatagram,

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from controller.touch.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
-from controller.touch.frames import Touch
+from controller.sources.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.sources.touch import Touch
 from model.errors import InputError
 
 TYPE_A = (

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TypeAlias
 from urllib.parse import parse_qsl
 
-from controller.touch.reject_counter import RejectCounter
+from controller.sources.reject_counter import RejectCounter
 from model.errors import InputError
 from model.structure.plate import Plate
 from registry.plugins import PluginRegistry

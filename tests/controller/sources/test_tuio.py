@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.touch.frames import Touch, TouchFrame
-from controller.touch.reject_counter import RejectCounter
-from controller.touch.tuio import TuioReader, TuioSource
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame
+from controller.sources.tuio import TuioReader, TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from tuio_messages import bundle, cursor, frame, free_port, message

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.touch.slots import Report, SlotReader
+from controller.sources.slots import Report, SlotReader
 from model.errors import InputError
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]

@@ -213,7 +213,7 @@ class Dialogue:
             silences, until = self.arming
             if self.silences != silences:
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-            if self._time() > until:  # this machine slept: it is too late for whoever asked
+            if self._time() > until:  # this machine slept: it is too late for the caller
                 raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
         if self._other_host_at > -math.inf:
             self.check_other_host()

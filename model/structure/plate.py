@@ -233,8 +233,8 @@ SCALED = {
 """How mass and stiffness by each field of a plate go with its thickness h and modulus E.
 
 All as the plate's own, h and E h³: so one solution serves for other thicknesses and moduli, where
-two plates are told apart within a fifth of their difference. A field that is not here has no such
-law, as of a mass that stays: a plate that has it must be solved for each thickness.
+two plates are told apart within a fifth of their difference. Fields that are not listed follow
+other laws, as a mass that stays does: a plate with one must be solved for each thickness.
 """
 
 SHEAR_CORRECTION = 5 / 6

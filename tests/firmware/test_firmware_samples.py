@@ -8,7 +8,6 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from drivers.protocol.table import STATUS
 from hand_written import tone as command
 from model.arrays import FloatArray
 from moved_firmware import (
@@ -25,11 +24,6 @@ from moved_firmware import (
 )
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
-
-
-def word_of(status: bytes, name: str) -> int:
-    """A word of an unstuffed status, behind type, version, address and sequence."""
-    return int.from_bytes(status[5 + 2 * STATUS.places[name] :][:2], "little")
 
 
 def seconds(count: int) -> FloatArray:

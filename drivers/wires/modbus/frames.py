@@ -52,7 +52,9 @@ EXCEPTIONS: Mapping[int, str] = {
 }
 """Refusals that exceptions stand for."""
 
-_RTU_MIN, _RTU_MAX = 4, 256  # bytes; unit, function and CRC at least
+RTU_MAX = 256
+"""Bytes of the longest frame over RTU."""
+_RTU_MIN = 4  # bytes; unit, function and CRC
 _TRIES_MAX = 512  # places at which a frame is looked for at once; noise has no end
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
@@ -222,7 +224,7 @@ class AduReader:
         start, rest = 0, -1  # where a frame is looked for, and where one may become whole
         tries = 0
         while start < len(data):
-            size = self._size(data[start : start + _RTU_MAX])
+            size = self._size(data[start : start + RTU_MAX])
             is_whole = 0 < size <= len(data) - start
             adu = _checked(data[start : start + size]) if is_whole else None
             is_behind = self._is_lost or start > 0
@@ -232,7 +234,7 @@ class AduReader:
                 found.append(adu)
                 data, start, rest, self._is_lost = data[start + size :], 0, -1, False
                 continue
-            is_short = len(data) <= _RTU_MAX
+            is_short = len(data) <= RTU_MAX
             may_end = size == 0 and waits and not is_behind and is_short  # by a pause
             if rest < 0 and (size > len(data) - start or may_end):
                 rest = start
@@ -240,7 +242,7 @@ class AduReader:
                 break
             start, tries = start + 1, tries + 1
             if tries >= _TRIES_MAX:
-                start = max(start, len(data) - _RTU_MAX)
+                start = max(start, len(data) - RTU_MAX)
         rest = len(data) if rest < 0 else rest
         if rest:
             found.append(Adu(0, b"", raw=data[:rest]))
@@ -251,13 +253,13 @@ class AduReader:
     def _size(self, data: bytes) -> int:
         """Return the size of the RTU frame that begins here; 0 where none can, the most if open."""
         if len(data) < _RTU_MIN:
-            return _RTU_MAX
+            return RTU_MAX
         try:
             kind = self._decoder.lookupPduClass(data)
-            size = 0 if kind is None else kind.calculateRtuFrameSize(data) or _RTU_MAX
+            size = 0 if kind is None else kind.calculateRtuFrameSize(data) or RTU_MAX
         except Exception:  # whatever a library raises for bytes that were damaged
             return 0
-        return size if size <= _RTU_MAX else 0
+        return size if size <= RTU_MAX else 0
 
 
 def _checked(frame: bytes) -> Adu | None:

@@ -33,6 +33,7 @@ from drivers.wires.modbus.frames import (
     REPLY,
     RESPONSE_SIZE,
     RTU,
+    RTU_MAX,
     TCP,
     WRITE,
     WRITE_SIZE,
@@ -60,7 +61,6 @@ from drivers.wires.wire import (
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
 _SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
-_FRAME_MAX = 256  # bytes
 _NO_SUCH_REGISTERS = (1, 2, 3, 4)
 _GATEWAY = {10: "path to", 11: "response of"}
 _RTU_CHECKS = "baud rate, parity, cable and protocol, and whether the adapter echoes"
@@ -208,7 +208,7 @@ class ModbusWire(Wire):
         """Count bytes that are no frame, once between two frames."""
         self.counters.invalid_frames += not self._damaged
         self._damaged_size = len(data) + (self._damaged_size if self._damaged else 0)
-        self._damaged = (self._damaged + data[: _FRAME_MAX + 5])[: _FRAME_MAX + 5]
+        self._damaged = (self._damaged + data[: RTU_MAX + 5])[: RTU_MAX + 5]
         what = f"{self._damaged_size} bytes that are no valid frame came "
         what += f"({self._damaged[:8].hex(' ')})"
         if self._request is not None and self._damaged == self._request.frame:
@@ -276,7 +276,7 @@ class SilentPort(PortAbove):
 
     def write(self, data: bytes) -> None:
         """Send a frame as soon as the line was silent; raises LinkError."""
-        latest = self._loop.time() + _FRAME_MAX * self._byte_time + self._silence
+        latest = self._loop.time() + RTU_MAX * self._byte_time + self._silence
         kept = [each for each in self._waiting if each[1].startswith(_TO_ALL)]
         self._waiting = [*kept, (latest, data)]
         self._send()

@@ -91,9 +91,6 @@ def test_client_that_does_not_read_loses_notifications_then_the_connection() -> 
     assert wire.is_aborted
 
 
-NO_TOUCH = '{"source":"a","touches":[]}'
-
-
 async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
     """After 2000 requests at once the next is refused; stop and touch are served."""
     served, client, _ = serving()

@@ -30,7 +30,7 @@ def _layer(number: float, channel: float = 0, level: float = 0, frequency: float
 
 @dataclass
 class OnLines(Taken):
-    """A group on lines, which takes steps; lines are told by their numbers, amplifiers by names."""
+    """A group on lines, which takes steps; lines are given by number, amplifiers by name."""
 
     lines: Sequence[MemoryLine] = ()
     group: Group = field(init=False)

@@ -7,7 +7,7 @@ The examples with four, eight, twelve and sixteen ERAs, 40 to 320 Hz in steps of
 apart (8 cm on the table) with contents of 20 dB SL, 20 Hz apart; `identified`: with an uncertainty
 as after `era rig identify`. For every number of contents and quiet fingers the worst finger that
 nine of ten plates promise: median over the sets (and their worst tenth); share of exactly solved
-plates that keep the promise (`model.table.exact_plates`); processor time of an answer on one
+plates that keep the promise (`model.study.exact_plates`); processor time of an answer on one
 thread, median. With --fingers so many fingers in all, 3 cm apart, for the times. With --modulation
 contents 30 Hz apart, of which the first comes and goes so often: what that costs the worst finger
 where it is served, median over the sets (and the most). With --distortion amplifiers whose second
@@ -30,14 +30,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import random_contacts, use_one_thread
-from model.table.pattern_query import prepare_patterns
+from model.answer.pattern_query import prepare_patterns
 from model.table.raster_kernel import read_fingertips
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from model.answer.request import Answer
     from model.arrays import FloatArray
-    from model.table.request import Answer
     from model.table.table import LocalizationTable
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -125,8 +125,8 @@ def _print_row(
 ) -> None:
     import numpy as np
 
-    from model.table.answer import answer
-    from model.table.request import ANY_BAND, Finger, Request
+    from model.answer.answer import answer
+    from model.answer.request import ANY_BAND, Finger, Request
 
     choices = list(combinations(BANDS, contents)) if has_bands else [(ANY_BAND,) * contents]
 
@@ -167,10 +167,10 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     """Print what a search that takes its time finds beyond the answers."""
     import numpy as np
 
+    from model.answer.search import Contents, Stream
+    from model.answer.search_in_c import choose_tones
+    from model.answer.search_in_numpy import choose_by_numpy
     from model.drive_modes import coherent
-    from model.table.contents import Contents, Stream
-    from model.table.contents_kernel import choose_tones
-    from model.table.contents_numpy import choose_by_numpy
 
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
@@ -228,8 +228,8 @@ def _print_modulated(
     """Print what side bands cost the worst finger."""
     import numpy as np
 
-    from model.table.answer import answer
-    from model.table.request import Finger, Request
+    from model.answer.answer import answer
+    from model.answer.request import Finger, Request
 
     steady, cost = [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
@@ -263,8 +263,8 @@ def _print_distorted(
     """Print how far each content is above the second harmonics, sums and differences there."""
     import numpy as np
 
-    from model.table.answer import answer
-    from model.table.request import APART_HZ, Finger, Request
+    from model.answer.answer import answer
+    from model.answer.request import APART_HZ, Finger, Request
     from model.vibration.excitation import base_amplitudes
 
     above, near = [], []
@@ -309,8 +309,8 @@ def _kept(
     """Share of held-out plates on which the worst finger has what is promised."""
     import numpy as np
 
-    from model.table.exact_plates import draw_plates, powers_on
-    from model.table.question import Question
+    from model.answer.question import Question
+    from model.study.exact_plates import draw_plates, powers_on
 
     count = len(found.layers) + len(quiet)
     plates = draw_plates(

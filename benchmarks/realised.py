@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.table.pattern_query import find_pattern
+from model.answer.pattern_query import find_pattern
 
 if TYPE_CHECKING:
+    from model.answer.question import Question
     from model.arrays import FloatArray
     from model.rig.rig import Rig
-    from model.table.question import Question
     from model.vibration.excitation import Excitation
 
 PAGE = Path(__file__).parents[1] / "docs" / "measured" / "contrast-benchmark.md"
@@ -81,9 +81,9 @@ def _line(row: Row, sets: int) -> str:
 
     from benchmarks.identification.answers import DRIVES
     from benchmarks.identification.plates import FREQUENCIES
+    from model.answer.question import Question
     from model.rig.file import load_rig
     from model.table.build import build_table
-    from model.table.question import Question
 
     rig = load_rig(RIG.parent / f"{row.rig}.yaml")
     known = replace(DRIVES, gain=row.error, phase_deg=100 * row.error)
@@ -125,7 +125,7 @@ def realised(
     from model.spectral.direct import direct_spectral_acceleration
     from model.spectral.mesh import SpectralMesh
     from model.structure.attachments import fingertip_loads
-    from model.table.exact_plates import draw_plates
+    from model.study.exact_plates import draw_plates
     from model.vibration.excitation import base_amplitudes
 
     plate, eras = rig.plate, rig.eras

@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.table.pattern_query import find_pattern
+from model.answer.pattern_query import find_pattern
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from model.answer.question import Question
     from model.rig.rig import Rig
-    from model.table.question import Question
     from model.table.table import LocalizationTable
 
 PLATES = ("paper_plate", "eight_eras", "car_display", "table")
@@ -81,7 +81,7 @@ def _question(rig: "Rig", quiet: int, number: int) -> "Question":
     """The question of a set."""
     import numpy as np
 
-    from model.table.question import Question
+    from model.answer.question import Question
 
     rng = np.random.default_rng([SEED, quiet, number])
     size = (rig.plate.length, rig.plate.width)
@@ -154,7 +154,7 @@ def _score(
 
     from benchmarks.realised import realised
     from model.finger.perception import decibels
-    from model.table.exact_plates import draw_plates, felt_on
+    from model.study.exact_plates import draw_plates, felt_on
     from model.vibration.excitation import Tone
 
     question = _question(rig, quiet, number)

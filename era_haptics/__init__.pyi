@@ -25,6 +25,10 @@ from era_haptics.tables import answer as answer
 from era_haptics.tables import contrast_map as contrast_map
 from era_haptics.tables import query as query
 from era_haptics.tables import table as table
+from model.answer.pattern import Pattern as Pattern
+from model.answer.request import Answer as Answer
+from model.answer.request import Finger as Finger
+from model.answer.request import Request as Request
 from model.calibration.calibration_result import Calibration as Calibration
 from model.errors import InputError as InputError
 from model.finger.grid import Grid as Grid
@@ -34,13 +38,9 @@ from model.rig.file import load_rig as load_rig
 from model.rig.rig import Rig as Rig
 from model.rig.uncertainty import Uncertainty as Uncertainty
 from model.structure.attachments import Fingertip as Fingertip
-from model.table.contrast_map import ContrastMap as ContrastMap
+from model.study.contrast_map import ContrastMap as ContrastMap
 from model.table.file import load_table as load_table
 from model.table.file import save_table as save_table
-from model.table.pattern import Pattern as Pattern
-from model.table.request import Answer as Answer
-from model.table.request import Finger as Finger
-from model.table.request import Request as Request
 from model.table.table import LocalizationTable as LocalizationTable
 from model.vibration.excitation import Tone as Tone
 from model.vibration.maps import PlateMap as PlateMap

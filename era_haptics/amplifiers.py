@@ -5,10 +5,10 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.playing.contents import Tone
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
+from model.answer.pattern import Pattern
 from model.arguments import shown
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
 
 
 def open_amplifier(

@@ -6,10 +6,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from model.arguments import expect, is_whole, shown
-from model.arrays import FloatArray
+from model.arrays import FloatArray, Point
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.table.question import Point
 
 Positions: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
 """One position x, y [m], or several; also an array of shape (2,) or (n, 2)."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import TypeAlias
 
+from model.answer.pattern import Pattern
 from model.arguments import expect_number, shown
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
 from model.vibration.excitation import Excitation, Tone
 
 

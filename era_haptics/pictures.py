@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from era_haptics.arguments import Positions, as_points
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.solved_plate import SolvedPlate
+from model.answer.pattern import Pattern
 from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
@@ -17,8 +18,7 @@ from model.figures.table_pictures import (
     draw_level_scale,
     draw_levels,
 )
-from model.table.contrast_map import ContrastMap
-from model.table.pattern import Pattern
+from model.study.contrast_map import ContrastMap
 from model.table.table import LocalizationTable
 from sim.plant.excited_plate import Playback
 from sim.plant.fingers import Record

@@ -5,6 +5,8 @@ from functools import cached_property
 
 from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
 from era_haptics.drive import Drives, excitation_of
+from model.answer.pattern import ONSET_RAMP, Pattern
+from model.answer.question import Question
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -16,8 +18,6 @@ from model.reduction.reduced_plate import (
 )
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from model.vibration.maps import PlateMap, plate_map
 from sim.plant.excited_plate import Playback, play

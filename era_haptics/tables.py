@@ -4,21 +4,21 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from era_haptics.arguments import Positions, as_frequencies, as_loads, as_points, expect_rig
+from model.answer.answer import answer as _answer
+from model.answer.pattern import Pattern
+from model.answer.query import query_table
+from model.answer.question import Question
+from model.answer.request import APART_HZ, Answer, Finger, Request
+from model.answer.timing import Timing
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
-from model.table.answer import answer as _answer
-from model.table.contrast_map import ContrastMap, map_contrast
-from model.table.pattern import Pattern
-from model.table.query import query_table
-from model.table.question import Question
-from model.table.request import APART_HZ, Answer, Finger, Request
+from model.study.contrast_map import ContrastMap, map_contrast
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.table_cache import cached_table
-from model.table.timing import Timing
 
 
 def table(

@@ -11,6 +11,9 @@ IntArray: TypeAlias = NDArray[np.int64]
 Float32Array: TypeAlias = NDArray[np.float32]
 Complex64Array: TypeAlias = NDArray[np.complex64]
 
+Point: TypeAlias = tuple[float, float]
+"""x, y [m]."""
+
 
 def lattice(x: FloatArray, y: FloatArray) -> FloatArray:
     """All points of a lattice, (len(x) * len(y), 2): row after row, x running first."""

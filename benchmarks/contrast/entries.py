@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 
 from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
 from benchmarks.contrast.optimum import optimum
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
+from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.build import build_table
-from model.table.exact_plates import Plates, accelerations_on, draw_plates, touched
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, Tone

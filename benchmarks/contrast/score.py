@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
+from model.answer.pattern import ONSET_RAMP
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
+from model.study.exact_plates import draw_plates, felt_on
 from model.table.build import build_table
-from model.table.exact_plates import draw_plates, felt_on
-from model.table.pattern import ONSET_RAMP
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
 from sim.plant.excited_plate import play

@@ -8,6 +8,8 @@ import numpy as np
 from benchmarks.identification.hidden import finger_stiffness
 from benchmarks.identification.server import Truth
 from benchmarks.identification.thin_plate import Complexes, Reals
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig
@@ -15,8 +17,6 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.build import build_table
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.table.table import LocalizationTable
 
 DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)

@@ -35,7 +35,7 @@ from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
 from model.structure.attachments import Fingertip
-from model.table.live_table import table_following
+from model.table.following import table_following
 from model.table.table import LocalizationTable
 
 PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"

@@ -25,10 +25,10 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.wires.serial_line.host import SerialWire
+from model.answer.timing import Timing
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table_cache import cached_table
-from model.table.timing import Timing
 from registry import clock
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier

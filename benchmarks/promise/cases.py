@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from model.answer.answer import answer
+from model.answer.request import ANY_BAND, Request
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.table.answer import answer
 from model.table.build import build_table
-from model.table.request import ANY_BAND, Request
 from model.table.table import LocalizationTable
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

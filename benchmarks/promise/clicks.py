@@ -18,13 +18,13 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import use_one_thread
-from model.table.pattern_query import find_pattern
+from model.answer.pattern_query import find_pattern
 
 if TYPE_CHECKING:
+    from model.answer.effect_level import RaisedPattern
+    from model.answer.question import Question
     from model.arrays import FloatArray
     from model.rig.rig import Rig
-    from model.table.effect_level import RaisedPattern
-    from model.table.question import Question
     from model.table.table import LocalizationTable
 
 RIGS = ("paper_plate", "eight_eras", "car_display", "table")
@@ -74,10 +74,10 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
     """Questions with one to three quiet fingers in turn, and what is played for a click there."""
     import numpy as np
 
-    from model.table.effect_level import DriveLimits, EffectLevels
-    from model.table.pulse_gains import OverEffect
-    from model.table.question import Question
-    from model.table.random_contacts import random_contacts
+    from model.answer.effect_level import DriveLimits, EffectLevels
+    from model.answer.pulse_gains import OverEffect
+    from model.answer.question import Question
+    from model.study.random_contacts import random_contacts
 
     rng, levels, found = np.random.default_rng(seed), EffectLevels(table), []
     full = DriveLimits(table.strokes)
@@ -99,10 +99,10 @@ def given(
     """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
     import numpy as np
 
+    from model.answer.effect_level import EffectLevels
     from model.finger.fingertip import fingertip_points, fingertip_weights
-    from model.table.effect_level import EffectLevels
-    from model.table.exact_plates import draw_plates
-    from model.table.live_table import table_following
+    from model.study.exact_plates import draw_plates
+    from model.table.following import table_following
     from model.vibration.excitation import Tone
 
     drawn = draw_plates(

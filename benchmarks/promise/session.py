@@ -24,8 +24,8 @@ from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
 from controller.play.observer import Applied
+from model.answer.timing import Timing
 from model.finger.fingertip import FINGERTIP_RADIUS
-from model.table.timing import Timing
 from registry import clock
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections

@@ -16,6 +16,8 @@ from benchmarks.transients.cases import (
     quantised,
     with_errors,
 )
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.arrays import ComplexArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db
@@ -24,8 +26,6 @@ from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.knots import steady_states
 from model.transients.measures import ENDING_WINDOW, Transients

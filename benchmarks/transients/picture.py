@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.transients.cases import Case
+from model.answer.pattern import ONSET_RAMP
 from model.arrays import FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db
 from model.rig.rig import Rig
-from model.table.pattern import ONSET_RAMP
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.shaping import Shaper

@@ -18,11 +18,11 @@ from controller.play.content import Selection
 from controller.play.intent import Target
 from controller.play.table_query import fingers_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.answer import answer
+from model.answer.request import MIN_CONTRAST_DB, Answer
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
-from model.table.answer import answer
-from model.table.request import MIN_CONTRAST_DB, Answer
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150

@@ -11,14 +11,14 @@ from controller.play.chooser import Chooser
 from controller.play.intent import Target
 from controller.play.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.effect_level import EffectLevels
+from model.answer.pulse_gains import promised_over_effect_db
 from model.arrays import FloatArray
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
 from model.structure.attachments import fingertip_loads
-from model.table.effect_level import EffectLevels
-from model.table.pulse_gains import promised_over_effect_db
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients

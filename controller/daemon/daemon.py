@@ -27,9 +27,9 @@ from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
+from model.answer.timing import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from registry import clock
 from registry.garbage_collection import no_long_collections, without_collections
 from registry.threads import DaemonThreads, in_thread

@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from controller.demo.touch_row import FingerRow, TouchRow
+from model.answer.pattern import Pattern
+from model.answer.request import OWN_CONTRAST_DB
 from model.arrays import FloatArray, lattice
 from model.choice import ranked_by
 from model.figures import save_figure
@@ -22,8 +24,6 @@ from model.figures.drawing import label_plate, raster
 from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
-from model.table.pattern import Pattern
-from model.table.request import OWN_CONTRAST_DB
 from model.table.table import LocalizationTable
 
 MAX_PANELS = 6

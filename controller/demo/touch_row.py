@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from model.answer.pattern import Pattern
 from model.arrays import FloatArray
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
@@ -13,7 +14,6 @@ from model.finger.perception import (
     mean_level_db_sl,
     sensation_level,
 )
-from model.table.pattern import Pattern
 from model.vibration.excitation import peak_acceleration
 
 Position: TypeAlias = tuple[float, float]

@@ -12,11 +12,11 @@ from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
 from controller.play.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.request import MAX_MODULATION, MIN_MODULATION
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
-from model.table.request import MAX_MODULATION, MIN_MODULATION
 from registry.plugins import PluginRegistry
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"

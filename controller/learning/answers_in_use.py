@@ -8,9 +8,9 @@ import asyncio
 
 from controller.learning.messages import Answers
 from controller.play.loop import Controller
+from model.answer.timing import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 
 _PAUSE = 0.02  # s; between frequencies, which take a millisecond or two each
 

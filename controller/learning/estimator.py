@@ -28,6 +28,7 @@ from controller.learning.messages import (
     packed,
     unpacked,
 )
+from model.answer.pattern_query import prepare_patterns
 from model.errors import InputError
 from model.files.array_file import remove_partial
 from model.identification.in_service import Known
@@ -35,8 +36,7 @@ from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.table.live_table import table_following
-from model.table.pattern_query import prepare_patterns
+from model.table.following import table_following
 from model.table.table import LocalizationTable
 
 _NICE = 10  # above that of the daemon, whose loop comes first

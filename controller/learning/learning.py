@@ -27,10 +27,10 @@ from controller.play.loop import Controller
 from controller.play.observer import Applied, Observer
 from controller.sources.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
+from model.answer.timing import Timing
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from registry import clock
 from registry.plugins import failure_text
 

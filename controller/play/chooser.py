@@ -22,12 +22,12 @@ from controller.play.joint_answer import (
 )
 from controller.play.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.effect_level import EffectLevels
+from model.answer.pattern import IMPERCEPTIBLE_DB_SL
+from model.answer.request import verdict_of
 from model.choice import NEARLY
 from model.errors import InputError
 from model.finger.perception import decibels
-from model.table.effect_level import EffectLevels
-from model.table.pattern import IMPERCEPTIBLE_DB_SL
-from model.table.request import verdict_of
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from controller.play.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.pattern import Pattern
+from model.answer.question import Question
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
-from model.table.pattern import Pattern
-from model.table.question import Question
 from model.table.table import LocalizationTable
 
 Targets = tuple[tuple[Contact, Target], ...]

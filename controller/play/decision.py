@@ -19,11 +19,11 @@ from controller.play.selection import Selector
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
+from model.answer.pattern_query import find_pattern, prepare_patterns
+from model.answer.question import Question
+from model.answer.timing import Timing
 from model.rig.rig import Rig
-from model.table.pattern_query import find_pattern, prepare_patterns
-from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from registry.plugins import failure_text
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.

@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.question import SHAPED_FROM
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.perception import STRONG_DB_SL
-from model.table.question import SHAPED_FROM
 
 _MIN_WAIT = 0.001  # s
 

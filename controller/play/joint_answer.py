@@ -18,16 +18,16 @@ from controller.play.content import HELD_BACK, SHARED, Content, Prediction, Sele
 from controller.play.intent import Target
 from controller.play.table_query import fingers_of, question_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
+from model.answer import request
+from model.answer.answer import answer
+from model.answer.modulation import with_gains
+from model.answer.pattern import ONSET_RAMP, Pattern
+from model.answer.promised import share_stroke
+from model.answer.question import MIN_LEVEL_DB_SL, Question
+from model.answer.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
 from model.arrays import Complex64Array
 from model.choice import NEARLY
 from model.finger.perception import decibels
-from model.table import request
-from model.table.answer import answer
-from model.table.modulation import with_gains
-from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.promised import share_stroke
-from model.table.question import MIN_LEVEL_DB_SL, Question
-from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 

@@ -29,12 +29,12 @@ from drivers.host.group import Group, GroupState
 from drivers.host.joint_sets import Played
 from drivers.opening import Lines
 from drivers.protocol.timing import HEARTBEAT, REPLY_TIMEOUT
+from model.answer.timing import Timing
 from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from registry import clock
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release

@@ -9,9 +9,9 @@ from controller.play.decision import Decision
 from controller.play.playing import PlayedContent
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
-from model.table.pattern import Pattern
-from model.table.question import Question
-from model.table.timing import Timing
+from model.answer.pattern import Pattern
+from model.answer.question import Question
+from model.answer.timing import Timing
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
+from model.answer.pattern import Pattern
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
 
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.

@@ -18,11 +18,11 @@ from controller.play.capabilities import EnvelopeSupport
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
+from model.answer.pattern import Pattern
+from model.answer.question import Question
+from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
-from model.table.question import Question
-from model.table.timing import Timing
 from model.transients.base_motion import KNOT_STEP, BaseEnvelope, Envelopes
 from model.transients.knots import ONSET_KNOTS
 from model.vibration import excitation as physics

@@ -22,8 +22,8 @@ from controller.play.content import (
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.answer import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
-from model.table.answer import MAX_SEPARATE
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.

@@ -9,16 +9,16 @@ from typing import Any
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.intent import Target, band_of_table
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.effect_level import DriveLimits, EffectLevels
+from model.answer.pattern import IMPERCEPTIBLE_DB_SL, Pattern
+from model.answer.pattern_query import UnreachableLevel, find_pattern
+from model.answer.pulse_gains import OverEffect
+from model.answer.question import MAX_LEVEL_DB_SL, Question
+from model.answer.request import OWN_CONTRAST_DB, Finger, Request
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
-from model.table.effect_level import DriveLimits, EffectLevels
-from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
-from model.table.pattern_query import UnreachableLevel, find_pattern
-from model.table.pulse_gains import OverEffect
-from model.table.question import MAX_LEVEL_DB_SL, Question
-from model.table.request import OWN_CONTRAST_DB, Finger, Request
 from model.table.table import LocalizationTable
 
 MAX_DB_SL = 26.0

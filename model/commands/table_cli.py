@@ -66,8 +66,8 @@ def query(
     Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
     ERA, and predicted levels and contrast.
     """
+    from model.answer.query import query_one
     from model.table.file import load_table
-    from model.table.query import query_one
 
     if batch is not None:
         if target or quiet or own or swap_bands:
@@ -211,8 +211,8 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
 
     defaults: of keys that lines leave out.
     """
+    from model.answer.query import query_batch
     from model.table.file import load_table
-    from model.table.query import query_batch
     from registry.regular_file import regular_file
 
     table = load_table(table_file)

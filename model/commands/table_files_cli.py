@@ -33,7 +33,7 @@ from model.files.replacing import (
 
 if TYPE_CHECKING:
     from model.spectral.mesh import PlateMesh
-    from model.table.contrast_map import ContrastMap
+    from model.study.contrast_map import ContrastMap
 
 
 class Format(StrEnum):
@@ -68,8 +68,8 @@ def plot(
     """Draw weak cells, levels, contrast and an answer."""
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
+    from model.study.overview import find_overview
     from model.table.file import load_table
-    from model.table.overview import find_overview
 
     inches = figure_size(size)
     table = load_table(table_file)
@@ -104,7 +104,7 @@ def export(
 
     docs/reference/table-file.md describes the content.
     """
-    from model.table.export import export_csv, export_mat
+    from model.study.export import export_csv, export_mat
     from model.table.file import load_table
 
     if content is not None and to is Format.MAT:
@@ -155,7 +155,7 @@ def contrast_map(
 ) -> None:
     """Map the promised contrast of every place to given quiet fingers."""
     from model.finger.grid import Grid
-    from model.table.contrast_map import map_contrast
+    from model.study.contrast_map import map_contrast
     from model.table.file import load_table
 
     inches = figure_size(size)

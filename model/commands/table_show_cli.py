@@ -19,10 +19,10 @@ from model.errors import InputError
 from model.files.replacing import begins_with, check_picture
 
 if TYPE_CHECKING:
-    from model.table.promise_at_sensors import MeasuredVerification
-    from model.table.table_check import CheckSettings
-    from model.table.verify import Verification
-    from model.table.weak_cells import WeakCells
+    from model.study.promise_at_sensors import MeasuredVerification
+    from model.study.table_check import CheckSettings
+    from model.study.verify import Verification
+    from model.study.weak_cells import WeakCells
 
 
 def show(
@@ -31,8 +31,8 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show levels, weak cells, contrast and origin of a table."""
+    from model.study.overview import find_overview, summarize
     from model.table.file import load_table
-    from model.table.overview import find_overview, summarize
 
     table = load_table(table_file)
     started = time.perf_counter()
@@ -101,7 +101,7 @@ def verify(
             f"the table must come before the rig: era table verify {rig_file} {table_file}"
         )
     if device is not None:
-        from model.table.table_check import CheckSettings
+        from model.study.table_check import CheckSettings
 
         if sensors_file is None:
             raise InputError("--sensors is missing: a file of the accelerometers at the inputs")
@@ -125,8 +125,8 @@ def _verify_by_solving(
     table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
 ) -> None:
     from model.rig.file import load_rig
+    from model.study.verify import verify_table
     from model.table.file import load_table
-    from model.table.verify import verify_table
 
     rig = load_rig(rig_file)
     table = load_table(table_file, rig=rig)
@@ -158,7 +158,7 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
     from model.finger.perception import FELT_DB_SL
-    from model.table.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
+    from model.study.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -219,7 +219,7 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
     """Yield the map of a table; listed: with every weak cell."""
     import numpy as np
 
-    from model.table.weak_cells import text_map
+    from model.study.weak_cells import text_map
 
     yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
     if np.isfinite(cells.errors_db).any():
@@ -273,8 +273,8 @@ def _verify_by_measuring(
 ) -> None:
     """Measure promises of a table; exit with 1 where too few are kept."""
     from model.rig.file import load_rig
+    from model.study.table_check import check_by_measuring, plain_rig
     from model.table.file import load_table
-    from model.table.table_check import check_by_measuring, plain_rig
 
     if picture is not None:
         check_picture(picture)

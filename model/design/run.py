@@ -12,6 +12,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from model.answer.answer import answer
+from model.answer.request import Finger, Request
 from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_first
 from model.design.problem import DesignProblem, NamedLayouts
@@ -21,9 +23,7 @@ from model.finger.perception import STRONG_DB_SL
 from model.processes import on_processes
 from model.rig.rig import Rig
 from model.structure.support import support_problem
-from model.table.answer import answer
 from model.table.build import build_table
-from model.table.request import Finger, Request
 from model.table.table import LocalizationTable
 
 SENSITIVITY_STEP = 0.005

@@ -28,6 +28,11 @@ class Drawing:
     bases: int = 1
 
 
+JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
+PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
+"""Drawn plates that judge candidates, and those of the promise."""
+
+
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from model.calibration.calibration_result import Calibration
 from model.figures.drawing import ACTIVE_COLOR
-from model.table.promise_at_sensors import MeasuredVerification
+from model.study.promise_at_sensors import MeasuredVerification
 
 _ROWS = 2  # of sensors
 

@@ -11,19 +11,19 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray, lattice
+from model.answer.pattern import Pattern
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.arrays import FloatArray, Point, lattice
 from model.errors import InputError
 from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, sensation_level
-from model.table.contrast_map import ContrastMap
-from model.table.overview import Overview
-from model.table.pattern import Pattern
-from model.table.pattern_query import find_pattern
-from model.table.question import Point, Question
+from model.study.contrast_map import ContrastMap
+from model.study.overview import Overview
+from model.study.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.table.table import LocalizationTable
-from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.vibration.excitation import Excitation
 
 _CONTRAST = "promised felt contrast / dB"

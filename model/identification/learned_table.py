@@ -17,7 +17,7 @@ from model.identification.in_service import Known, LivePlate, Report, widest
 from model.identification.learned_file import LearnedPlate, OtherPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
-from model.table.live_table import table_following
+from model.table.following import table_following
 from model.table.table import LocalizationTable
 
 

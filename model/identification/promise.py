@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.answer.pattern_query import find_pattern
+from model.answer.question import MIN_LEVEL_DB_SL, Question
 from model.arrays import FloatArray
 from model.ensemble.measures import PERCENTILE
 from model.identification.identify import Identification
+from model.study.exact_plates import draw_plates, felt_on
+from model.study.random_contacts import MIN_DISTANCE, random_contacts
 from model.table.build import build_table
-from model.table.exact_plates import draw_plates, felt_on
-from model.table.pattern_query import find_pattern
-from model.table.question import MIN_LEVEL_DB_SL, Question
-from model.table.random_contacts import MIN_DISTANCE, random_contacts
 
 _PLATES = 60
 _MARGIN = 0.013  # m, of fingers from the edges

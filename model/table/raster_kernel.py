@@ -7,6 +7,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from model.arrays import Point
 from model.compiled.kernels import kernels, run
 from model.compiled.structures import GivenRaster
 from model.finger.fingertip import (
@@ -16,7 +17,6 @@ from model.finger.fingertip import (
     FIVE_POINTS,
     GAUSS_LEGENDRE,
 )
-from model.table.question import Point
 from model.table.raster import FingertipShapes
 from model.table.table import LocalizationTable
 

@@ -13,9 +13,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
 from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, attach
+from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
 from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
@@ -28,8 +29,6 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, SAME_FREQUENCY
-from model.table.question import Point
 from model.table.raster import Raster
 from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
@@ -46,6 +45,9 @@ EFFECT_DURATIONS = (0.02, 0.04, 0.08, 0.16)
 """Durations [s] of short effects for which the plate's ringing is kept; the nearest is taken."""
 
 PAPER_GRID = Grid(12, 9)
+
+SAME_FREQUENCY = 1e-3
+"""Distance [Hz] of two frequencies that are one."""
 
 BACKGROUND_CELL, CELLS_PER_WAVELENGTH = 0.0254, 4
 """Largest side [m] of the cells by whose centres the power of the plate around targets counts, that

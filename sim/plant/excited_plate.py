@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from model.answer.pattern import ONSET_RAMP
+from model.answer.question import Question
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
@@ -23,8 +25,6 @@ from model.finger.perception import (
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
-from model.table.pattern import ONSET_RAMP
-from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation, base_amplitudes, peak_acceleration

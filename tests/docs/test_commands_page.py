@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from controller.cli.main import load_commands
 from model.cli import app
-from model.table import overview
+from model.study import overview
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")

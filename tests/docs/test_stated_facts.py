@@ -13,10 +13,10 @@ from drivers.errors import CommandError
 from drivers.protocol.table import REACTION
 from drivers.protocol.timing import BOOT_TIME
 from drivers.wires.known import address_of
-from model.table.effect_level import MIN_RAISED_CONTRAST_DB
-from model.table.request import MIN_CONTRAST_DB, OWN_CONTRAST_DB
-from model.table.verify import MIN_KEPT_SHARE
-from model.table.weak_cells import WANTED_CONTRAST_DB
+from model.answer.effect_level import MIN_RAISED_CONTRAST_DB
+from model.answer.request import MIN_CONTRAST_DB, OWN_CONTRAST_DB
+from model.study.verify import MIN_KEPT_SHARE
+from model.study.weak_cells import WANTED_CONTRAST_DB
 from registry.limits import GuardLimits
 
 ROOT = Path(model.__file__).parents[1]

@@ -16,6 +16,10 @@ import pytest
 from benchmarks.direct_plate import direct_responder
 from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
 from long_form import shortly
+from model.answer.pattern import Pattern
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
@@ -25,11 +29,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.build import build_table
-from model.table.pattern import Pattern
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from model.transients.base_motion import BaseEnvelope, shaped
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised

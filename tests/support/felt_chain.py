@@ -18,10 +18,10 @@ from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.observer import Applied
 from drivers.judge.watching.capture import Violation
+from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from registry import clock
 from sim.amplifier.readings import AmplifierSummary
 from sim.far_ends.opening import Wire

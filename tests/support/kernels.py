@@ -22,9 +22,9 @@ from ctypes import CDLL, c_char_p
 from dataclasses import dataclass
 from pathlib import Path
 
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.compiled.kernels import processor_features, versions
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 
 ROOT = Path(__file__).parents[2]
 TESTS = (

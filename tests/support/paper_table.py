@@ -5,12 +5,12 @@ from functools import cache
 
 import numpy as np
 
+from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.question import Question
 from model.drive_modes.forms import Forms
 from model.fem.mesh import ELEMENTS, Mesh
 from model.rig.rig import Rig
 from model.table.build import build_table
-from model.table.fingers_on_plate import FingersOnPlate
-from model.table.question import Question
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from model.answer.query import query_table
+from model.answer.question import Question
+from model.answer.timing import Timing
 from model.design.area import area_of
 from model.design.contacts import anywhere
 from model.design.problem import DesignProblem, layouts_of
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
 from model.table.build import solve_table
-from model.table.query import query_table
-from model.table.question import Question
-from model.table.timing import Timing
 from model.version import NUMERICS_VERSION
 from model.vibration.natural_modes import natural_modes
 from paper_plate import make_paper_rig

@@ -11,16 +11,16 @@ from functools import partial
 import numpy as np
 
 from controller.play import decision, table_query
+from model.answer.effect_level import DriveLimits, RaisedPattern
+from model.answer.pattern import Pattern
+from model.answer.pattern_query import find_pattern, prepare_patterns
+from model.answer.pulse_gains import PulseResponses
+from model.answer.question import MIN_LEVEL_DB_SL, Question
 from model.arrays import FloatArray, IntArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
-from model.table.effect_level import DriveLimits, RaisedPattern
-from model.table.pattern import Pattern
-from model.table.pattern_query import find_pattern, prepare_patterns
-from model.table.pulse_gains import PulseResponses
-from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.vibration.excitation import Excitation
 from registry.limits import GuardLimits
 

@@ -18,13 +18,13 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.observer import Applied
+from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from paper_table import smooth_rig
 from registry import clock
 from rig_on_wire import after_each

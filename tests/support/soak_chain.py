@@ -18,8 +18,8 @@ from controller.operation.states import DaemonEvent, DaemonState, Trigger
 from controller.play.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
+from model.answer.timing import Timing
 from model.rig.rig import Rig
-from model.table.timing import Timing
 from paper_plate import make_paper_rig
 from registry import clock
 from rig_on_wire import after_each, on_two_amplifiers

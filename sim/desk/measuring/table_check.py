@@ -9,17 +9,17 @@ import numpy as np
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import DriverError, LinkError
 from drivers.playing.contents import Tone
+from model.answer.pattern import Pattern
 from model.arrays import FloatArray
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
-from model.table.promise_at_sensors import (
+from model.study.promise_at_sensors import (
     MeasuredVerification,
     Promise,
     measured_promise,
     promises,
 )
+from model.study.table_check import CheckSettings
 from model.table.table import LocalizationTable
-from model.table.table_check import CheckSettings
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels, is_whole
 from sim.desk.measuring.multisine import ramped

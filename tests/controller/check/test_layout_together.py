@@ -22,10 +22,10 @@ from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.answer import answer
+from model.answer.effect_level import EffectLevels
+from model.answer.request import Request
 from model.config.shapes import Rectangle
-from model.table.answer import answer
-from model.table.effect_level import EffectLevels
-from model.table.request import Request
 from several_fingers import playable, table
 
 SIZE = 0.03

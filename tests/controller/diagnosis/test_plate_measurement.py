@@ -20,6 +20,8 @@ from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
 from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
@@ -28,8 +30,6 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer

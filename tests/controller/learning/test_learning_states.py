@@ -32,12 +32,12 @@ from controller.learning.messages import (
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
 from drivers.playing.contents import Layer, Tone
+from model.answer.timing import Timing
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 from paper_plate import make_paper_rig
 from small_table import small_table
 from virtual_loop import in_virtual_time

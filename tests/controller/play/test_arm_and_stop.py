@@ -13,9 +13,9 @@ from drivers.errors import LinkError
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.records import Values
+from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Channel
-from model.table.timing import Timing
 from newest_contact import BuzzNewestContact
 from set_chain import FINGER, OTHER, set_chain, set_running
 from set_table import SetTiming

@@ -23,9 +23,9 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
+from model.answer.pattern import Pattern
 from model.arrays import Complex64Array
 from model.errors import InputError
-from model.table.pattern import Pattern
 from set_table import SetTiming
 from several_fingers import (
     ABOVE,

@@ -12,7 +12,7 @@ from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.joint_answer import query_jointly, unshaped
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
-from model.table.effect_level import EffectLevels
+from model.answer.effect_level import EffectLevels
 from several_fingers import LEFT, RIGHT, playable, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]

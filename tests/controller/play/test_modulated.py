@@ -16,9 +16,9 @@ from controller.play.playing import PlayedContent, Playing
 from controller.play.routing import PlateSet
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
+from model.answer.pattern import Pattern
+from model.answer.question import Question
 from model.config.shapes import Rectangle
-from model.table.pattern import Pattern
-from model.table.question import Question
 from model.vibration.excitation import Tone
 from paper_table import smooth_rig
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table

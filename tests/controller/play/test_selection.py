@@ -14,11 +14,11 @@ from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
 from controller.play.table_query import strongest
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.pattern import Pattern
+from model.answer.question import Question
 from model.errors import InputError
 from model.finger.perception import DEFAULT_THRESHOLD
 from model.structure.plate import Material, Plate
-from model.table.pattern import Pattern
-from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Tone
 from set_table import SetLevels

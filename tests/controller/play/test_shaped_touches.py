@@ -19,8 +19,8 @@ from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import QUANTITIES
-from model.table.pattern import Pattern
-from model.table.question import Question
+from model.answer.pattern import Pattern
+from model.answer.question import Question
 from model.transients.base_motion import BaseEnvelope
 from set_chain import FINGER, OTHER, set_running
 from set_table import SetTiming

@@ -13,13 +13,13 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
+from model.answer.pattern_query import UnreachableLevel
 from model.cli import app
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.errors import InputError
 from model.rig.file import example_rig_path
-from model.table import overview
+from model.study import overview
 from model.table.file import load_table, save_table
-from model.table.pattern_query import UnreachableLevel
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from drives import by_hand
+from model.answer.question import Question
 from model.arrays import Complex64Array
 from model.choice import NEARLY
 from model.drive_modes import coherent, playable_drive_modes
@@ -15,7 +16,6 @@ from model.drive_modes import switched as switched_mode
 from model.drive_modes.forms import Forms
 from model.finger.fingertip import fingertip_points
 from model.rig.uncertainty import Uncertainty
-from model.table.question import Question
 from paper_table import contact_sets, forms_of, smooth_table
 
 SIGMA = 0.1

@@ -18,8 +18,8 @@ from model.finger.grid import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike
 from model.spectral.mesh import SpectralMesh
+from model.study.weak_cells import WeakCells
 from model.table.build import build_table
-from model.table.weak_cells import WeakCells
 from paper_plate import make_paper_rig
 from small_table import small_table
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from model.answer.pattern import Pattern
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import (
@@ -15,7 +16,6 @@ from model.finger.perception import (
     sensitivity_margin_db,
 )
 from model.structure.plate import Material, Plate
-from model.table.pattern import Pattern
 from model.vibration.excitation import Tone
 
 PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"

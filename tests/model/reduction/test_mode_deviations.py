@@ -17,8 +17,8 @@ from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
+from model.study.verify import verify_table
 from model.table.build import build_table
-from model.table.verify import verify_table
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])

@@ -21,7 +21,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
 from model.table.build import TableProblem, build_table
-from model.table.live_table import table_following
+from model.table.following import table_following
 from paper_plate import make_paper_rig
 
 FRAME = 0.053  # kg

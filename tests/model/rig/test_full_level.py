@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.fem.plate import assemble
@@ -23,8 +25,6 @@ from model.rig.layouts import (
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
 from paper_plate import make_paper_rig

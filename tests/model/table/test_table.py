@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.drive_modes.switched import highest_levels
 from model.errors import InputError
 from model.fem.plate import assemble
@@ -18,11 +20,9 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
+from model.study.exact_plates import Plates, felt_on
 from model.table.build import TableProblem, build_table
-from model.table.exact_plates import Plates, felt_on
-from model.table.live_table import table_following
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
+from model.table.following import table_following
 from model.table.raster import Raster
 from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable, default_drive_frequencies

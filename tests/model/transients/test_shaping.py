@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.table.build import build_table
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.measures import Transients

@@ -26,11 +26,11 @@ from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.study.promise_at_sensors import Promise, promises
+from model.study.table_check import CheckSettings
 from model.table.build import build_table
 from model.table.file import save_table
-from model.table.promise_at_sensors import Promise, promises
 from model.table.table import LocalizationTable
-from model.table.table_check import CheckSettings
 from model.vibration.excitation import tone_amplitudes
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard

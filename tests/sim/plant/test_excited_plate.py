@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from model.answer.question import Question
 from model.errors import InputError
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -14,7 +15,6 @@ from model.finger.perception import detection_threshold, mean_level_db_sl
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
-from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time

@@ -9,6 +9,10 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 from driven_bases import FINGERTIP, faded_base, resting, shaped_base
+from model.answer.pattern import Pattern
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -19,10 +23,6 @@ from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad
 from model.structure.plate import Material, Plate
 from model.table.build import build_table
-from model.table.pattern import Pattern
-from model.table.pattern_query import find_pattern
-from model.table.question import Question
-from model.table.timing import Timing
 from model.transients.base_motion import Term
 from model.transients.measures import ONSET_WINDOW
 from paper_plate import make_paper_rig

@@ -1,0 +1,172 @@
+"""What fingers feel of the tones of all contents on drawn plates, and what is promised of it."""
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.search import PROMISED_PERCENTILE, Contents, Tones
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.choice import NEARLY
+from model.ensemble.draws import PROMISED_DRAWS
+from model.ensemble.measures import percentile
+from model.finger.perception import decibels
+
+_TINY = 1e-20
+
+
+def promised(
+    fingers: FingersOnPlate,
+    contents: Contents,
+    rows: IntArray,
+    weights: Complex64Array,
+    owners: IntArray,
+    *,
+    is_apart: bool = True,
+    gains: FloatArray | None = None,
+) -> Tones:
+    """What fingers feel of tones at rows (m,) of weights (m, n), at gains (m,).
+
+    owners (m,): the content of each tone; gains: None for those to the contents' levels.
+    """
+    shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
+    power = fingers.powers(PROMISED_DRAWS, rows, weights)
+    by_tone, factor = gains, 1.0
+    if by_tone is None:
+        of_contents, factor = _gains_to_levels(contents, power, shares, weights, owners)
+        by_tone = of_contents[owners]
+    power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
+    contrast, level, of_others = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
+    each_own = [
+        felt_amplitudes(power, shares, rows, owners == j, s.targets) for j, s in enumerate(streams)
+    ]
+    ratios: list[Float32Array] = []
+    loudest = np.zeros(power.shape[-1], dtype=np.float32)
+    for finger in (*(finger for stream in streams for finger in stream.targets), *contents.quiet):
+        felt, others = np.min(each_own, axis=0), np.ones(len(rows), dtype=bool)
+        for j, stream in enumerate(streams):
+            if finger in stream.targets:
+                others = owners != j
+                felt = felt_amplitudes(power, shares, rows, ~others, (finger,))
+                level[finger] = felt[0], promise(felt)
+        if not others.any():
+            continue
+        heard = np.sqrt(np.maximum(loudest_power(power[others], rows[others], finger), _TINY))
+        ratios.append(felt / heard)
+        of_others[finger] = promise(heard, 100 - PROMISED_PERCENTILE)
+        contrast[finger] = figures(ratios[-1])
+        if finger in contents.quiet:
+            loudest = np.maximum(loudest, heard)
+    worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
+    if len(streams) == 1:
+        contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
+    of_all = worst[2], promise(loudest, 100 - PROMISED_PERCENTILE)
+    worst_db, loudest_db_sl = decibels(np.array(of_all)).tolist()
+    return Tones(
+        rows=rows.tolist(),
+        weights=weights.tolist(),
+        gains=by_tone.tolist(),
+        owners=owners.tolist(),
+        contrast_db=decibels(contrast).tolist(),
+        level_db_sl=decibels(level).tolist(),
+        foreign_db_sl=decibels(of_others).tolist(),
+        worst_db=worst_db,
+        loudest_db_sl=loudest_db_sl,
+        stroke_factor=factor,
+        is_apart=is_apart,
+    )
+
+
+def _gains_to_levels(
+    contents: Contents,
+    power: Float32Array,
+    shares: Float32Array,
+    weights: Complex64Array,
+    owners: IntArray,
+) -> tuple[FloatArray, float]:
+    """Gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`."""
+    streams, levels = contents.streams, contents.levels
+    alone = np.arange(len(owners))  # as if each had a frequency of its own
+    own = [
+        promise(felt_amplitudes(power, shares, alone, owners == j, s.targets))
+        for j, s in enumerate(streams)
+    ]
+    drives = np.zeros((len(streams), weights.shape[1]))
+    np.add.at(drives, owners, np.abs(weights))
+    priorities = [stream.priority for stream in streams]
+    return share_stroke(levels / np.maximum(own, 1e-30), drives, levels.astype(float), priorities)
+
+
+def share_stroke(
+    gains: FloatArray,
+    weights: Complex64Array | FloatArray,
+    levels: FloatArray,
+    priorities: Sequence[int],
+) -> tuple[FloatArray, float]:
+    """Gains (K,) to levels (K,) within the stroke, and the least factor on them.
+
+    Of each priority the louder contents are lowered first, to one level (max-min), until all fit
+    into what is left by the higher ones.
+    """
+    amplitudes = gains[:, None] * np.abs(weights)
+    factors, left = np.zeros(len(gains)), np.ones(amplitudes.shape[1])
+    for priority in sorted({*priorities}, reverse=True):
+        of = np.array(priorities) == priority
+        level, is_lowered = 0.0, of
+        while is_lowered.any():
+            kept = amplitudes[of & ~is_lowered].sum(axis=0)
+            per_level = (amplitudes[is_lowered] / levels[is_lowered, None]).sum(axis=0)
+            level = float((np.maximum(left - kept, 0) / np.maximum(per_level, 1e-30)).min())
+            if (levels[is_lowered] > level).all():
+                break
+            is_lowered = is_lowered & (levels > level)
+        factors[of] = np.where(is_lowered[of], level / levels[of], 1.0)
+        used = factors[of] @ amplitudes[of]
+        left = np.where(used >= left * (1 - NEARLY), 0.0, left - used)  # rounding leaves no stroke
+    return gains * factors, float(factors.min())
+
+
+def felt_amplitudes(
+    power: Float32Array,
+    shares: Float32Array,
+    rows: IntArray,
+    is_own: NDArray[np.bool_],
+    targets: Sequence[int],
+) -> Float32Array:
+    """The least that a content's fingertips feel of its own tones, (d,), of power (m, k, p, d).
+
+    shares (k, p): of the points in the mean. Tones of other contents at its frequencies, by rows
+    (m,), may cancel part of it.
+    """
+    squares = np.zeros(power.shape[1:], dtype=power.dtype)
+    for tone in np.flatnonzero(is_own).tolist():
+        amplitude = np.sqrt(power[tone])
+        for other in np.flatnonzero(~is_own & (rows == rows[tone])).tolist():
+            amplitude = amplitude - np.sqrt(power[other])
+        squares += np.maximum(amplitude, 0) ** 2
+    return np.asarray(np.min([shares[t] @ np.sqrt(squares[t]) for t in targets], axis=0))
+
+
+def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:
+    """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
+
+    Of contents of one frequency, by rows (j,), the amplitudes add.
+    """
+    at = power[:, finger]
+    total = np.zeros(at.shape[1:], dtype=at.dtype)
+    order = np.argsort(rows, kind="stable").tolist()
+    for _, same in groupby(order, key=rows.__getitem__):
+        total += np.sqrt(at[list(same)]).sum(axis=0) ** 2
+    return np.asarray(total.max(axis=0))
+
+
+def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
+    """Percentile of the drawn plates, without the first, the nominal one."""
+    return float(percentile(values[1:].astype(float), percent))
+
+
+def figures(ratio: Float32Array) -> tuple[float, float, float]:
+    """Of ratios (1 + d,): nominal, of half of the drawn plates, of nine of ten."""
+    return float(ratio[0]), promise(ratio, 50), promise(ratio)

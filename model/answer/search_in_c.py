@@ -1,0 +1,140 @@
+"""Tones of contents by one call of a kernel in C, or in numpy where there is no compiler."""
+
+from array import array
+from ctypes import addressof
+from typing import TypeAlias
+from weakref import WeakKeyDictionary
+
+from model.answer.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
+from model.answer.search import (
+    KEPT,
+    MISSING,
+    PROMISED_PERCENTILE,
+    PRUNING_STEP,
+    REACHED,
+    Contents,
+    Tones,
+)
+from model.answer.search_in_numpy import choose_by_numpy
+from model.arrays import Complex64Array
+from model.compiled.kernels import kernels, run
+from model.compiled.structures import (
+    FOUND,
+    Drawn,
+    FoundTones,
+    GivenQuestion,
+    GivenRaster,
+    Method,
+    Plates,
+    Rules,
+)
+from model.drive_modes import coherent
+from model.drive_modes.forms import LEVEL_MARGIN
+from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
+from model.ensemble.measures import PERCENTILE
+from model.ensemble.touched_by_kernel import draws_structure, plates_structure
+from model.ensemble.touched_plate import RIDGE
+from model.table.raster_kernel import given_raster
+from model.table.table import LocalizationTable
+
+
+def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
+    """Choose a tone for each content, and find what it promises."""
+    streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
+    starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
+    for stream in streams:
+        targets += stream.targets
+        starts.append(len(targets))
+        for band in stream.bands:
+            bands += band
+        priorities.append(stream.priority)
+        levels.append(10 ** (stream.level_db_sl / 20))
+    if by is None:
+        return choose_by_numpy(table, contents)
+    count, n, k = len(streams), len(table.eras), len(places)
+    kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
+    plates, raster, rules, by_count = kept
+    judging, promise, stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
+    if contents.loads.count(1.0) < len(contents.loads):
+        stiffness = table.attached.finger_stiffness(k, contents.loads)
+    # Not arrays of numpy, of which each takes as long to make and to read as all of these.
+    numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
+    at = array("d", [coordinate for place in places for coordinate in place])
+    background = contents.background
+    given = GivenQuestion(
+        *(count, len(streams[0].bands), k, len(quiet)),
+        *(contents.candidates, contents.combinations),
+        *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
+        *(at.buffer_info()[0], stiffness.ctypes.data),
+        None if background is None else background.ctypes.data,
+        *(addressof(judging), addressof(promise)),
+    )
+    size = 2 * n * count
+    rows, figures = array("i", bytes(4 * count)), array("f", bytes(4 * (size + count + 6 * k + 3)))
+    to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
+    status = run(by.library.answer, to, plates, raster, rules, given)
+    if status != FOUND:
+        raise AssertionError("contents must have tones")
+    found = figures.tolist()
+    weights = map(complex, found[:size:2], found[1:size:2])
+    contrast = size + count
+    level, of_others = contrast + 3 * k, contrast + 5 * k
+    worst, loudest, factor = found[-3:]
+    return Tones(
+        rows=rows.tolist(),
+        weights=list(zip(*[weights] * n, strict=True)),
+        gains=found[size:contrast],
+        owners=range(count),
+        contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
+        level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
+        foreign_db_sl=found[of_others:-3],
+        worst_db=worst,
+        loudest_db_sl=loudest,
+        stroke_factor=factor,
+        is_apart=bool(to.is_apart),
+    )
+
+
+_Fingers: TypeAlias = tuple[Drawn, Drawn, Complex64Array]
+"""Plates that judge and those of the promise, and the stiffness of fingers that press lightly."""
+
+_Kept: TypeAlias = tuple[Plates, GivenRaster, Rules, dict[int, _Fingers]]
+"""What kernels read of a table; and of so many fingers."""
+
+_kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
+
+
+def _with(table: LocalizationTable, fingers: int) -> _Fingers:
+    judging, promise = (
+        draws_structure(table.on_eras, fingers, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
+    )
+    return judging, promise, table.attached.finger_stiffness(fingers)
+
+
+def _kept_of(table: LocalizationTable) -> _Kept:
+    """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
+    uncertainty = table.uncertainty
+    variance = uncertainty.gain_variance
+    rules = Rules(
+        *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
+        *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.thickness > 0),
+        *(variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
+        *(PERCENTILE, PROMISED_PERCENTILE),
+        *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
+        *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
+        (Method * 3)(*map(_method, coherent.WITHIN_STROKE)),
+    )
+    rules.point(
+        rim=CENTRE_AND_RIM,
+        threshold=table.thresholds,
+        error=table.error_power,
+        frequencies=table.frequencies,
+    )
+    return plates_structure(table.on_eras), given_raster(table), rules, {}
+
+
+def _method(of: coherent.Method) -> Method:
+    return Method(
+        *(of.steps, of.is_limited, of.variance, of.gain),
+        *(coherent.LEVEL_RESERVE, coherent.MAX_GROWTH, coherent.MAX_MULTIPLIER),
+    )

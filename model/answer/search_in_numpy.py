@@ -1,0 +1,214 @@
+"""Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.answer.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
+from model.answer.promised import promised
+from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.choice import best_few, best_first, best_of
+from model.drive_modes.coherent import search, search_all, search_to_level
+from model.drive_modes.forms import Forms
+from model.ensemble.draws import JUDGING_DRAWS
+from model.ensemble.measures import percentile
+from model.finger.perception import decibels
+from model.table.table import SAME_FREQUENCY, LocalizationTable
+
+_TINY = 1e-20
+_BATCH = 64  # candidates that are judged at once
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Candidates (m,) of all contents: of which stream and band, row, score, weights (m, n)."""
+
+    streams: IntArray
+    bands: IntArray
+    rows: IntArray
+    scores: FloatArray
+    weights: Complex64Array
+
+
+def choose_by_numpy(table: LocalizationTable, contents: Contents) -> Tones:
+    """Choose a tone for each content, and find what it promises."""
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
+    rows = contents.rows
+    kept = ranked(fingers, contents) if contents.is_ranked else rows
+    found, is_limited = _candidates(fingers, contents, kept)
+    if len(kept) < len(rows) and (not len(found.rows) or is_limited):
+        found, is_limited = _candidates(fingers, contents, rows)
+    own, loudest = _judged(fingers, contents, found)
+    best, is_apart = np.zeros(1, dtype=int), True
+    if len(contents.streams) > 1:
+        best, is_apart = best_combination(table, contents, found, own, loudest)
+    elif len(found.rows) > 1:
+        quiet = loudest[:, [*contents.quiet]]
+        level = float(contents.levels[0])
+        best[0] = best_tone(level, found.scores, own, quiet)
+    rows, weights = found.rows[best], found.weights[best]
+    return promised(fingers, contents, rows, weights, np.arange(len(rows)), is_apart=is_apart)
+
+
+def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
+    """The rows most worth a search for one target, ascending; by one form of all other fingers."""
+    table, tips, touched = fingers.table, fingers.tips, fingers.touched
+    rows, target, others = contents.rows, contents.streams[0].targets[0], contents.others(0)
+    points, weights = tips.few, tips.few_weights
+    if len(others) > MAX_FINGERS_BY_POINT:
+        points, weights = touched.centres[:, None], np.ones_like(weights[:, :1])
+    shares = np.zeros_like(weights)
+    shares[others] = weights[others] / np.float32(len(others))
+    every = points.reshape(1, -1, points.shape[2])
+    found = touched.forms(rows, every, shares.reshape(1, -1), table.error_power)
+    fields = found.fields.reshape(len(rows), *points.shape[:2], -1)
+    mean = (weights[target] @ fields[:, target])[None]
+    level, threshold = float(contents.levels[0]), table.thresholds.take(rows)
+    power = found.power.swapaxes(0, 1)
+    searched = search_all(Forms(mean, power, found.power, threshold, level, 0.0))
+    order = best_first(searched.bound)
+    reaches = searched.score[order] > 0
+    # Those that would be better than the best, were they loud enough.
+    first = int(reaches.argmax()) if reaches.any() else len(order)
+    missing = order[:first][:MISSING]
+    reaching = order[reaches][: KEPT - len(missing)]
+    return np.asarray(rows[np.sort(np.concatenate([reaching, missing]))])
+
+
+def _candidates(
+    fingers: FingersOnPlate, contents: Contents, rows: IntArray
+) -> tuple[Candidates, bool]:
+    """The best tones of each content in each band, and whether a level was hard to reach."""
+    count, hertz = len(contents.streams), fingers.table.frequencies
+    formed = fingers.forms(rows, with_fine=True)
+    apart_hz = contents.apart_hz if count > 1 else 0.0
+    found: list[tuple[int, int, int, float, Complex64Array]] = []
+    is_limited = False
+    for number, stream in enumerate(contents.streams):
+        others = contents.others(number)
+        level = stream.level_db_sl + float(decibels(count))
+        for band, (low, end) in enumerate(stream.bands):
+            here = formed.at(np.flatnonzero((rows >= low) & (rows < end)))
+            rest = None if contents.background is None or others else contents.background[here.rows]
+            asked = here.of(stream.targets, others, level, rest)
+            searched, forms = search_to_level(asked)
+            is_limited |= len(searched.level_limited) > 0 or forms is not asked
+            ways = [searched]
+            if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
+                ways.append(search(here.by_point(forms, others)))
+            for way in ways:
+                for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
+                    score, weights = float(way.score[each]), way.weights[each]
+                    found.append((number, band, int(here.rows[each]), score, weights))
+    parts = zip(*found, strict=True) if found else ((),) * 5
+    return Candidates(*(np.array(part) for part in parts)), is_limited
+
+
+def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
+    """Indices of the two best scores, and of the best ones that are apart from all of these."""
+    found: list[int] = []
+    for at in best_first(score).tolist():
+        if score[at] <= 0 or len(found) == count:
+            break
+        gaps = np.abs(frequencies[found] - frequencies[at])
+        if len(found) < 2 or (gaps >= apart_hz - SAME_FREQUENCY).all():
+            found.append(at)
+    return found
+
+
+def _judged(
+    fingers: FingersOnPlate, contents: Contents, found: Candidates
+) -> tuple[FloatArray, FloatArray]:
+    """Amplitude (m, d) at the targets of each candidate, squared one (m, k, d) at loudest points.
+
+    Those of several contents at the contents' levels.
+    """
+    parts = [
+        fingers.drawn(JUDGING_DRAWS, found.rows[first:][:_BATCH], found.weights[first:][:_BATCH])
+        for first in range(0, len(found.rows), _BATCH)
+    ]
+    means = np.concatenate([part.means for part in parts])
+    loudest = np.concatenate([part.loudest[:, :, 1:] for part in parts], dtype=float)
+    own = np.empty((len(loudest), loudest.shape[2]))
+    for number, stream in enumerate(contents.streams):
+        of = found.streams == number
+        own[of] = means[of][:, [*stream.targets], 1:].min(axis=1)
+        if len(contents.streams) > 1:
+            gain = contents.levels[number] / np.maximum(percentile(own[of]), _TINY)
+            own[of] *= gain[:, None]
+            loudest[of] *= gain[:, None, None] ** 2
+    return own, loudest
+
+
+def best_tone(wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray) -> int:
+    """The candidate of an only content: level first, then contrast.
+
+    Without other fingers the score counts, and as much a level that is much the same on all plates.
+    wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d) as of `_judged`.
+    """
+    least = percentile(own)
+    reaches = least >= wanted * REACHED
+    if not reaches.any():
+        reaches[:] = True
+    if not quiet.shape[1]:
+        return best_of(reaches * scores * least / percentile(own, 50))
+    loud = np.sqrt(quiet.max(axis=1))
+    return best_of(np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0))
+
+
+def best_combination(
+    table: LocalizationTable,
+    contents: Contents,
+    found: Candidates,
+    own: FloatArray,
+    loudest: FloatArray,
+) -> tuple[IntArray, bool]:
+    """A candidate of each content (K,), and whether their frequencies are apart.
+
+    Of all that exchange bands and are apart, else of all that exchange bands.
+    """
+    streams, hertz = contents.streams, table.frequencies[found.rows]
+    for gap in (contents.apart_hz, 0.0):
+        combinations = np.flatnonzero(found.streams == 0)[:, None]
+        for number in range(1, len(streams)):
+            own_candidates = np.flatnonzero(found.streams == number)
+            before = np.repeat(combinations, len(own_candidates), axis=0)
+            last = np.tile(own_candidates, len(combinations))[:, None]
+            gaps = np.abs(hertz[last] - hertz[before])
+            allowed = (gaps >= gap - SAME_FREQUENCY).all(axis=1)
+            if len(streams[0].bands) > 1:
+                allowed &= (found.bands[last] != found.bands[before]).all(axis=1)
+            combinations = np.concatenate([before, last], axis=1)[allowed]
+            if len(combinations) > contents.combinations:
+                some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
+                worst = worst_ratios(combinations, streams, contents.quiet, *some)
+                combinations = combinations[best_few(worst, contents.combinations)]
+        if len(combinations):
+            worst = worst_ratios(combinations, streams, contents.quiet, own, loudest)
+            return combinations[best_of(worst)], gap == contents.apart_hz
+    raise AssertionError("contents with as many bands must have a combination")
+
+
+def worst_ratios(
+    combinations: IntArray,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    own: FloatArray,
+    loudest: FloatArray,
+) -> FloatArray:
+    """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,).
+
+    Of the first j contents alone; own (m, d), loudest (m, k, d) as of `_judged`.
+    """
+    levels, total = own[combinations] ** 2, loudest[combinations].sum(axis=1)
+    worst = np.full((len(combinations), own.shape[1]), np.inf)
+    for j, at in enumerate(combinations.T):
+        if combinations.shape[1] > 1:
+            for finger in streams[j].targets:
+                others_power = np.maximum(total[:, finger] - loudest[at, finger], _TINY)
+                worst = np.minimum(worst, levels[:, j] / others_power)
+    for finger in quiet:
+        worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
+    return percentile(worst)

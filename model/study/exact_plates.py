@@ -1,0 +1,189 @@
+"""Plates within the uncertainty of a rig solved exactly: the check of what answers promise.
+
+Each plate is solved in the reduced coordinates of the table, at the pattern's frequencies. One that
+is thicker by a factor has the same mode shapes; natural frequencies and modal masses scale with it.
+That is exact for thin plates; shear and rotary inertia of the paper's plate change the response by
+less than 1e-3 over 2 %.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.answer.question import Question
+from model.arrays import ComplexArray, FloatArray, IntArray, Point
+from model.ensemble.measures import over_fingertips
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import (
+    FingertipLoad,
+    attached_stiffness,
+    coupled_forces,
+    fingertip_loads,
+)
+from model.structure.modal_elasticity import check_scales, modal_receptance
+from model.table.raster_kernel import read_fingertips
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation, base_amplitudes
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """Factors of d plates relative to the modelled one.
+
+    thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
+    load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
+    deviation (d, contacts): of the response at each finger, in errors of the field.
+    """
+
+    thickness: FloatArray
+    loss: FloatArray
+    damping: FloatArray
+    stiffness: FloatArray
+    load: FloatArray
+    gain: ComplexArray
+    deviation: ComplexArray
+
+
+def draw_plates(
+    rng: np.random.Generator,
+    uncertainty: Uncertainty,
+    *,
+    count: int,
+    era_count: int,
+    contact_count: int,
+) -> Plates:
+    """Draw plates: normal numbers, of logarithms for damping, loss and load."""
+
+    def normal(*shape: int) -> FloatArray:
+        return rng.standard_normal((count, *shape))
+
+    phase = math.radians(uncertainty.phase_deg)
+    real, imaginary = normal(contact_count), normal(contact_count)
+    common = np.exp(uncertainty.common_gain * normal(1))
+    return Plates(
+        thickness=1 + uncertainty.thickness * normal(),
+        loss=uncertainty.damping ** normal(),
+        damping=uncertainty.damping ** normal(),
+        stiffness=1 + uncertainty.stiffness * normal(era_count),
+        load=np.exp(uncertainty.fingertip * normal(contact_count)),
+        gain=common
+        * (1 + uncertainty.gain * normal(era_count))
+        * np.exp(1j * phase * normal(era_count)),
+        deviation=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """What fingers feel on d plates: amplitude to threshold at the weakest target (d,).
+
+    contrast (d,): of it to that at the loudest quiet point, None without quiet fingers.
+    """
+
+    level: FloatArray
+    contrast: FloatArray | None
+
+
+def felt_on(
+    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+) -> Felt:
+    """What the fingers of a question feel of an excitation on plates; powers of its tones add."""
+    rows, power = powers_on(table, question, excitation, plates)
+    sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
+    weights = read_fingertips(table, question.contacts).fine_weights
+    (means,), (loudest,) = over_fingertips(sensed[None], weights)
+    count = len(question.targets)
+    level = means[:count].min(axis=0)
+    if not question.quiet:
+        return Felt(level, None)
+    return Felt(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
+
+
+def powers_on(
+    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+) -> tuple[IntArray, FloatArray]:
+    """Rows of an excitation's frequencies (m,), and squared amplitudes on plates (m, points, d).
+
+    At the fine points of `read_fingertips` of a question, finger by finger.
+    """
+    rows, found = _responses(table, *touched(table, question), excitation, plates)
+    return rows, np.abs(found) ** 2
+
+
+def amplitudes_on(
+    table: LocalizationTable, points: Sequence[Point], excitation: Excitation, plates: Plates
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (f,) [Hz] and amplitudes (f, points, d) [m/s²] where nothing touches the plate.
+
+    points [m]; plates: of as many contacts as points, whose loads count for nothing.
+    """
+    shapes = table.shapes_at(points)[:, None]
+    rows, found = _responses(table, shapes, (), excitation, plates)
+    return table.frequencies[rows], np.abs(found)
+
+
+def touched(
+    table: LocalizationTable, question: Question
+) -> tuple[FloatArray, Sequence[FingertipLoad]]:
+    """Shapes at the fine points of a question's fingers (k, p, r), and their loads."""
+    fine = read_fingertips(table, question.contacts).fine.astype(float)
+    return fine, fingertip_loads(table.fingertip, question.contacts, question.loads)
+
+
+def _responses(
+    table: LocalizationTable,
+    discs: FloatArray,
+    fingers: Sequence[FingertipLoad],
+    excitation: Excitation,
+    plates: Plates,
+) -> tuple[IntArray, ComplexArray]:
+    """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    rows = table.rows_of(frequencies)
+    found = accelerations_on(table, discs, fingers, rows, bases[:, None], plates)[:, :, 0]
+    weights = np.abs(bases) / [era.stroke for era in table.eras]
+    size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))
+    deviation = np.repeat(plates.deviation, discs.shape[1], axis=1)
+    return rows, (found + np.multiply.outer(deviation, size).swapaxes(1, 2)).transpose(1, 2, 0)
+
+
+def accelerations_on(
+    table: LocalizationTable,
+    discs: FloatArray,
+    fingers: Sequence[FingertipLoad],
+    rows: IntArray,
+    bases: ComplexArray,
+    plates: Plates,
+) -> ComplexArray:
+    """Acceleration (d, m, c, points) [m/s²] for base motions (m, c, eras) [m].
+
+    At rows (m,) of the table's frequencies and points of shapes discs (k, p, r), each finger at the
+    first point of its disc; without the deviation of the field.
+    """
+    check_scales(table.plate, plates.thickness)
+    w, eras = table.attached.omega[rows], table.eras
+    k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
+    damping = plates.damping[:, None, None] * c
+    springs = plates.stiffness[:, None] * k + 1j * w[:, None] * damping
+    loads = plates.load[:, : len(fingers)]
+    factors = np.pad(loads, ((0, 0), (len(table.masses), 0)), constant_values=1.0)
+    resting = attached_stiffness(w, table.masses, fingers)
+    at_eras = springs - (w**2)[:, None] * bolts
+    stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
+    nominal = table.attached.modal[rows]
+    lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
+    modal = modal_receptance(lossy, w, plates.thickness)[:, :, None]
+    shapes = np.vstack([table.attachment_shapes, discs[: len(fingers), 0]])
+    receptance = np.asarray((modal * shapes) @ shapes.T, dtype=complex)
+    gains = np.array([era.gain(table.frequencies[rows]) for era in eras]).T
+    driven = (springs * plates.gain[:, None] * gains)[:, :, None] * bases
+    still = ((0, 0), (0, 0), (0, 0), (0, len(shapes) - len(eras)))
+    forces = coupled_forces(receptance, stiffness, np.pad(driven, still).swapaxes(2, 3))
+    moved = modal * (forces.swapaxes(2, 3) @ shapes)
+    found = -(w**2)[:, None, None] * (moved @ discs.reshape(-1, discs.shape[-1]).T)
+    return np.asarray(found)
+
+
+_ERA_KEYS = ("stiffness", "damping", "bolt_mass")

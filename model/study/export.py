@@ -1,0 +1,167 @@
+"""Export of tables: a .mat file of everything, or .csv files of patterns or fields.
+
+`docs/reference/table-file.md` lists every name with its shape and unit.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.answer.pattern_query import find_pattern
+from model.arrays import Complex64Array
+from model.config.sections import Quantity
+from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+from model.files.csv_file import write_rows
+from model.rig.rig import PHYSICS
+from model.rig.sections import (
+    AirGapSection,
+    EraSection,
+    FingertipSection,
+    LayerSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+)
+from model.study.weak_cells import pair_questions
+from model.table.file import FORMAT_VERSION
+from model.table.table import LocalizationTable
+
+MAX_MAT_BYTES = (1 << 31) - 1
+"""Size of one variable in a .mat file of version 5, its header included."""
+
+
+def export_mat(table: LocalizationTable, path: Path) -> None:
+    """Write a struct `table` as a .mat file of version 5.
+
+    Raises InputError for a table that the format cannot hold, OSError where it cannot be written.
+    """
+    from scipy.io import savemat
+
+    size = 8 * table.raster.point_count * len(table.frequencies) * len(table.eras)
+    if size > MAX_MAT_BYTES:
+        raise InputError(
+            f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
+            f"{size / 1e9:.1f} GB; open the table itself, a .npz file, with numpy.load"
+        )
+    content = {
+        "format_version": float(FORMAT_VERSION),
+        "code_version": table.code_version,
+        "fingerprint": table.fingerprint,
+        "mode": table.drive_mode,
+        **_physics(table),
+        "mesh": str(table.mesh),
+        "reference_mesh": str(table.reference_mesh),
+        "discretisation_error": table.discretisation_error,
+        "frequency_hz": table.frequencies,
+        "raster_x_m": table.raster.x,
+        "raster_y_m": table.raster.y,
+        "acceleration_m_s2": _fields(table),
+        "mode_omega_rad_s": table.omega,
+        "mode_loss_rad2_s2": table.losses,
+        "mode_dispersion_hz": table.dispersion_frequencies,
+        "mode_dispersion_rad2_s2": table.dispersion,
+        "mode_shape": table.shapes,
+        "mode_shape_attachments": table.attachment_shapes,
+        "cell_centre_m": table.cell_centres,
+        "cells_along_x": float(table.grid.nx),
+        "cells_along_y": float(table.grid.ny),
+    }
+    with whole_or_nothing(path) as stream:
+        savemat(
+            stream,  # type: ignore[arg-type]  # it takes files too, its types do not say so
+            {"table": content},
+            long_field_names=True,
+            oned_as="column",
+        )
+
+
+def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
+    """Write a .csv file whose columns have their units in their names.
+
+    content: "patterns": a row for each target and quiet finger of the table's map, with what each
+    ERA plays in the table's drive mode, empty where it is silent, and what is promised, all empty
+    where the level is not reached; "fields": a row for each raster point and frequency, with real
+    and imaginary acceleration by each ERA alone at full stroke.
+    """
+    write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
+
+
+def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    parts = [f"{era.name}_{part}" for era in table.eras for part in ("hz", "level", "phase_deg")]
+    contacts = [f"{finger}_{axis}_m" for finger in ("target", "quiet") for axis in "xy"]
+    yield [*contacts, *parts, "robust_level_db_sl", "robust_felt_contrast_db"]
+    for question in chain.from_iterable(pair_questions(table)):
+        at = chain.from_iterable(question.contacts)
+        try:
+            pattern = find_pattern(table, question)
+        except InputError:
+            yield [*at, *[""] * (len(parts) + 2)]
+            continue
+        drive = table.drive_of(pattern.excitation)
+        tones = (drive[era.name].values() if era.name in drive else [""] * 3 for era in table.eras)
+        promised = (pattern.robust_level_db_sl, pattern.robust_felt_contrast_db)
+        yield [*at, *chain.from_iterable(tones), *promised]
+
+
+def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    parts = [f"{era.name}_{part}_m_s2" for era in table.eras for part in ("real", "imag")]
+    yield ["x_m", "y_m", "frequency_hz", *parts]
+    for (x, y), at_point in zip(table.raster.points.tolist(), _fields(table), strict=True):
+        for frequency, values in zip(table.frequencies.tolist(), at_point, strict=True):
+            yield [x, y, frequency, *_short(values.view(np.float32))]
+
+
+def _fields(table: LocalizationTable) -> Complex64Array:
+    """Acceleration [m/s²] on the raster by each ERA alone at full stroke, (points, f, eras)."""
+    return np.ascontiguousarray(table.unit_fields(table.raster.points).transpose(2, 0, 1))
+
+
+def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
+    """Shortest decimals that identify single-precision numbers."""
+    return [str(value) for value in values]
+
+
+_SECTIONS = (PlateSection, LayerSection, MaterialSection, AirGapSection, EraSection, MassSection)
+_NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad"}
+
+
+def _physics(table: LocalizationTable) -> dict[str, Any]:
+    """All that a table must have of its rig, numbers with the units of the rig's file."""
+    by_unit = {
+        key: f"{key}_{unit.lower().replace(' ', '').replace('/', '_').replace('^', '')}"
+        for section in (*_SECTIONS, FingertipSection)
+        for key, field in section.model_fields.items()
+        for unit in (each.dimension.unit for each in field.metadata if isinstance(each, Quantity))
+        if unit
+    } | _NAMES
+    return {
+        name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)
+        for name in PHYSICS
+    }
+
+
+def _exported(value: Any, names: Mapping[str, str]) -> Any:
+    """A value as .mat files have it; names: with units, by those of fields."""
+    if is_dataclass(value):
+        each = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {names.get(key, key): _exported(own, names) for key, own in each.items()}
+    if value is None:
+        return np.zeros((0, 0))
+    if not isinstance(value, tuple):
+        return value
+    rows = [_exported(each, names) for each in value]
+    return _structs(rows) if rows and isinstance(rows[0], dict) else np.array(rows, dtype=float)
+
+
+def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
+    """A struct array (n, 1) of rows of the same names."""
+    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in rows[0]])
+    for number, row in enumerate(rows):
+        for name, value in row.items():
+            structs[name][number, 0] = value
+    return structs

@@ -1,0 +1,373 @@
+"""Verification of a table: a sample of it recomputed by other methods.
+
+- Content: fields on the raster and at the cells, against the plate solved at each frequency
+  without modes (`model.spectral.direct`), relative L2. On finite elements, and with measured modes,
+  against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
+- Answers: level and contrast at random contacts, against the same with the fingers attached, too.
+- Promises: the felt contrast of nine of ten plates, on plates solved exactly.
+- Answers in time: amplitudes at the fingertips once the pattern, started from rest on the plate in
+  time (`model.transients.time_response`), has settled. Contrast beyond 25 dB counts as 25: in a
+  null, hysteretic and viscous damping differ by more than the vibration that is left.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.answer.pattern import Pattern
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.grid import Grid
+from model.finger.perception import contrast_db, decibels, detection_threshold
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import reduce_free_plate
+from model.rig.rig import Rig
+from model.spectral.direct import Responder, direct_spectral_acceleration
+from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.structure.attachments import fingertip_loads, footprints_of
+from model.study.exact_plates import draw_plates, felt_on
+from model.study.random_contacts import random_contacts
+from model.table.table import LocalizationTable
+from model.transients.base_motion import ramped_onset
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation, base_amplitudes, tone_amplitudes
+
+CONTENT_TOLERANCE = 1e-4
+"""Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""
+
+MODAL_ERROR = 0.03
+"""What lossy layers and air couple among modes, relative to the field (`benchmarks.layers`)."""
+
+ROUNDING_DB = 0.01
+
+RASTER_ERROR = 2e-4
+"""Interpolation error of a field on the raster, relative to its root mean square."""
+
+FINGER_ERROR = 7e-3
+"""What fingers deflect locally and the table's modes do not, relative to the same."""
+
+TIME_TOLERANCE_DB = 1.0
+MAX_CONTRAST_IN_TIME_DB = 25.0
+
+PLATES = 200
+"""Plates drawn for each answer."""
+
+MIN_KEPT_SHARE = 0.8
+"""Of the plates that must keep a promise; nine of ten are expected, on average over answers."""
+
+SAMPLED_FREQUENCIES = 3
+
+_ALL_OVER = Grid(8, 6)  # where the root mean square is taken
+
+_WINDOW = 0.25  # s, in which steady amplitudes are read
+_LEFT = 1e-4  # of what the start excited, before they are
+_MAX_DURATION = 20.0  # s
+
+
+@dataclass(frozen=True)
+class ContentCheck:
+    """A kind of content with its error and tolerance, relative L2."""
+
+    name: str
+    error: float
+    tolerance: float
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether the error is within the tolerance."""
+        return self.error <= self.tolerance
+
+
+@dataclass(frozen=True)
+class AnswerCheck:
+    """An answer, its level [dB SL] and felt contrast [dB] predicted, solved directly, and in time.
+
+    The tolerances [dB] follow from `field_error`: more where less is left of the vibration.
+    """
+
+    question: Question
+    pattern: Pattern
+    predicted_contrast_db: float
+    direct_level_db_sl: float
+    direct_contrast_db: float
+    contrast_in_time_db: float
+    level_tolerance_db: float
+    contrast_tolerance_db: float
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether all are within their tolerances; NaN is not."""
+        level = abs(self.direct_level_db_sl - self.pattern.level_db_sl)
+        contrast = abs(self.direct_contrast_db - self.predicted_contrast_db)
+        predicted, in_time = (
+            min(each, MAX_CONTRAST_IN_TIME_DB)
+            for each in (self.predicted_contrast_db, self.contrast_in_time_db)
+        )
+        return (
+            level <= self.level_tolerance_db
+            and contrast <= self.contrast_tolerance_db
+            and abs(in_time - predicted) <= self.time_tolerance_db
+        )
+
+    @property
+    def time_tolerance_db(self) -> float:
+        """Tolerance of the contrast in time."""
+        return TIME_TOLERANCE_DB + self.contrast_tolerance_db
+
+
+@dataclass(frozen=True)
+class PromiseCheck:
+    """Exact plates on which the answers keep their promised felt contrast: share, and number."""
+
+    kept_share: float
+    plate_count: int
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether enough plates keep it."""
+        return self.kept_share >= MIN_KEPT_SHARE
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All recomputed content and answers."""
+
+    content: tuple[ContentCheck, ...]
+    answer_checks: tuple[AnswerCheck, ...]
+    promise: PromiseCheck
+
+    @property
+    def checks(self) -> tuple[ContentCheck | AnswerCheck | PromiseCheck, ...]:
+        """All checks."""
+        return (*self.content, *self.answer_checks, self.promise)
+
+    @property
+    def failed_count(self) -> int:
+        """Number of failed checks."""
+        return [check.is_passed for check in self.checks].count(False)
+
+    def as_json(self) -> dict[str, Any]:
+        """All checks for programs."""
+        return {
+            "content": [
+                {"what": check.name, "relative_error": check.error, "passed": check.is_passed}
+                for check in self.content
+            ],
+            "answers": [
+                {
+                    "target_m": list(answer.question.targets[0]),
+                    "quiet_m": [list(place) for place in answer.question.quiet],
+                    "predicted_level_db_sl": answer.pattern.level_db_sl,
+                    "direct_level_db_sl": answer.direct_level_db_sl,
+                    "level_tolerance_db": answer.level_tolerance_db,
+                    "predicted_felt_contrast_db": answer.predicted_contrast_db,
+                    "direct_felt_contrast_db": answer.direct_contrast_db,
+                    "contrast_tolerance_db": answer.contrast_tolerance_db,
+                    "felt_contrast_in_time_db": answer.contrast_in_time_db,
+                    "time_tolerance_db": answer.time_tolerance_db,
+                    "passed": answer.is_passed,
+                }
+                for answer in self.answer_checks
+            ],
+            "promise": {
+                "kept_share": self.promise.kept_share,
+                "plates": self.promise.plate_count,
+                "passed": self.promise.is_passed,
+            },
+            "failed": self.failed_count,
+        }
+
+
+def field_error(table: LocalizationTable, frequency: float) -> float:
+    """By how much the raster and the mesh may differ between their points, and fingers in them.
+
+    Relative to the field's root mean square: next to nothing of polynomials of high degree;
+    elements of the first order make straight lines of a wave, the raster does not. Modes that
+    change with frequency are taken one by one.
+    """
+    finger = 0.0 if table.fingertip is None else FINGER_ERROR
+    return (
+        RASTER_ERROR
+        + _modal_error(table)
+        + finger
+        + table.mesh.interpolation_error(table.plate, frequency)
+    )
+
+
+def _modal_error(table: LocalizationTable) -> float:
+    return 0.0 if table.modal_dispersion is None else MODAL_ERROR
+
+
+def _reference(rig: Rig, mesh: PlateMesh, free: FreePlate) -> Responder:
+    """The plate without modes, where that can be said of it."""
+    if isinstance(mesh, SpectralMesh) and not rig.plate.mode_deviations:
+        return partial(direct_spectral_acceleration, rig.plate, mesh)
+    return free.acceleration
+
+
+def verify_table(
+    table: LocalizationTable,
+    rig: Rig,
+    *,
+    samples: int = 12,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Verification:
+    """Recompute content and answers to random contacts, with 1, 2, 3 quiet ones in turn.
+
+    The rig must be the table's own: check the fingerprint when loading. samples: number of answers;
+    progress: called with the numbers of answers done and of all. Raises InputError where no
+    contacts have an answer.
+    """
+    rng = np.random.default_rng(seed)
+    free = solve_free_plate(rig.plate, table.mesh, frequency_max=float(table.frequencies[-1]))
+    respond = _reference(rig, table.mesh, free)
+    content = tuple(_check_content(table, rig, respond, rng))
+    check = _AnswerChecker(table, rig, free, respond)
+    answer_checks, kept = [], []
+    for number in range(samples):
+        question, pattern = _random_answer(table, rng, others=1 + number % 3)
+        answer_checks.append(check(question, pattern))
+        kept.append(_kept_share(table, question, pattern, rng))
+        progress(number + 1, samples)
+    promise = PromiseCheck(float(np.mean(kept)), samples * PLATES)
+    return Verification(content, tuple(answer_checks), promise)
+
+
+def _kept_share(
+    table: LocalizationTable, question: Question, pattern: Pattern, rng: np.random.Generator
+) -> float:
+    """Share of exact plates on which an answer keeps its promised felt contrast."""
+    plates = draw_plates(
+        rng,
+        table.uncertainty,
+        count=PLATES,
+        era_count=len(table.eras),
+        contact_count=len(question.targets) + len(question.quiet),
+    )
+    contrast = felt_on(table, question, pattern.excitation, plates).contrast
+    if contrast is None or pattern.robust_felt_contrast_db is None:
+        return math.nan
+    return float((decibels(contrast) >= pattern.robust_felt_contrast_db - ROUNDING_DB).mean())
+
+
+def _check_content(
+    table: LocalizationTable, rig: Rig, respond: Responder, rng: np.random.Generator
+) -> Iterator[ContentCheck]:
+    count = min(SAMPLED_FREQUENCIES, len(table.frequencies))
+    chosen = np.sort(rng.choice(len(table.frequencies), count, replace=False))
+    points = np.concatenate([table.raster.points, table.cell_centres])
+    exact = respond(rig.eras, table.frequencies[chosen], points, loads=rig.masses)
+    on_raster, at_cells = np.split(exact, [table.raster.point_count], axis=2)
+    found = table.unit_fields(table.raster.points)[chosen]
+    tolerance = CONTENT_TOLERANCE + _modal_error(table)
+    yield ContentCheck("fields on the raster", _relative(found, on_raster), tolerance)
+    between = table.mesh.interpolation_error(rig.plate, float(table.frequencies[-1]))
+    found = table.unit_fields(table.cell_centres)[chosen]
+    tolerance += RASTER_ERROR + between
+    yield ContentCheck("fields at the cells", _relative(found, at_cells), tolerance)
+
+
+def _relative(found: NDArray[Any], exact: NDArray[Any]) -> float:
+    """The worst relative L2 error along the last axis."""
+    size = np.linalg.norm(exact, axis=-1)
+    return float((np.linalg.norm(found - exact, axis=-1) / size).max())
+
+
+class _AnswerChecker:
+    """Recomputes answers with the fingers on the plate."""
+
+    def __init__(
+        self, table: LocalizationTable, rig: Rig, free: FreePlate, respond: Responder
+    ) -> None:
+        self._table, self._rig, self._free, self._respond = table, rig, free, respond
+
+    def __call__(self, question: Question, pattern: Pattern) -> AnswerCheck:
+        """One answer recomputed."""
+        rig = self._rig
+        contacts = question.contacts
+        discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
+        weights = fingertip_weights(*contacts[0], rig.plate)
+        count = len(weights)
+        points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
+        fingers = fingertip_loads(rig.fingertip, contacts, question.loads)
+        frequencies, everywhere = tone_amplitudes(
+            pattern.excitation,
+            rig.eras,
+            lambda f: self._respond(rig.eras, f, points, loads=[*rig.masses, *fingers]),
+        )
+        direct, rest = np.split(everywhere, [len(discs)], axis=1)
+        attached = footprints_of(rig.eras, rig.masses, fingers)
+        plate = plate_in_time(
+            reduce_free_plate(self._free, attached), rig.eras, loads=rig.masses, contacts=fingers
+        )
+        in_time = steady_in_time(plate, Transients(plate), pattern.excitation, discs)
+        threshold = detection_threshold(frequencies, self._table.threshold)[:, None]
+        felt, felt_in_time, felt_elsewhere = (
+            np.linalg.norm(tones / threshold, axis=0) for tones in (direct, in_time, rest)
+        )
+        error = field_error(self._table, float(frequencies[-1]))
+        error *= math.sqrt(float((felt_elsewhere**2).mean()))
+        at_target = float(decibels(1 + error / (felt[:count] @ weights)))
+        at_quiet = float(decibels(1 + error / felt[count:].max()))
+        contrast = pattern.felt_contrast_db
+        return AnswerCheck(
+            question,
+            pattern,
+            predicted_contrast_db=math.nan if contrast is None else contrast,
+            direct_level_db_sl=float(decibels(felt[:count] @ weights)),
+            direct_contrast_db=_contrast(felt, weights),
+            contrast_in_time_db=_contrast(felt_in_time, weights),
+            level_tolerance_db=ROUNDING_DB + at_target,
+            contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
+        )
+
+
+def steady_in_time(
+    plate: PlateInTime, transients: Transients, excitation: Excitation, points: FloatArray
+) -> FloatArray:
+    """Amplitudes (f, p) [m/s²] at points [m] long after an excitation started from rest."""
+    slowest = -float(plate.eigenvalues.real.max())
+    settled = -math.log(_LEFT) / slowest if slowest > 0 else _MAX_DURATION
+    duration = min(settled, _MAX_DURATION) + _WINDOW
+    bases = ramped_onset(excitation, plate.eras, ramp=0.02)
+    felt = transients.acceleration(bases, points, duration=duration)
+    last = round(_WINDOW * SAMPLE_RATE)
+    times = np.arange(len(felt) - last, len(felt)) / SAMPLE_RATE
+    frequencies, _ = base_amplitudes(excitation, plate.eras)
+    phases = 2 * np.pi * np.outer(times, frequencies)
+    fitted, *_ = np.linalg.lstsq(np.hstack([np.cos(phases), np.sin(phases)]), felt[-last:])
+    return np.asarray(np.hypot(*np.split(fitted, 2)))
+
+
+def _contrast(felt: FloatArray, weights: FloatArray) -> float:
+    """Felt contrast [dB] of a target, whose points with their weights come first."""
+    target, quiet = np.split(felt, [len(weights)])
+    return float(contrast_db([target], quiet, [weights]))
+
+
+def _random_answer(
+    table: LocalizationTable, rng: np.random.Generator, *, others: int
+) -> tuple[Question, Pattern]:
+    """Contacts at least 5 cm apart, and the table's answer; where they do not fit, fewer."""
+    for tries in range(1000):
+        count = 1 + max(1, others - tries // 200)
+        with contextlib.suppress(InputError):
+            contacts = random_contacts(rng, count, table.plate, tries=1)
+            question = Question(contacts[:1], contacts[1:])
+            return question, find_pattern(table, question)
+    length, width = table.plate.length, table.plate.width
+    raise InputError(
+        f"no random contacts on this plate of {length:g} x {width:g} m have an answer at 20 dB "
+        "SL to verify; is it smaller than two fingers, or its stroke too small?"
+    )

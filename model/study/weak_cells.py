@@ -1,0 +1,264 @@
+"""Felt contrast that the cells of a plate have to other fingers.
+
+For the centre of each cell as the target, the contrast that nine of ten plates give to another
+finger at random places at least 5 cm away. A cell is *feasible* if the
+median other finger leaves 12 dB at 20 dB SL: turned down to 12 dB SL, which is felt well, the other
+finger is then at its threshold. It is *weak* if more than one other finger in ten leaves less.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.arrays import FloatArray, Point, nullable
+from model.errors import InputError
+from model.finger.grid import Grid
+from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.structure.attachments import Era, PointLoad
+from model.structure.plate import Plate
+from model.study.random_contacts import MIN_DISTANCE
+from model.table.table import LocalizationTable
+
+WANTED_CONTRAST_DB = FELT_DB_SL
+WANTED_LEVEL_DB_SL = STRONG_DB_SL
+
+STRATA = (2, 2)
+"""Strata of a quarter of the plate, one random place of the other finger in each.
+
+Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with
+less variance than from places drawn freely.
+"""
+
+Contrasts: TypeAlias = tuple[float, float]
+"""Felt contrast [dB] of nine of ten plates, and that of the nominal plate."""
+
+Ask: TypeAlias = Callable[[Question], Contrasts | None]
+"""Answers a question with quiet fingers, None where the level is not reached."""
+
+_DECIMALS = 9  # of places [m]: below that is rounding
+
+# Weak places are as large as a quarter of a wavelength.
+_MAX_GRID = Grid(8, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class WeakCells:
+    """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
+
+    -inf where the level is not reached, NaN on a plate too small for two fingers. errors_db: one
+    standard deviation of both by the choice of the other fingers, (2, cells). pairs_db: promised
+    and nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
+    """
+
+    grid: Grid
+    centres: FloatArray
+    median_db: FloatArray
+    tenth_db: FloatArray
+    errors_db: FloatArray
+    pairs_db: FloatArray
+
+    @property
+    def feasible(self) -> NDArray[np.bool_]:
+        """Mask of feasible cells."""
+        return np.asarray(self.median_db >= WANTED_CONTRAST_DB)
+
+    @property
+    def weak(self) -> NDArray[np.bool_]:
+        """Mask of weak cells."""
+        return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
+
+    def as_json(self) -> dict[str, Any]:
+        """The map for programs; null where a contrast is not finite."""
+        return {
+            "grid": str(self.grid),
+            "centres_m": self.centres.tolist(),
+            "median_contrast_db": nullable(self.median_db),
+            "tenth_percentile_contrast_db": nullable(self.tenth_db),
+            "median_contrast_error_db": nullable(self.errors_db[0]),
+            "tenth_percentile_contrast_error_db": nullable(self.errors_db[1]),
+            "is_weak": self.weak.tolist(),
+            "is_feasible": self.feasible.tolist(),
+        }
+
+
+def sampling_error(values: ArrayLike, percent: float) -> float:
+    """One standard deviation of a percentile of a random sample (n,), NaN where it is not finite.
+
+    Half the distance between the order statistics that are one standard deviation of the number of
+    values below the percentile away from it, whatever the values' distribution. Equal values count
+    once, as those of questions that mirror each other.
+    """
+    sample = np.asarray(values, dtype=float)
+    share, count = percent / 100, len(np.unique(sample))
+    if count == 0:
+        return math.nan
+    ranks = np.clip(share + np.array([-1, 1]) * math.sqrt(share * (1 - share) / count), 0, 1)
+    low, high = np.quantile(sample, ranks, method="inverted_cdf")
+    return float(high - low) / 2 if np.isfinite([low, high]).all() else math.nan
+
+
+def map_grid(table: LocalizationTable) -> Grid:
+    """Grid of the map: the table's, or a coarser one in place of a fine one."""
+    return Grid(min(table.grid.nx, _MAX_GRID.nx), min(table.grid.ny, _MAX_GRID.ny))
+
+
+def find_weak_cells(
+    table: LocalizationTable, answered: Sequence[Sequence[Contrasts | None]]
+) -> WeakCells:
+    """The map, of what `pair_questions` have been answered, cell by cell."""
+    grid = map_grid(table)
+    found, errors = np.full((2, 2, len(answered)), np.nan)
+    for cell, answers in enumerate(answered):
+        # -inf where the level is not reached.
+        contrasts = [-np.inf if each is None else each[0] for each in answers]
+        if contrasts:
+            # A sample with -inf cannot be interpolated.
+            found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
+            errors[:, cell] = [sampling_error(contrasts, percent) for percent in (50, 10)]
+    pairs = contrasts_reached(chain.from_iterable(answered))
+    median, tenth = found
+    return WeakCells(grid, grid.centres(table.plate), median, tenth, errors, pairs)
+
+
+def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
+    """Promised and nominal felt contrast [dB] of answers that reach the level, (2, answers)."""
+    return np.array([*filter(None, answered)], dtype=float).reshape(-1, 2).T
+
+
+def pair_questions(table: LocalizationTable) -> list[list[Question]]:
+    """For each cell of `map_grid` as the target, those with each other finger at a distance.
+
+    Places of the other finger are drawn for each cell, the same for cells that mirror each other
+    where the plate does.
+    """
+    grid, plate = map_grid(table), table.plate
+    centres = grid.centres(plate)
+    images = mirror_images(table)
+    along_x, along_y = (True, False) in images, (False, True) in images
+
+    def seed(x: int, y: int) -> list[int]:
+        return [
+            min(x, grid.nx - 1 - x) if along_x else x,
+            min(y, grid.ny - 1 - y) if along_y else y,
+        ]
+
+    return [
+        _questions(centres[x + y * grid.nx], _places(plate, seed(x, y)))
+        for y in range(grid.ny)
+        for x in range(grid.nx)
+    ]
+
+
+def ask_once(table: LocalizationTable) -> Ask:
+    """Promised and nominal felt contrast [dB] of questions, None where the level is not reached.
+
+    Questions that mirror each other, where plate, ERAs and masses do, have one answer, so that the
+    noise of the drawn plates does not make several samples of one.
+    """
+    images, known = mirror_images(table), dict[Question, Contrasts | None]()
+
+    def ask(question: Question) -> Contrasts | None:
+        first = _first_image(question, table, images)
+        if first not in known:
+            known[first] = contrasts_of(table, first)
+        return known[first]
+
+    return ask
+
+
+def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
+    """Promised and nominal felt contrast [dB], None where the level is not reached."""
+    try:
+        found = find_pattern(table, question)
+    except InputError:
+        return None
+    promised, nominal = found.robust_felt_contrast_db, found.felt_contrast_db
+    return None if promised is None or nominal is None else (promised, nominal)
+
+
+def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
+    """The reflections, along x, along y or both, under which a table's plate is the same.
+
+    That along neither is always one of them.
+    """
+    every = [(False, False), (True, False), (False, True), (True, True)]
+    return [
+        along
+        for along in every
+        if all(
+            _placed(attached, table, along) == _placed(attached, table, every[0])
+            for attached in (table.eras, table.masses)
+        )
+    ]
+
+
+def _first_image(
+    question: Question, table: LocalizationTable, images: Sequence[tuple[bool, bool]]
+) -> Question:
+    """The image of a question that is the same for all its images."""
+    if len(images) == 1:
+        return question
+    count = len(question.targets)
+    contacts = min(
+        tuple(_reflected(at, table, along) for at in question.contacts) for along in images
+    )
+    return replace(question, targets=contacts[:count], quiet=contacts[count:])
+
+
+def _reflected(at: Point, table: LocalizationTable, along: tuple[bool, bool]) -> Point:
+    (x, y), plate = at, table.plate
+    return (
+        round(plate.length - x if along[0] else x, _DECIMALS),
+        round(plate.width - y if along[1] else y, _DECIMALS),
+    )
+
+
+def _placed(
+    attached: Iterable[Era | PointLoad], table: LocalizationTable, along: tuple[bool, bool]
+) -> Counter[Era | PointLoad]:
+    """What is attached, without names, at its reflected places."""
+    found: Counter[Era | PointLoad] = Counter()
+    for each in attached:
+        x, y = _reflected((each.x, each.y), table, along)
+        nameless = replace(each, name="") if isinstance(each, Era) else each
+        found[replace(nameless, x=x, y=y)] += 1
+    return found
+
+
+def text_map(weak: WeakCells) -> Iterator[str]:
+    """Median contrast as lines of text, the largest y first, with * for weak cells."""
+    shape = (weak.grid.ny, weak.grid.nx)
+    rows = zip(weak.median_db.reshape(shape), weak.weak.reshape(shape), strict=True)
+    for median, marks in reversed(list(rows)):
+        yield "".join(
+            f"{'-' if not np.isfinite(value) else format(value, '.0f'):>4}{'*' if mark else ' '}"
+            for value, mark in zip(median, marks, strict=True)
+        ).rstrip()
+
+
+def _places(plate: Plate, seed: list[int]) -> FloatArray:
+    """Random places all over a plate, with all their mirror images, (n, 2) [m]."""
+    corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
+    drawn = np.random.default_rng(seed).uniform(0, 1, corner.shape)
+    drawn = (corner + drawn) / (2 * np.array(STRATA))
+    mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
+    size = np.array([plate.length, plate.width])
+    return np.asarray(size * mirrored.reshape(-1, 2))
+
+
+def _questions(target: FloatArray, places: FloatArray) -> list[Question]:
+    """At the wanted level at a target [m], for each other finger at a distance."""
+    far = np.linalg.norm(places - target, axis=1) >= MIN_DISTANCE
+    at = (float(target[0]), float(target[1]))
+    return [
+        Question((at,), ((float(x), float(y)),), level_db_sl=WANTED_LEVEL_DB_SL)
+        for x, y in places[far]
+    ]

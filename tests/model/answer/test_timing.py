@@ -1,0 +1,111 @@
+"""Onsets, endings and transient measures of a table's patterns."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.answer.pattern_query import find_pattern
+from model.answer.query import query_batch
+from model.answer.question import Question
+from model.answer.timing import Timing
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import footprints_of
+from model.table.build import build_table
+from model.transients.base_motion import ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.shaping import Shaper
+from model.transients.time_response import plate_in_time
+from paper_plate import make_paper_rig
+
+QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), drive_mode="phased")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A mesh that is quick to solve, and weightless fingers, as on the plate in time."""
+    known = replace(Uncertainty.none(), gain=0.05, phase_deg=5.0)
+    return replace(make_paper_rig(24, 18), fingertip=None, uncertainty=known)
+
+
+@pytest.fixture(scope="module")
+def table(rig):
+    """A few frequencies are enough to choose among."""
+    return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), drive_mode="phased")
+
+
+@pytest.fixture(scope="module")
+def solved(rig):
+    """The same plate solved in time without the table."""
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=300.0)
+    return Transients(plate_in_time(reduced, rig.eras))
+
+
+def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
+    """Measures of ramps and envelopes agree; envelopes do better with the same excitation."""
+    timing = Timing(table)
+    plain = timing.with_transient_measures(QUESTION, find_pattern(table, QUESTION))
+    shaped_pattern = timing.with_transient_measures(
+        QUESTION, timing.with_envelopes(QUESTION, find_pattern(table, QUESTION))
+    )
+    assert plain.onset is plain.ending is None
+    ramps = (
+        ramped_onset(plain.excitation, rig.eras, ramp=0.040),
+        ramped_ending(plain.excitation, rig.eras, ramp=0.040),
+    )
+    envelopes = (shaped(shaped_pattern.onset, rig.eras), shaped(shaped_pattern.ending, rig.eras))
+    for pattern, (onset, ending) in ((plain, ramps), (shaped_pattern, envelopes)):
+        contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
+        assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
+        left = solved.residual_db(pattern.excitation, ending)
+        assert pattern.residual_db == pytest.approx(left, abs=0.2)
+    assert shaped_pattern.transient_contrast_db > plain.transient_contrast_db + 3
+    assert shaped_pattern.residual_db < plain.residual_db - 10
+    assert shaped_pattern.excitation == plain.excitation
+
+
+@pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
+def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
+    """Knots within a per mille of the largest, at an edge of the plate as well."""
+    question = replace(QUESTION, quiet=quiet)
+    found = Timing(table).with_envelopes(question, find_pattern(table, question))
+    shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
+    onset = shaper.onset(found.excitation, targets=question.targets, quiet=quiet)
+    largest = max(each.largest for each in onset.values())
+    for name, each in onset.items():
+        np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
+
+
+def test_transient_measures_without_quiet_fingers(table):
+    """There is no contrast; what is left after the end is known all the same."""
+    alone = Question(((0.09, 0.07),), drive_mode="phased")
+    timing = Timing(table)
+    pattern = timing.with_transient_measures(
+        alone, timing.with_envelopes(alone, find_pattern(table, alone))
+    )
+    assert pattern.transient_contrast_db is None
+    assert pattern.residual_db < -20
+
+
+def test_query_batch_has_knots_only_with_envelopes(table):
+    """21 and 8 knots for every ERA, from silence to the pattern and back; else null."""
+    line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
+    plain, with_knots = query_batch(
+        table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
+    )
+    assert plain["onset"] is plain["ending"] is None
+    assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
+    assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
+    assert {each["start"]["level"] for each in with_knots["onset"].values()} == {0.0}
+    for era, tone in with_knots["drive"].items():
+        start = with_knots["ending"][era]["start"]
+        assert start["level"] == pytest.approx(tone["level"])
+        assert start["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        last = with_knots["onset"][era]["knots"][-1]
+        assert last["level"] == pytest.approx(tone["level"])
+        assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
+        assert with_knots["ending"][era]["knots"][-1]["level"] == 0
+    assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]

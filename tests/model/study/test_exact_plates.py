@@ -1,0 +1,238 @@
+"""Plates within the uncertainty, by the direct solver, and what answers promise of them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.direct_plate import direct_acceleration
+from model.answer.pattern_query import find_pattern
+from model.answer.question import Question
+from model.ensemble.measures import percentile
+from model.fem.plate import assemble
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import detection_threshold
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import FingertipLoad
+from model.study.exact_plates import Plates, draw_plates, felt_on
+from model.table.build import build_table
+from model.vibration.excitation import base_amplitudes
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+
+TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
+
+PLATES = Plates(
+    thickness=np.array([1.0, 1.02, 0.98]),
+    loss=np.array([1.0, 2.0, 0.5]),
+    damping=np.array([1.0, 0.5, 2.0]),
+    stiffness=np.array([[1.0, 1.0, 1.0, 1.0], [0.9, 1.1, 1.0, 0.95], [1.1, 1.0, 0.92, 1.05]]),
+    load=np.array([[1.0, 1.0, 1.0], [0.5, 2.0, 1.5], [1.8, 0.6, 1.0]]),
+    gain=np.array(
+        [[1, 1, 1, 1], [1.05, 0.96, 1.02, np.exp(0.1j)], [np.exp(-0.08j), 1, 0.93, 1]],
+        dtype=complex,
+    ),
+    deviation=np.zeros((3, 3), dtype=complex),
+)
+
+
+def directly(rig, pattern, number, *, targets=1, pressed=(1, 1, 1)):
+    """Felt and acceleration contrast [dB] by the sparse direct solve of that plate.
+
+    targets: how many of the places are; the weakest one counts. pressed: factor on the pulp and
+    contact mass of each finger.
+    """
+    plate = replace(
+        rig.plate,
+        thickness=rig.plate.thickness * PLATES.thickness[number],
+        loss_factor=rig.plate.loss_factor * PLATES.loss[number],
+    )
+    eras = [
+        replace(era, stiffness=era.stiffness * k, damping=era.damping * PLATES.damping[number])
+        for era, k in zip(rig.eras, PLATES.stiffness[number], strict=True)
+    ]
+    places = (TARGET, *QUIET)
+    fingers = [
+        FingertipLoad(*place, rig.fingertip.scaled(more).multiplied(factor))
+        for place, more, factor in zip(places, pressed, PLATES.load[number], strict=True)
+    ]
+    discs = [fingertip_points(*place, rig.plate) for place in places]
+    frequencies, bases = base_amplitudes(pattern.excitation, rig.eras)
+    unit = direct_acceleration(
+        assemble(plate, rig.mesh),
+        eras,
+        frequencies,
+        np.concatenate(discs),
+        loads=[*rig.masses, *fingers],
+    )
+    weights = bases / [era.stroke for era in rig.eras] * PLATES.gain[number]
+    amplitudes = np.abs(np.einsum("fe,fep->fp", weights, unit))
+    above = np.sqrt(((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1))
+    each = np.split(above, np.cumsum([len(disc) for disc in discs])[:-1])
+    means = [
+        here @ fingertip_weights(*place, rig.plate)
+        for here, place in zip(each[:targets], places, strict=False)
+    ]
+    return 20 * np.log10(min(means) / np.concatenate(each[targets:]).max())
+
+
+@pytest.mark.parametrize(("targets", "mode"), [(1, "switched"), (1, "phased"), (2, "switched")])
+def test_felt_on_agrees_with_the_direct_solve(targets, mode):
+    """Thicker, softer, damped otherwise, misdriven, other fingers on it: within 0.15 dB."""
+    places = (TARGET, *QUIET)
+    question = Question(places[:targets], places[targets:], drive_mode=mode)
+    pattern = find_pattern(smooth_table(), question)
+    contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
+    found = 20 * np.log10(contrast)
+    solved = [directly(smooth_rig(), pattern, number, targets=targets) for number in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.15)
+    assert np.ptp(solved) > 0.3  # the plates do differ
+
+
+def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve():
+    """Contrasts of the answer, and on other plates with these fingers: within 0.15 dB.
+
+    Nominal contrast on the first of the plates, which is the modelled one; those of fingers that
+    press alike are off by more.
+    """
+    loads = (2.5, 0.4, 1.0)
+    question = Question((TARGET,), QUIET, drive_mode="phased", loads=loads)
+    pattern = find_pattern(smooth_table(), question)
+    contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
+    found = 20 * np.log10(contrast)
+    solved = [directly(smooth_rig(), pattern, number, pressed=loads) for number in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.15)
+    assert pattern.felt_contrast_db == pytest.approx(solved[0], abs=0.15)
+    alike = [directly(smooth_rig(), pattern, number) for number in range(3)]
+    assert np.abs(np.subtract(alike, solved)).max() > 0.4
+
+
+def test_discretisation_error_enters_the_contrast_of_plates():
+    """An error that drowns one finger's response trades places with it; twice the error is 6 dB.
+
+    Far above the response it is the whole amplitude D there: D over quiet and target over D make
+    target over quiet.
+    """
+    question = Question((TARGET,), QUIET[:1], drive_mode="phased")
+    table = smooth_table()
+    excitation = find_pattern(table, question).excitation
+    plates = replace(
+        draw_plates(
+            np.random.default_rng(0), Uncertainty.none(), count=3, era_count=4, contact_count=2
+        ),
+        deviation=1e6 * np.array([[0, 0], [1, 0], [0, 1j]]),
+    )
+
+    def contrasts(of):
+        return 20 * np.log10(felt_on(of, question, excitation, plates).contrast)
+
+    right, at_target, at_quiet = contrasts(table)
+    assert at_target + at_quiet == pytest.approx(right, abs=0.01)
+    worse = replace(table, discretisation_error=2 * table.discretisation_error)
+    found = contrasts(worse) - [right, at_target, at_quiet]
+    assert found == pytest.approx([0, 6.02, -6.02], abs=0.01)
+
+
+def test_error_power_is_the_error_of_the_direct_field():
+    """One ERA driven: its field over the plate by the direct solve, mean square, times it."""
+    rig, table = smooth_rig(), smooth_table()
+    frequency = float(table.frequencies[8])
+    direct = direct_acceleration(
+        assemble(rig.plate, rig.mesh), rig.eras, np.array([frequency]), table.raster.points
+    )[0, 1]
+    expected = table.discretisation_error[8] ** 2 * (np.abs(direct) ** 2).mean()
+    assert table.error_power[8, 1] == pytest.approx(expected, rel=1e-3)
+
+
+def test_draw_plates_has_the_spreads_of_the_uncertainty():
+    """Normal numbers: of the logarithm for damping, loss and load."""
+    plates = draw_plates(
+        np.random.default_rng(0), Uncertainty(), count=4000, era_count=3, contact_count=2
+    )
+    expected_stds = [
+        (np.abs(plates.gain), 0.05),
+        (np.degrees(np.angle(plates.gain)), 5.0),
+        (plates.stiffness, 0.1),
+        (plates.thickness, 0.02),
+        (np.log(plates.damping), math.log(1.5)),
+        (np.log(plates.loss), math.log(1.5)),
+        (np.log(plates.load), 0.5),
+    ]
+    for values, std in expected_stds:
+        assert values.std() == pytest.approx(std, rel=0.04)
+
+
+@pytest.mark.parametrize("mode", ["switched", "phased"])
+def test_promises_are_kept_on_nine_of_ten_plates(mode):
+    """On 200 fresh plates each, level and felt contrast of 16 answers: 85 to 95 % of all."""
+    table = smooth_table()
+    rng = np.random.default_rng(3)
+    level_kept, contrast_kept, typical = [], [], []
+    for number, places in enumerate(contact_sets(16, fingers=4, seed=41)):
+        count = 1 + number % 3
+        question = Question((places[0],), tuple(places[1 : 1 + count]), drive_mode=mode)
+        pattern = find_pattern(table, question)
+        plates = draw_plates(
+            rng, table.uncertainty, count=200, era_count=4, contact_count=1 + count
+        )
+        felt = felt_on(table, question, pattern.excitation, plates)
+        contrasts = 20 * np.log10(felt.contrast)
+        level_kept.append(20 * np.log10(felt.level) >= pattern.robust_level_db_sl)
+        contrast_kept.append(contrasts >= pattern.robust_felt_contrast_db)
+        typical.append(np.median(contrasts) - pattern.median_felt_contrast_db)
+    assert 0.85 <= np.mean(level_kept) <= 0.95
+    assert 0.85 <= np.mean(contrast_kept) <= 0.95
+    assert np.mean(typical) == pytest.approx(0.0, abs=0.4)
+
+
+def test_percentile_is_that_of_numpy():
+    """Linear between values."""
+    values = np.random.default_rng(0).normal(size=(3, 64))
+    for percent in (10, 50, 90):
+        expected = np.percentile(values, percent, axis=1)
+        np.testing.assert_allclose(percentile(values, percent), expected)
+
+
+@pytest.mark.parametrize(
+    ("known", "percent", "expected"),
+    [
+        (Uncertainty(), 10, (16.1, 12.5, 9.5)),
+        (replace(Uncertainty.none(), gain=0.01, phase_deg=1.0), 50, (33.0, 18.0, 14.5)),
+    ],
+)
+def test_answers_reach_what_an_independent_optimum_does(known, percent, expected):
+    """Medians over 20 contact sets of the contrast of plates with loading fingers, 1 to 3 quiet.
+
+    The optimum climbed the percentile itself on other sets of the same plate, on another model of
+    it; medians over so few sets move by a decibel.
+    """
+    table = build_table(replace(smooth_rig(), uncertainty=known), frequencies=FREQUENCIES)
+    rng = np.random.default_rng(8)
+    for quiet, optimum in zip((1, 2, 3), expected, strict=True):
+        found = []
+        for places in contact_sets(20, fingers=1 + quiet, seed=100 + quiet):
+            question = Question(
+                (places[0],), tuple(places[1:]), drive_mode="phased", envelopes=True
+            )
+            pattern = find_pattern(table, question)
+            plates = draw_plates(rng, known, count=100, era_count=4, contact_count=1 + quiet)
+            contrast = felt_on(table, question, pattern.excitation, plates).contrast
+            found.append(20 * np.log10(np.percentile(contrast, percent)))
+        assert np.median(found) == pytest.approx(optimum, abs=2.0)
+
+
+@pytest.mark.parametrize("places", range(4))
+def test_promise_holds_where_the_thickness_moves_resonances(places: int) -> None:
+    """Of plates that differ by 6 % in thickness nine of ten give what is promised, to a decibel."""
+    uncertainty = Uncertainty(0.01, 1.0, thickness=0.06, stiffness=0.02, damping=1.1)
+    table = replace(smooth_table(), uncertainty=uncertainty)
+    target, *quiet = contact_sets(places + 1, fingers=2 + places % 2, seed=11)[-1]
+    question = Question((target,), tuple(quiet))
+    pattern = find_pattern(table, question)
+    plates = draw_plates(
+        np.random.default_rng(3), uncertainty, count=600, era_count=4, contact_count=1 + len(quiet)
+    )
+    contrast = felt_on(table, question, pattern.excitation, plates).contrast
+    assert contrast is not None
+    found = 20 * np.log10(np.percentile(contrast, 10))
+    assert pattern.robust_felt_contrast_db == pytest.approx(found, abs=1.0)

@@ -12,7 +12,7 @@ import types
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeAlias
 
 import controller
 import drivers
@@ -20,6 +20,10 @@ from daemon_bench import ready_daemon, until
 from served_api import Wire, request
 from virtual_loop import VirtualLoop, run_virtual
 
+Function: TypeAlias = tuple[str, str]
+"""File, and the name in it."""
+
+_ROOT = Path(__file__).parents[2]
 _OWN = tuple(str(Path(package.__path__[0])) for package in (controller, drivers))
 
 
@@ -27,7 +31,7 @@ class Chain:
     """The own functions that lead to the present one, over callbacks of the event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._before: tuple[str, ...] = ()
+        self._before: tuple[Function, ...] = ()
         self._call_soon = loop.call_soon
         loop.call_soon = self._scheduled  # type: ignore[method-assign, assignment]
 
@@ -41,18 +45,19 @@ class Chain:
 
         return self._call_soon(run, *args, context=context)
 
-    def here(self, frame: types.FrameType | None) -> tuple[str, ...]:
+    def here(self, frame: types.FrameType | None) -> tuple[Function, ...]:
         """The functions on the way to a frame, outermost first."""
-        found: list[str] = []
+        found: list[Function] = []
         while frame is not None:
             code = frame.f_code
             if code.co_filename.startswith(_OWN):
-                found.append(f"{Path(code.co_filename).name}:{code.co_qualname}")
+                file = Path(code.co_filename).relative_to(_ROOT).as_posix()
+                found.append((file, code.co_qualname))
             frame = frame.f_back
         return tuple(dict.fromkeys((*self._before, *reversed(found))))
 
 
-async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
+async def _stopped(folder: Path) -> tuple[tuple[Function, ...], int]:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     async with ready_daemon(folder) as (bench, era):
@@ -60,7 +65,7 @@ async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
         client, wire = bench.daemon._server._make_connection(0), Wire()
         client.connection_made(wire)
         await asyncio.sleep(0.01)
-        chain, written, calls = Chain(loop), list[tuple[str, ...]](), 0
+        chain, written, calls = Chain(loop), list[tuple[Function, ...]](), 0
         seen = loop.seen
 
         def first(*message: Any) -> None:
@@ -82,7 +87,7 @@ async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
     return written[0], calls
 
 
-def stop_path() -> tuple[tuple[str, ...], int]:
+def stop_path() -> tuple[tuple[Function, ...], int]:
     """The functions on the way of a stop, and how many own calls there are until its first byte."""
     with TemporaryDirectory() as folder:
         return run_virtual(_stopped(Path(folder)))
@@ -90,6 +95,7 @@ def stop_path() -> tuple[tuple[str, ...], int]:
 
 if __name__ == "__main__":
     path, calls = stop_path()
-    owners = dict.fromkeys(each.rpartition(".")[0] for each in path)
-    sys.stdout.write("\n".join(path) + f"\n{len(path)} functions of {len(owners)} owners, ")
+    owners = dict.fromkeys((file, name.rpartition(".")[0]) for file, name in path)
+    lines = (f"{file} {name}" for file, name in path)
+    sys.stdout.write("\n".join(lines) + f"\n{len(path)} functions of {len(owners)} owners, ")
     sys.stdout.write(f"{calls} own calls before the first byte\n")

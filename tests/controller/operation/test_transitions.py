@@ -165,7 +165,7 @@ async def test_flush_makes_each_call_once() -> None:
 def test_stop_takes_one_turn_and_few_functions() -> None:
     """Nothing waits on its way, and what it passes through can be read in a few minutes."""
     path, calls = stop_path()
-    assert path[0].endswith("Connection.buffer_updated")
-    assert path[-1].endswith("Line._start")
+    assert path[0][1].endswith("Connection.buffer_updated")
+    assert path[-1][1].endswith("Line._start")
     assert len(path) < 17, path
     assert calls < 100

@@ -280,7 +280,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        self._note_reports(reply, now)
+        for kind in reports_of(reply):
+            self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -324,13 +325,12 @@ class Dialogue:
                 except Exception:
                     _logger.exception("amplifier %s: a listener failed", self.name)
 
-    def _note_reports(self, status: Values, now: float) -> None:
-        """Note the reports of a status, and log those of which the last was long ago."""
-        for kind in reports_of(status):
-            if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
-                cause, remedy = REPORTS[kind]
-                _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
-            self.reported_at[kind] = now
+    def _note_report(self, kind: ReportKind, now: float) -> None:
+        """Note a report of a status, and log it unless the last was a short time ago."""
+        if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+            cause, remedy = REPORTS[kind]
+            _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
+        self.reported_at[kind] = now
 
     def wire_ramp(self, ramp: float) -> int:
         """Return the nearest ramp that the amplifier has: silence is never refused for it."""

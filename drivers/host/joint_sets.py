@@ -5,7 +5,6 @@ At one moment on all, or on none. A token is newer than another by less than hal
 commits one that changes nothing before.
 """
 
-import asyncio
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from drivers.host.dialogue import Staged
 from drivers.host.jobs import JointStart, Later, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
-from drivers.host.members import Members
+from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
@@ -69,14 +68,7 @@ class JointSets:
             if each.name in layers:
                 amplifiers.append(each)
                 staging.append(each.stage(token, layers[each.name], now=is_silent))
-        results: list[Staged | BaseException]
-        if len(staging) == 1:  # as in `Members.all`
-            try:
-                results = [await staging[0]]
-            except DriverError as error:
-                results = [error]
-        else:
-            results = await asyncio.gather(*staging, return_exceptions=True)
+        results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for each, result in zip(amplifiers, results, strict=True):
@@ -148,7 +140,8 @@ class JointSets:
         # With the broadcasts: one that waits is not sent where this is given up.
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for each, status in zip(requests, statuses, strict=False):
-            await _check_plays(each, status, token)
+            if status["token"] != token or status["state"] in LATCHED:
+                await _check_plays(each, status, token)
 
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""
@@ -160,7 +153,7 @@ class JointSets:
         if unchanged:
             self.token = token_after(self.token)
             sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
-            await asyncio.gather(*sets)
+            await self._members.all(sets)
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

@@ -126,7 +126,7 @@ class Line:
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
                 self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
-                if self._must_yield(job):
+                if self._queue.jobs and self._must_yield(job):
                     self._not_answered(job)
                 else:
                     self._start(job, arrival.data)

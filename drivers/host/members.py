@@ -73,18 +73,22 @@ class Members:
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
         """Await all requests to their ends, then raise the most severe error."""
-        if len(requests) == 1:  # without a further iteration of the event loop
-            return [await requests[0]]
-        return self.checked(await asyncio.gather(*requests, return_exceptions=True))
+        return self.checked(await outcomes(requests))
 
     def checked(self, results: Sequence[_T | BaseException]) -> list[_T]:
         """Return results; raises the most severe error.
 
         A lost link is first; last are what others have preempted and, after it, a degraded link.
         """
-        if errors := [each for each in results if isinstance(each, BaseException)]:
+        values, errors = list[_T](), list[BaseException]()
+        for each in results:
+            if isinstance(each, BaseException):
+                errors.append(each)
+            else:
+                values.append(each)
+        if errors:
             raise min(errors, key=self._severity)
-        return [each for each in results if not isinstance(each, BaseException)]
+        return values
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
@@ -102,6 +106,19 @@ class Members:
                 if is_lost(amplifier) or clock.now() > self.gives_up_at:
                     raise
                 await asyncio.sleep(_REPEAT_INTERVAL)
+
+
+async def outcomes(requests: Sequence[Awaitable[_T]]) -> Sequence[_T | BaseException]:
+    """Await all requests to their ends; returns the result or the error of each."""
+    if len(requests) > 1:
+        return await asyncio.gather(*requests, return_exceptions=True)
+    results = list[_T | BaseException]()
+    for request in requests:  # without a further iteration of the event loop
+        try:
+            results.append(await request)
+        except Exception as error:
+            results.append(error)
+    return results
 
 
 def is_lost(amplifier: Amplifier) -> bool:

@@ -23,7 +23,7 @@ from drivers.host.feeding import Stopped
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Members, is_lost
+from drivers.host.members import Members, is_lost, outcomes
 from drivers.host.silencing import Silencing
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
@@ -137,9 +137,8 @@ class Group:
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
-            arming = asyncio.gather(
-                *[each.arm(session, self._watchdog) for each in amplifiers], return_exceptions=True
-            )
+            arms = [each.arm(session, self._watchdog) for each in amplifiers]
+            arming = asyncio.ensure_future(outcomes(arms))
             try:
                 members.checked(await asyncio.shield(arming))
                 members.check_none_since(before)
@@ -156,19 +155,17 @@ class Group:
             self.sets.is_incomplete = False
             self.state = GroupState.ARMED
 
-    async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
+    async def _disarm_armed(self, arming: "asyncio.Future[Any]") -> None:
         """Disarm what may have been armed by this; any other may be another host's."""
         await arming
-        disarmed = await asyncio.gather(
-            *[
-                self.members.retried(each, partial(each.disarm, STOP_RAMP))
-                for each in self.amplifiers.values()
-                if each.may_be_armed
-            ],
-            return_exceptions=True,
-        )
+        retried = self.members.retried
+        disarms = [
+            retried(each, partial(each.disarm, STOP_RAMP))
+            for each in self.amplifiers.values()
+            if each.may_be_armed
+        ]
         # One that is mute stops none.
-        if not all(isinstance(each, LinkError | None) for each in disarmed):
+        if not all(isinstance(each, LinkError | None) for each in await outcomes(disarms)):
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
@@ -267,10 +264,21 @@ class Group:
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        stops = self.silencing.stop(ramp)
+        silencing, stops = self.silencing, dict[str, asyncio.Future[Stopped]]()
+        for line in {each.line for each in self.amplifiers.values()}:
+            if len(line.members) > 1:  # so that none waits for the reply of another
+                try:
+                    silencing.broadcast(line, ramp)
+                except Exception:  # each amplifier is stopped by itself as well
+                    _logger.exception("%s: the broadcast of a stop failed", line.name)
+        for name, amplifier in self.amplifiers.items():
+            try:
+                stops[name] = amplifier.stop(ramp)
+            except Exception as error:  # the others are stopped all the same
+                stops[name] = asyncio.get_running_loop().create_future()
+                stops[name].set_exception(error)
         names = stops if waits_for is None else waits_for
-        outcomes = self.silencing.outcomes
-        return self.silencing.start(outcomes, {name: stops[name] for name in names})
+        return silencing.start(silencing.outcomes, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.

@@ -1,7 +1,6 @@
 """Stops and disarms of all amplifiers: each is begun at once and goes on to its end."""
 
 import asyncio
-import logging
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, ParamSpec, TypeVar
 
@@ -9,11 +8,11 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
+from drivers.host.members import outcomes
 from drivers.protocol.records import Values
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
-_logger = logging.getLogger(__name__)
 
 
 class Silencing:
@@ -42,28 +41,8 @@ class Silencing:
         if self._tasks:
             await asyncio.wait({*self._tasks})
 
-    def stop(self, ramp: float) -> dict[str, "asyncio.Future[Stopped]"]:
-        """Queue a stop of every amplifier along a ramp [s]; nothing here fails or waits.
-
-        Those of one line get a broadcast first, so that none waits for the reply of another.
-        """
-        for line in {each.line for each in self._amplifiers.values()}:
-            if len(line.members) > 1:
-                try:
-                    self._broadcast(line, ramp)
-                except Exception:  # each amplifier is stopped by itself as well
-                    _logger.exception("%s: the broadcast of a stop failed", line.name)
-        stops: dict[str, asyncio.Future[Stopped]] = {}
-        for name, amplifier in self._amplifiers.items():
-            try:
-                stops[name] = amplifier.stop(ramp)
-            except Exception as error:  # the others are stopped all the same
-                stops[name] = asyncio.get_running_loop().create_future()
-                stops[name].set_exception(error)
-        return stops
-
-    def _broadcast(self, line: Line, ramp: float) -> None:
-        """Request a stop of all amplifiers of a line, unless one is queued."""
+    def broadcast(self, line: Line, ramp: float) -> None:
+        """Request a stop of all amplifiers of a line along a ramp [s], unless one is queued."""
         queued = self._broadcasts.get(line)
         if queued is None or queued.done():
             first = next(iter(self._amplifiers.values()))
@@ -76,15 +55,13 @@ class Silencing:
         self, stops: Mapping[str, "asyncio.Future[Stopped]"]
     ) -> Mapping[str, Stopped]:
         """Await stops by name; of one that failed by itself it is said what it may play."""
-        outcomes: dict[str, Stopped] = {}
-        for name, result in zip(
-            stops, await asyncio.gather(*stops.values(), return_exceptions=True), strict=True
-        ):
+        said: dict[str, Stopped] = {}
+        for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
             if isinstance(result, BaseException):
                 cause = f"{type(result).__name__}: {result}"
                 result = self._amplifiers[name].what_may_play(cause)
-            outcomes[name] = result
-        return outcomes
+            said[name] = result
+        return said
 
 
 async def _to_completion(task: "asyncio.Future[_T]") -> _T:

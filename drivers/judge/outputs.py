@@ -102,6 +102,17 @@ class ExpectedOutputs:
         half = self._plays.half[layer]
         return start - half <= self.playback.end_of(layer) <= end + half
 
+    def _faded(self, one: LayerSet, time: float) -> float:
+        """Return when what a layer plays has faded, however it ends by a time, also by a set."""
+        ramp = max(_RAMP.from_wire(one.ramp), self.playback.ramp_of(one.layer))
+        ends = [
+            voice.ended(time, ramp).transition.end
+            for voices in self.playback.all_voices
+            for voice in voices
+            if voice.layer == one.layer and not voice.has_ended
+        ]
+        return max([time + ramp, *ends])
+
     def play(
         self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
     ) -> None:
@@ -115,10 +126,9 @@ class ExpectedOutputs:
             if not (one.renew or one.after):
                 lasting.clear()
             lasting.add(one.valid_for)
-            if self._may_end(number, start, end) and (
-                one.renew or any(each.keep_phase for each in one.commands)
-            ):
-                self._unknown[number] = math.inf
+            if self._may_end(number, start, end):  # and then on other ways than by the set
+                goes_on = one.renew or any(each.keep_phase for each in one.commands)
+                self._unknown[number] = math.inf if goes_on else self._faded(one, end)
             elif not one.renew and not one.after:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)

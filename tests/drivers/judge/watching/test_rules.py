@@ -104,6 +104,24 @@ def test_loop_that_stalls_between_two_commits_sends_the_second_no_more() -> None
     assert talk.found == []
 
 
+@pytest.mark.parametrize(
+    ("after", "level", "broken"), [(0.017, 1917, []), (0.1, 0, []), (0.1, 1917, ["plays"])]
+)
+def test_layer_may_have_ended_by_itself_just_before_a_set(
+    after: float, level: int, broken: list[str]
+) -> None:
+    """60 ms after its commit, whose reply took 12; the set that silences it came 3 ms later.
+
+    20 ms behind that the fade of 40 ms is 23 ms old: 0.25 (1 + cos(23/40 pi)).
+    """
+    talk = Talk().armed()
+    talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=40, valid_for=60))
+    talk.sends(hand.COMMIT, (9, 5)).rest(0.012)
+    talk.replies(hand.COMMIT, hand.status(token=5, tokens=(5, 0, 0, 0)))
+    talk.rest(0.049).staged(6, hand.layer(0, ramp=40)).committed(6, levels=(4878, 0))
+    assert talk.rest(after).says(token=6, levels=(level, 0)).found == broken
+
+
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
     """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
     talk = Talk().armed().rest(0.4)

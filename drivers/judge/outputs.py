@@ -5,7 +5,7 @@ asked of `drivers.playing.uncertain`.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, TypeAlias
 
 from drivers.playing.playback import Playback, playback_of
@@ -21,7 +21,6 @@ _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
 _LASTING = 3.0  # s; what ends after it is not awaited
-_FINE = 0.026  # Hz; half a step of the wire
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
 _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
 _ALL_LAYERS = {*range(_LAYERS)}
@@ -195,7 +194,7 @@ class ExpectedOutputs:
         tokens, start = shown["tokens"], self._widened(when)[0]
         levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
         if sure := self.sure(when):
-            low = self._check_levels(levels, when, self._report)
+            low = self.check_levels(levels, when, self._report)
             for layer, token in enumerate(tokens):
                 possible = self.tokens_of(layer, sure)
                 if token not in possible:
@@ -217,34 +216,13 @@ class ExpectedOutputs:
             return math.inf
         return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
 
-    def check_sensors(
-        self,
-        levels: Sequence[float],
-        frequencies: Mapping[int, float],
-        time: float,
-        *,
-        report_low: Report | None,
-    ) -> None:
-        """Compare what sensors measure: levels, and frequencies [Hz] of channels that settled.
+    def check_levels(
+        self, levels: Sequence[float], when: Interval, report_low: Report | None
+    ) -> float:
+        """Compare levels of channels; returns the largest level that one surely has.
 
         report_low: takes levels that are too low, None where they may be.
         """
-        when = time, time
-        if sure := self.sure(when):
-            self._check_levels(levels, when, report_low)
-        lag = self._plays.lag + self._slack
-        for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
-            voices = self.playback.all_voices[channel]
-            lasting = sorted({each.frequency for each in voices if not each.has_ended})
-            is_settled = all(each.transition.end < time - lag for each in voices)
-            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
-                what = f"frequency of channel {channel}"
-                self._report("plays", time, what, must=one_of(lasting), seen=frequency)
-
-    def _check_levels(
-        self, levels: Sequence[float], when: Interval, report_low: Report | None
-    ) -> float:
-        """Compare levels of channels; returns the largest level that one surely has."""
         can_be_low = self.may_derate or not self.is_exact or report_low is None
         start, end = self._widened(when)
         largest = 0.0

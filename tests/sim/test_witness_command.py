@@ -220,7 +220,7 @@ def test_witness_refuses_invalid_arguments(
             CONFIG | {"amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
             "channels.0.frequency_hz",
         ),
-        (CONFIG | {"times_s": {"lift": math.inf}}, "times_s.lift"),
+        (CONFIG | {"times_s": {"heartbeat": math.inf}}, "times_s.heartbeat"),
     ],
 )
 def test_witness_config_refuses_an_invalid_key(plan: dict[str, object], named: str) -> None:

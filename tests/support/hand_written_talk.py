@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import hand_written as hand
-from drivers.judge.watching.witness import Witness
+from plate_witness import PlateWitness
 
 TOOK = 0.001  # s; from a request to its reply
 HALF: dict[str, Any] = {"token": 5, "levels": (5000, 0), "tokens": (5, 0, 0, 0)}
@@ -36,7 +36,7 @@ class Talk:
         times = {"slack": 0.002, "heartbeat": 3.0}
         self.config = {"wires": {"a": "serial"}, "amplifiers": amplifiers, "times_s": times}
         self.capture: list[str] = []
-        self.witness = Witness(self.config, record=self.capture.append)
+        self.witness = PlateWitness(self.config, record=self.capture.append)
         if expected is not None:
             self.witness.expect({names[0]: {0: list(expected)}})
         self.time = 1.0

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, get_args
 
 from controller.play.loop import Controller
-from drivers.judge.watching.witness import OperatorCommand, Witness
+from plate_witness import OperatorCommand, PlateWitness
 from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.faults.fault_window import FaultWindow
@@ -39,7 +39,7 @@ def witness_config(
     }
 
 
-def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None:
+def sense(witness: PlateWitness, now: float, name: str, amplifier: Amplifier) -> None:
     """Show the levels and frequencies of an amplifier's channels at a time [s]."""
     channels = range(amplifier.playback.channels)
     levels = [min(amplifier.playback.level(channel, now), 1.0) for channel in channels]
@@ -52,7 +52,7 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
     witness.levels(now, name, levels, frequencies=frequencies)
 
 
-class LoopWitness(Witness):
+class LoopWitness(PlateWitness):
     """A witness of all wires of a control loop, in virtual time, by the URLs of its amplifiers.
 
     It hears only what a host hears that has the wires open. judged: by what it judges, as for

@@ -18,8 +18,8 @@ from chain import Chain
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.judge.watching.capture import Violation
-from drivers.judge.watching.witness import OperatorCommand
 from model.vibration.excitation import Excitation, Tone
+from plate_witness import OperatorCommand
 from registry import clock
 from registry.limits import GuardLimits
 from set_table import STROKE, SetTable, make_rig

@@ -5,7 +5,7 @@ A plain mapping, given independently of the controller's configuration:
     {"wires": {"line": "serial"},
      "amplifiers": {"main": {"wire": "line", "address": 1, "channels": {0: {
          "frequency_hz": [40, 500], "level": 1.0, "slew_per_s": 100}}}},
-     "times_s": {"lift": 0.02}}
+     "times_s": {"heartbeat": 0.08}}
 """
 
 from collections.abc import Mapping
@@ -34,16 +34,10 @@ class ChannelLimits(_Section):
 class TimeLimits(_Section):
     """Time limits [s].
 
-    lift: from the last lift to the silencing command; release: to silence; touch: from a touch to
-    its pattern; stop: from the request to the frame; heartbeat: between frames that feed the
-    watchdog; reply: to a reply; together: until all amplifiers have a set; slack: error of the
-    witness's own clock.
+    heartbeat: between frames that feed the watchdog; reply: to a reply; together: until all
+    amplifiers have a set; slack: error of the witness's own clock.
     """
 
-    lift: FiniteFloat = 0.020
-    release: FiniteFloat = 0.060
-    touch: FiniteFloat = 0.100
-    stop: FiniteFloat = 0.020
     heartbeat: FiniteFloat = 0.075
     reply: FiniteFloat = 0.030
     together: FiniteFloat = 0.020

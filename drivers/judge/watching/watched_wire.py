@@ -89,7 +89,7 @@ class WatchedWire:
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
-            session.stop_requested_at = session.last_feed = session.first_stop = None
+            session.last_feed = session.first_stop = None
 
     def _forget_pending(self, time: float) -> None:
         """Abandon the pending requests; their replies may still arrive, and at another host."""

@@ -12,6 +12,7 @@ import host_violations
 from drivers.judge.watching.capture import read_capture
 from drivers.judge.watching.witness import Witness
 from hand_written_talk import HALF, Talk
+from plate_witness import RULES
 
 BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
 FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
@@ -25,11 +26,11 @@ def test_witness_finds_a_broken_rule(name: str) -> None:
     assert {*talk().found} == {rule}
 
 
-def test_every_rule_of_the_page_is_found_broken() -> None:
-    """By a conversation of its own."""
+def test_every_rule_is_found_broken() -> None:
+    """Those of the page and those of the plate, by a conversation of its own each."""
     rules = PAGE.read_text(encoding="utf-8").partition("## The rules")[2].partition("## In tests")
     listed = set(re.findall(r"^\| (\w+) \|", rules[0], flags=re.M)) - {"name"}
-    assert {rule for rule, _ in BROKEN.values()} == listed
+    assert {rule for rule, _ in BROKEN.values()} == listed | RULES.keys()
 
 
 @pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])

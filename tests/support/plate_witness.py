@@ -1,4 +1,4 @@
-"""A witness that knows the plate: fingers, operator's commands, stalls, what really plays.
+"""A witness that knows the plate: fingers, commands, stalls, faults, what really plays.
 
 A chain of tests has these beside the bytes on its wires. With them the witness has further rules
 for hosts: those of `RULES`; limits also of measured levels; armed only on an operator's request; a
@@ -14,8 +14,10 @@ from typing import Any, Literal, TypeAlias
 
 from drivers.judge.outputs import one_of
 from drivers.judge.watching.amplifier_session import AmplifierSession
+from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import A_READ, HELLO, Request
 from drivers.judge.watching.host_rules import CONFIRMED, IN_FLIGHT, SILENCING, HostRules
+from drivers.judge.watching.watched_wire import RECOVERY
 from drivers.judge.watching.witness import Witness
 from drivers.protocol.sets import LayerSet, is_vibrating
 from drivers.protocol.table import QUANTITIES
@@ -297,6 +299,7 @@ class PlateWitness(Witness):
         times = {**config.get("times_s", {})}
         own = {each.name: times.pop(each.name) for each in fields(PlateTimes) if each.name in times}
         super().__init__({**config, "times_s": times}, rules=PlateRules, **options)
+        self._faults_until = dict.fromkeys(self.wires, -math.inf)
         self._host.limits = PlateTimes(**own)
 
     def contacts(
@@ -325,6 +328,26 @@ class PlateWitness(Witness):
         super().closed(link, time)
         for session in self._wires[link].sessions.values():
             self._host.stops_requested.pop(session.name, None)
+
+    def faults(self, time: float, link: str, *, are_on: bool) -> None:
+        """Note the start or the end of injected faults on a wire or its amplifiers.
+
+        Until half a second after it only the rules are checked that no fault excuses.
+        """
+        self._advance(time)
+        self._faults_until[link] = math.inf if are_on else time
+        wire = self._wires[link]
+        wire.disturbed_until = self._faults_until[link] + RECOVERY
+        for session in () if are_on else wire.sessions.values():
+            session.amplifier.forget()  # what it did meanwhile may be unseen
+
+    def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
+        """Process bytes; those behind a frame that a fault has cut are read as its rest."""
+        wire = self._wires[link]
+        if wire.started_at.get(direction, time) <= self._faults_until[link] < time:
+            self._advance(time)
+            wire.disturb(time)
+        super().record_bytes(link, direction, time, data)
 
     def levels(
         self,

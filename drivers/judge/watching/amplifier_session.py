@@ -27,7 +27,7 @@ class AmplifierSession:
     """Requests to one amplifier by name, and the model of it; times [s].
 
     report_always: for violations that no fault of the wire excuses; report: for all others.
-    is_disturbed: whether faults were injected into the wire at or shortly before a time. played:
+    is_disturbed: whether what passed on the wire shortly before a time may have been lost. played:
     what it was sent to play; last_set: sent since Arm, token and layers; staged: the same, unless
     it was silenced since.
     """

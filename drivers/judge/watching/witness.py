@@ -92,11 +92,6 @@ class Witness:
         self._advance(time)
         self._wires[link].closed(time)
 
-    def faults(self, time: float, link: str, *, are_on: bool) -> None:
-        """Note the start or the end of injected faults on a wire or its amplifiers."""
-        self._advance(time)
-        self._wires[link].set_disturbed(time, is_on=are_on)
-
     def finish(self, time: float | None = None) -> list[Violation]:
         """The violations in order; time [s]: end of the observation."""
         if time is not None:

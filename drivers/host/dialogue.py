@@ -52,12 +52,13 @@ _logger = logging.getLogger(__name__)
 class Staged:
     """A set that an amplifier has staged, or plays at once: as the wire has it.
 
-    is_exact: to the word; until: when [s] it must have been committed.
+    is_exact: to the word; since, until: when [s] it was admitted, and must have been committed.
     """
 
     token: int
     layers: tuple[LayerSet, ...]
     is_exact: bool
+    since: float
     until: float
 
 
@@ -171,7 +172,7 @@ class Dialogue:
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         messages = parts(stream, session=self.session, token=token, now=now)
-        self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        self._admitted = Staged(token, admitted, True, since=moment, until=moment + delay)
         return self._admitted, messages
 
     def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:

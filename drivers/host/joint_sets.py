@@ -22,7 +22,6 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, STATES, name_of
 from drivers.protocol.timing import STOP_RAMP
-from registry import clock
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
@@ -83,14 +82,13 @@ class JointSets:
         if not is_silent:
             self._members.check_none_since(before)
             self.is_incomplete = len(layers) > 1
-            began = clock.now()
             try:
                 await self._commit(staged)
             except CommandRefused as refusal:
                 if refusal.until is None or self._members.epoch != before:
                     raise
                 # Too late for what the ledgers have admitted.
-                if any(each.played_at >= began for each in staged):
+                if any(each.played_at >= one.since for each, one in staged.items()):
                     await self.silence(STOP_RAMP)
                     return Preempted(str(refusal))
                 self.is_incomplete = False

@@ -25,7 +25,7 @@ BROKEN: Broken = {
         "limits",
         lambda: Talk().armed().staged(5, hand.layer(4, hand.tone(0, 100, 0.5))),
     ),
-    "rise_too_steep": ("limits", lambda: Talk(slew_per_s=40).armed().playing()),  # 0.5 within 10 ms
+    "rise_too_steep": ("limits", lambda: Talk(slew=40).armed().playing()),  # 0.5 within 10 ms
     "message_of_an_unknown_type": ("garbage", lambda: Talk().armed().refused(27, (), 1)),
     "set_with_half_a_command": (
         "garbage",

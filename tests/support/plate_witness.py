@@ -9,12 +9,13 @@ Times in s.
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from drivers.judge.outputs import one_of
 from drivers.judge.watching.amplifier_session import AmplifierSession
 from drivers.judge.watching.capture import Direction
+from drivers.judge.watching.config import WitnessConfig
 from drivers.judge.watching.decoded import A_READ, HELLO, Request
 from drivers.judge.watching.host_rules import CONFIRMED, IN_FLIGHT, SILENCING, HostRules
 from drivers.judge.watching.watched_wire import RECOVERY
@@ -43,7 +44,7 @@ _FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level"
 _RAMP, _LAYERS = QUANTITIES["ramp"], QUANTITIES["layer_count"].maximum
 
 
-@dataclass
+@dataclass(frozen=True)
 class PlateTimes:
     """Time limits.
 
@@ -293,14 +294,17 @@ class PlateRules(HostRules):
 
 
 class PlateWitness(Witness):
-    """A witness that is given what it cannot hear; config: with `times_s` of both."""
+    """A witness that is given what it cannot hear; limits: of times."""
 
-    def __init__(self, config: Mapping[str, Any], **options: Any) -> None:
-        times = {**config.get("times_s", {})}
-        own = {each.name: times.pop(each.name) for each in fields(PlateTimes) if each.name in times}
-        super().__init__({**config, "times_s": times}, rules=PlateRules, **options)
+    def __init__(
+        self,
+        config: WitnessConfig,
+        limits: PlateTimes = PlateTimes(),
+        **options: Any,
+    ) -> None:
+        super().__init__(config, rules=PlateRules, **options)
         self._faults_until = dict.fromkeys(self.wires, -math.inf)
-        self._host.limits = PlateTimes(**own)
+        self._host.limits = limits
 
     def contacts(
         self, time: float, contacts: Collection[Hashable], *, is_answerable: bool = True

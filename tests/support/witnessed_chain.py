@@ -172,7 +172,7 @@ def play(
     async def run() -> tuple[Scene, list[Violation]]:
         rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
         table = SetTable(ALONE, rig.plate, SHARED)
-        judged = {"channels": 3, "level": 0.5, "slew_per_s": 100}
+        judged = {"channels": 3, "level": 0.5, "slew": 100}
         options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
         async with Scene.on(Wire(wire), rig, table, **options) as scene:
             scene.witness.contacts(clock.now(), ())

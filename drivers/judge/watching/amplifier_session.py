@@ -156,7 +156,7 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
     limits = session.config.channels.get(command.channel)
     if limits is None:
         return "no such channel"
-    frequency, (low, high) = _FREQUENCY.from_wire(command.frequency), limits.frequency_hz
+    frequency, (low, high) = _FREQUENCY.from_wire(command.frequency), limits.frequency
     if not low - _FREQUENCY.step * _STEP <= frequency <= high + _FREQUENCY.step * _STEP:
         return f"frequency must be {low:g} to {high:g} Hz, got {frequency:g}"
     shapes = [shape for shape in (command.onset, command.ending) if shape is not None]
@@ -173,7 +173,7 @@ def check_sums(session: AmplifierSession, time: float) -> None:
     for channel, limits in session.config.channels.items():
         name = f"channel {channel}, sum of all layers"
         checked.append((f"level of {name}", levels.get(channel, 0.0), limits.level))
-        checked.append((f"rise of {name}", rises.get(channel, 0.0), limits.slew_per_s))
+        checked.append((f"rise of {name}", rises.get(channel, 0.0), limits.slew))
     for what, value, limit in checked:
         if value > limit * _ABOVE + _LEVEL.step:
             session.report_always(

@@ -1,13 +1,12 @@
 """The witness: bytes of every wire in, violations out. No clock, no I/O."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines
 from drivers.judge.watching.capture import Direction, Report, Violation, capture_line
-from drivers.judge.watching.config import WitnessConfig, parse_config
+from drivers.judge.watching.config import WitnessConfig
 from drivers.judge.watching.host_rules import HostRules
 from drivers.judge.watching.watched_amplifier import WatchedAmplifier
 from drivers.judge.watching.watched_wire import WatchedWire
@@ -21,18 +20,18 @@ class Witness:
 
     def __init__(
         self,
-        config: Mapping[str, Any] | WitnessConfig,
+        config: WitnessConfig,
         *,
         record: Callable[[str], None] = lambda line: None,
         rules: type[HostRules] = HostRules,
     ) -> None:
-        self._config = config if isinstance(config, WitnessConfig) else parse_config(config)
+        self._config = config
         self._report = Report()
         self._record = record
         self._now = -math.inf
         self.frames = 0
         self._sessions = {name: self._session(name) for name in self._config.amplifiers}
-        times = self._config.times_s
+        times = self._config.times
         self._deadlines = Deadlines()
         self._host = rules(self._sessions, times=times, deadlines=self._deadlines)
         self._wires = {
@@ -65,7 +64,7 @@ class Witness:
             if not is_disturbed(time):
                 report_always(invariant, time, sentence)
 
-        slack = self._config.times_s.slack
+        slack = self._config.times.slack
         amplifier = WatchedAmplifier(name, slack=slack, report=report, report_always=report_always)
         return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
 

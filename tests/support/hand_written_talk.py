@@ -27,13 +27,12 @@ class Talk:
         self,
         *,
         names: Sequence[str] = ("m",),
-        power: float = 9.0,
         expected: Sequence[tuple[float, float, float]] | None = None,
         **limits: Any,
     ) -> None:
         of_all = ChannelLimits(**{"frequency": (40, 500), "level": 0.8, **limits})
         amplifiers = {
-            name: AmplifierConfig("a", address, {0: of_all, 1: of_all}, power)
+            name: AmplifierConfig("a", address, {0: of_all, 1: of_all})
             for address, name in enumerate(names, 1)
         }
         times = TimeLimits(slack=0.002, heartbeat=3.0)

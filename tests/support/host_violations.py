@@ -57,15 +57,6 @@ BROKEN: Broken = {
             .committed(6, levels=(5000, 0), tokens=(5, 6, 0, 0))
         ),
     ),
-    "channels_above_the_power_together": (
-        "limits",
-        lambda: (
-            Talk(power=0.4)
-            .armed()
-            .staged(5, hand.layer(0, hand.tone(0, 100, 0.5), hand.tone(1, 100, 0.5)))
-            .committed(5, tokens=(5, 0, 0, 0))
-        ),
-    ),
     "wrong_checksum": (
         "garbage",
         lambda: Talk().armed().host_bytes(hand.frame(hand.GET_STATUS, sequence=77), flipped=-2),

@@ -168,26 +168,23 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
 
 def check_sums(session: AmplifierSession, time: float) -> None:
     """Check what an amplifier plays from a time on, over all layers."""
-    levels, power, rises = _sums(session.amplifier.outputs.playback, time)
-    checked = [("power", power, session.config.power)]
+    sums = _sums(session.amplifier.outputs.playback, time)
     for channel, limits in session.config.channels.items():
-        name = f"channel {channel}, sum of all layers"
-        checked.append((f"level of {name}", levels.get(channel, 0.0), limits.level))
-        checked.append((f"rise of {name}", rises.get(channel, 0.0), limits.slew))
-    for what, value, limit in checked:
-        if value > limit * _ABOVE + _LEVEL.step:
-            session.report_always(
-                "limits", time, f"{session.name}: {what} must be at most {limit:g}, got {value:.4g}"
-            )
+        level, rise = sums.get(channel, (0.0, 0.0))
+        for what, value, limit in (("level", level, limits.level), ("rise", rise, limits.slew)):
+            if value > limit * _ABOVE + _LEVEL.step:
+                session.report_always(
+                    "limits",
+                    time,
+                    f"{session.name}: {what} of channel {channel}, sum of all layers, must be at "
+                    f"most {limit:g}, got {value:.4g}",
+                )
 
 
-def _sums(
-    playback: Playback, time: float
-) -> tuple[Mapping[int, float], float, Mapping[int, float]]:
-    """Return what follows from a time on: largest levels, power, and steepest rises.
+def _sums(playback: Playback, time: float) -> Mapping[int, tuple[float, float]]:
+    """Return the largest level and the steepest rise that follow from a time on, by channel.
 
-    Levels and rises by channel, in full levels and full levels/s; looked at along the transitions
-    under way.
+    In full levels and full levels/s; looked at along the transitions under way.
     """
     times = {time}
     playing = {each: one for each, one in enumerate(playback.all_voices) if one}
@@ -196,12 +193,9 @@ def _sums(
         steps = range(count + 1)
         times.update(way.start + (way.end - way.start) * part / count for part in steps)
     moments = sorted({round(at, 6) for at in times if at >= time})  # no sums of floats
-    levels, rises = dict[int, list[float]](), dict[int, float]()
+    sums: dict[int, tuple[float, float]] = {}
     for channel, voices in playing.items():
         row = [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
         steeps = zip(pairwise(row), pairwise(moments), strict=True)
-        levels[channel] = row
-        rises[channel] = max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
-    moment_by_moment = zip(*levels.values(), strict=True)
-    power = max((sum(v * v for v in each) for each in moment_by_moment), default=0.0)
-    return {channel: max(row) for channel, row in levels.items()}, power, rises
+        sums[channel] = max(row), max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
+    return sums

@@ -36,15 +36,11 @@ class TimeLimits:
 
 @dataclass(frozen=True)
 class AmplifierConfig:
-    """An amplifier: its wire, its address, unit or node there, and the limits of its channels.
-
-    power: limit of the sum of their squared levels.
-    """
+    """An amplifier: its wire, its address, unit or node there, and the limits of its channels."""
 
     wire: str
     address: int
     channels: Mapping[int, ChannelLimits]
-    power: float = math.inf
 
 
 @dataclass(frozen=True)

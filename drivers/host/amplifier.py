@@ -11,7 +11,7 @@ from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted,
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import Stopped
-from drivers.host.jobs import Later, Priority
+from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.protocol.achieved import achieved_layer, achieved_problem
@@ -272,7 +272,7 @@ class Amplifier(Dialogue):
 
     def _request_stop(self, stop: _Stop) -> "asyncio.Future[Values]":
         stop.latch = self.latch
-        return self.line.submit(self, Priority.STOP, "Stop", Later(stop.sent))
+        return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
 
     async def _confirm_stop(self, stop: _Stop) -> Stopped:
         """Repeat a stop until its silence is confirmed, or its time is over.

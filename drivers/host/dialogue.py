@@ -17,7 +17,7 @@ from drivers.errors import (
 )
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import JointStart, Later, Priority
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -148,7 +148,7 @@ class Dialogue:
             return messages
 
         for _ in range(MAX_CONTRADICTIONS):
-            taken = await self.line.submit(self, priority, "Set", Later(make))
+            taken = await self.line.submit(self, priority, "Set", make)
             if taken["token"] == token:
                 break
         else:
@@ -182,8 +182,7 @@ class Dialogue:
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        later = Later(lambda: [values], start) if start is not None else values
-        return self.line.submit(self, Priority.SET, "Commit", later)
+        return self.line.submit(self, Priority.SET, "Commit", values, start=start)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].

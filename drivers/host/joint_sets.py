@@ -13,7 +13,7 @@ from functools import partial
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
-from drivers.host.jobs import JointStart, Later, Priority
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
@@ -131,8 +131,8 @@ class JointSets:
             if len(sharing) == 1:
                 requests[sharing[0]] = sharing[0].commit(token, start=start)
                 continue
-            later = Later(partial(_commit_of, sharing, token), start)
-            broadcasts.append(line.submit(None, Priority.SET, "Commit", later))
+            make = partial(_commit_of, sharing, token)
+            broadcasts.append(line.submit(None, Priority.SET, "Commit", make, start=start))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
         # With the broadcasts: one that waits is not sent where this is given up.

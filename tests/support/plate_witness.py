@@ -371,7 +371,8 @@ class PlateWitness(Witness):
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
         # A reply that is on its way is of an earlier time, which must not be passed before.
-        is_pending = self._wires[session.config.wire].is_pending(session)
+        wire = self._wires[session.config.wire]
+        is_pending = any(wire.sessions[one.address] is session for one in wire._pending.values())
         if not (is_pending or session.is_disturbed(time)):
             _check_measured(session, levels, frequencies or {}, time)
 

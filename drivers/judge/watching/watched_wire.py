@@ -108,10 +108,6 @@ class WatchedWire:
             if self.sessions[sent.address] is not session
         }
 
-    def is_pending(self, session: AmplifierSession) -> bool:
-        """Whether an amplifier has not replied to a request yet."""
-        return any(self.sessions[one.address] is session for one in self._pending.values())
-
     def is_disturbed(self, time: float) -> bool:
         """Whether replies may have been lost shortly before a time [s]."""
         return time <= self.disturbed_until

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -52,15 +52,20 @@ def witness(
     Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C. Exit
     status 1 on violations.
     """
+    from drivers.judge.watching.config import (
+        AmplifierConfig,
+        ChannelLimits,
+        TimeLimits,
+        WitnessConfig,
+    )
     from drivers.judge.watching.witness import Witness
     from sim.witness_relay import parse_endpoint
 
-    limits: dict[str, Any] = {
-        "frequency_hz": _band(frequency),
-        "level": _in_range("--level", level, maximum=1.0, unit="of full stroke"),
-    }
-    if slew is not None:
-        limits["slew_per_s"] = _in_range("--slew", slew, unit="of full stroke a second")
+    limits = ChannelLimits(
+        _band(frequency),
+        _in_range("--level", level, maximum=1.0, unit="of full stroke"),
+        math.inf if slew is None else _in_range("--slew", slew, unit="of full stroke a second"),
+    )
     slack = _in_range("--slack", slack, unit="ms")
     if replay is not None and record is not None:
         raise InputError("--record and --replay exclude each other: give one of them")
@@ -68,18 +73,15 @@ def witness(
     _check_apart(endpoints)
     locations = dict.fromkeys(each.location for each in endpoints)
     wires = {location: f"wire{number}" for number, location in enumerate(locations, 1)}
-    config = {
-        "wires": {wires[each.location]: each.kind for each in endpoints},
-        "amplifiers": {
-            each.url: {
-                "wire": wires[each.location],
-                "address": each.address,
-                "channels": dict.fromkeys(range(channels), limits),
-            }
+    of_all = dict.fromkeys(range(channels), limits)
+    config = WitnessConfig(
+        {wires[each.location]: each.kind for each in endpoints},
+        {
+            each.url: AmplifierConfig(wires[each.location], each.address, of_all)
             for each in endpoints
         },
-        "times_s": {"slack": slack * 1e-3},
-    }
+        TimeLimits(slack=slack * 1e-3),
+    )
     with _capture(record) as write:
         checker = Witness(config, record=write)
         if replay is not None:
@@ -98,14 +100,14 @@ def witness(
         raise typer.Exit(1)
 
 
-def _band(text: str) -> list[float]:
+def _band(text: str) -> tuple[float, float]:
     try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
         low = high = math.nan
     if not 0 <= low <= high < math.inf:
         raise InputError(f"--frequency must be LOW,HIGH in Hz, as in 40,500, got {text!r}")
-    return [low, high]
+    return low, high
 
 
 def _in_range(option: str, given: float, *, maximum: float = math.inf, unit: str) -> float:

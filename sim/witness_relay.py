@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from drivers.errors import CommandError, LinkError
 from drivers.judge.watching.capture import Direction
+from drivers.judge.watching.config import WireKind
 from drivers.judge.watching.witness import Witness
 from drivers.ports.serial_port import open_port
 from drivers.urls import Place
@@ -21,7 +22,7 @@ from model.errors import InputError
 from registry import clock
 from sim.transport.pseudo_terminal import make_terminal
 
-_KINDS = {
+_KINDS: dict[str, WireKind] = {
     **dict.fromkeys(("serial", "serial+tcp"), "serial"),
     **{"modbus+tcp": "modbus-tcp", "modbus+rtu": "modbus-rtu"},
     **{"can+socketcand": "socketcand", "can+slcan": "slcan"},
@@ -34,7 +35,7 @@ class WireEndpoint:
     """A parsed URL. kind: of wire; place: its device or port of the network; address: on it."""
 
     url: str
-    kind: str
+    kind: WireKind
     place: Place
     address: int
 

@@ -125,9 +125,7 @@ async def test_loss_is_detected_in_time(
     async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
         bound = 0.180 if wire in SLOWEST else THREE_HEARTBEATS
         if at_work is set_after_a_heartbeat:
-            host = host_of(hosted)
-            takes = host.line.wire.set_time(host.capabilities["channels"])
-            bound = loss_detection_time([takes])
+            bound = loss_detection_time([host_of(hosted).exchange_time("Set")])
         elif kind == "unplug":
             bound = 0.060
         for _ in range(3):

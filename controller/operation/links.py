@@ -237,7 +237,7 @@ class Supervisor(Operator):
     async def _check_disarmed(self) -> None:
         epoch, group = self.operation.epoch, self.controller.group
         statuses = await group.statuses()
-        if epoch != self.operation.epoch or group.silencing:
+        if epoch != self.operation.epoch or group.members.silencing:
             return  # they may have been read before, or during a ramp
         problem, state = find_problem(statuses, group.amplifiers), self.operation.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:

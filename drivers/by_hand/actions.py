@@ -243,8 +243,7 @@ async def drive(
             raise CommandError(str(refused)) from refused  # bad input, not a refusal
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
         watchdog = max(WATCHDOG, lowest)
-        channels = amplifier.capabilities["channels"]
-        check_watchdog(watchdog, amplifier.line.wire.set_time(channels))
+        check_watchdog(watchdog, amplifier.exchange_time("Set"))
         before = await amplifier.read_status()
         if before["state"] in LATCHED:
             raise CommandRefused(

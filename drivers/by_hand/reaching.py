@@ -137,7 +137,7 @@ def random_session() -> int:
 
 def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
     """Return limits by the wire's speed; empty where that is unknown."""
-    takes = amplifier.line.wire.set_time(amplifier.capabilities["channels"])
+    takes = amplifier.exchange_time("Set")
     if not takes:
         return {}
     return {

@@ -34,13 +34,15 @@ def check_links(
     """
     errors: dict[str, str] = {}
     addresses: dict[str, WireAddress] = {}
+    round_trips: dict[str, float] = {}
     by_place: dict[tuple[str, int], str] = {}
     lines: dict[str, WireAddress] = {}
     for name, url in urls.items():
         try:
             address = address_of(url)
-            set_time = address.make_wire().exchange_time(request_words("Set"), reply_words("Set"))
-            check_watchdog(WATCHDOG, set_time)
+            words = request_words("Set"), reply_words("Set")
+            round_trips[name] = address.make_wire().exchange_time(*words)
+            check_watchdog(WATCHDOG, round_trips[name])
             address.check_agrees(lines.setdefault(address.line, address).settings)
         except (CommandError, LinkError) as error:
             errors[name] = str(error)
@@ -55,7 +57,7 @@ def check_links(
     warnings = [
         *_ceiling_warnings(limits),
         *_skew_warnings(sorted(links), limits.frequency_max),
-        *_late_loss_warnings(used, channels),
+        *_late_loss_warnings(used, round_trips),
     ]
     return errors, warnings
 
@@ -86,18 +88,19 @@ def _ceiling_warnings(limits: GuardLimits) -> list[str]:
 
 
 def _late_loss_warnings(
-    addresses: Mapping[str, WireAddress], channels: Mapping[str, int]
+    addresses: Mapping[str, WireAddress], round_trips: Mapping[str, float]
 ) -> list[str]:
-    """Warn of lines on which a loss may be detected later than MAX_LOSS_DETECTION_TIME."""
+    """Warn of lines on which a loss may be detected later than MAX_LOSS_DETECTION_TIME.
+
+    round_trips [s]: of a set to each.
+    """
     lines: dict[str, list[str]] = {}
     for name, address in addresses.items():
         lines.setdefault(address.line, []).append(name)
     limit = MAX_LOSS_DETECTION_TIME
     warnings = []
     for names in lines.values():
-        took = loss_detection_time(
-            addresses[name].make_wire().set_time(channels[name]) for name in names
-        )
+        took = loss_detection_time(map(round_trips.__getitem__, names))
         if took > limit:
             warnings.append(
                 f"{', '.join(names)}: loss of the amplifiers may be detected only after "

@@ -1,8 +1,9 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
+import contextlib
 from collections.abc import Coroutine
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from drivers.counters import LinkStatistics
@@ -13,18 +14,18 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.stop import Stop
 from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
     ENABLED,
+    LATCHED,
     QUANTITIES,
     STATES,
     VERSION,
     has_feature,
 )
-from drivers.protocol.timing import REPLY_TIMEOUT, STOP_RAMP
+from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from registry import clock
 from registry.limits import GuardLimits
 
@@ -36,11 +37,39 @@ CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
-_WATCHDOG = QUANTITIES["watchdog"]
+_RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 _WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
+
+
+@dataclass(eq=False, slots=True)
+class _Stop:
+    """A stop along a ramp of the wire, repeated until it is confirmed, or for a time [s].
+
+    ends: when [s] that has passed, which counts from when the first request goes out; is_sent: it
+    has, so that what comes later needs a stop of its own; requested: the first one, queued when
+    the stop was begun; latch: the newest one when it was requested last.
+    """
+
+    ramp: int
+    timeout: float
+    ends: float
+    is_sent: bool = False
+    limit: asyncio.Timeout | None = None
+    requested: "asyncio.Future[Values] | None" = None
+    latch: int | None = None
+    result: "asyncio.Future[Stopped]" = field(init=False)
+
+    def sent(self) -> list[Values]:
+        """Return the values of the request, which goes out now."""
+        if not self.is_sent:
+            self.is_sent = True
+            self.ends = clock.now() + self.timeout
+            if self.limit is not None:
+                self.limit.reschedule(self.ends)
+        return [{"ramp": self.ramp}]
 
 
 class Amplifier(Dialogue):
@@ -65,7 +94,7 @@ class Amplifier(Dialogue):
         self.limits, self._serial_number = limits, serial_number
         self._is_output = is_output
         self.identity: Values = {}
-        self._stop: Stop | None = None
+        self._stop: _Stop | None = None
 
     def go_on_from(self, before: "Amplifier") -> None:
         """Know what was known of it when its line was opened before, and may have been lost."""
@@ -228,9 +257,48 @@ class Amplifier(Dialogue):
         The future ends once silence is confirmed, or a time [s] after the request has gone out.
         Until then all stops are one, which goes on if the caller is cancelled.
         """
-        if self._stop is None or self._stop.is_sent or self._stop.result.done():
-            self._stop = Stop(self, ramp, timeout)
-        return asyncio.shield(self._stop.result)
+        stop = self._stop
+        if stop is None or stop.is_sent or stop.result.done():
+            members, wire_ramp = len(self.line.members), self.wire_ramp(ramp)
+            # On a line that others share each has three exchanges: a stop and two statuses.
+            timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
+            timeout += _RAMP.from_wire(wire_ramp)
+            ends = clock.now() + timeout * (members + 1)  # on a line that others keep busy
+            self._stop = stop = _Stop(wire_ramp, timeout, ends)
+            stop.result = asyncio.ensure_future(self._confirm_stop(stop))
+            with contextlib.suppress(Exception):  # then it is requested in `_confirm_stop`
+                stop.requested = self._request_stop(stop)
+        return asyncio.shield(stop.result)
+
+    def _request_stop(self, stop: _Stop) -> "asyncio.Future[Values]":
+        stop.latch = self.latch
+        return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
+
+    async def _confirm_stop(self, stop: _Stop) -> Stopped:
+        """Repeat a stop until its silence is confirmed, or its time is over.
+
+        By a status in a latched state whose latch is newer than every one seen before, with the
+        levels of all channels at zero: another one may be old, kept on its way.
+        """
+        cause, pause = "", _RAMP.from_wire(stop.ramp) + _INTERVAL
+        try:
+            async with asyncio.timeout_at(stop.ends) as stop.limit:
+                while self.line.loss is None:
+                    try:
+                        requested, stop.requested = stop.requested, None
+                        status = await (requested or self._request_stop(stop))
+                        while _is_stopping(status, stop.latch):
+                            if self.is_silent(status):
+                                self.known = Stopped(True, clock.now())
+                                return self.known
+                            await asyncio.sleep(_INTERVAL)
+                            status = await self.read_status(Priority.STOP)
+                    except Exception as error:  # whatever it is, the stop goes on
+                        cause = str(error) or type(error).__name__
+                    await asyncio.sleep(pause)
+        except TimeoutError:
+            cause = cause or f"silence was not reported within {stop.timeout:g} s"
+        return self.what_may_play(self.line.loss or cause)
 
     async def request(
         self,
@@ -259,6 +327,13 @@ class Amplifier(Dialogue):
             if status["watchdog_left"] > left:
                 raise driven_by_another(self.name)
             left = status["watchdog_left"]
+
+
+def _is_stopping(status: Values, before: int | None) -> bool:
+    """Whether a status shows that a stop was carried out since a latch was the newest."""
+    if before is None or status["state"] not in LATCHED:
+        return False
+    return status["latch"] > 0 and is_newer_token(status["latch"], before)
 
 
 def check_identity(identity: Values, name: str, serial_number: str | None) -> None:

@@ -17,7 +17,7 @@ from drivers.errors import (
 )
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import JointStart, Later, Priority
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -52,12 +52,13 @@ _logger = logging.getLogger(__name__)
 class Staged:
     """A set that an amplifier has staged, or plays at once: as the wire has it.
 
-    is_exact: to the word; until: when [s] it must have been committed.
+    is_exact: to the word; since, until: when [s] it was admitted, and must have been committed.
     """
 
     token: int
     layers: tuple[LayerSet, ...]
     is_exact: bool
+    since: float
     until: float
 
 
@@ -147,7 +148,7 @@ class Dialogue:
             return messages
 
         for _ in range(MAX_CONTRADICTIONS):
-            taken = await self.line.submit(self, priority, "Set", Later(make))
+            taken = await self.line.submit(self, priority, "Set", make)
             if taken["token"] == token:
                 break
         else:
@@ -171,7 +172,7 @@ class Dialogue:
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         messages = parts(stream, session=self.session, token=token, now=now)
-        self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        self._admitted = Staged(token, admitted, True, since=moment, until=moment + delay)
         return self._admitted, messages
 
     def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:
@@ -181,8 +182,7 @@ class Dialogue:
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        later = Later(lambda: [values], start) if start is not None else values
-        return self.line.submit(self, Priority.SET, "Commit", later)
+        return self.line.submit(self, Priority.SET, "Commit", values, start=start)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -280,7 +280,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        self._note_reports(reply, now)
+        for kind in reports_of(reply):
+            self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
@@ -324,13 +325,12 @@ class Dialogue:
                 except Exception:
                     _logger.exception("amplifier %s: a listener failed", self.name)
 
-    def _note_reports(self, status: Values, now: float) -> None:
-        """Note the reports of a status, and log those of which the last was long ago."""
-        for kind in reports_of(status):
-            if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
-                cause, remedy = REPORTS[kind]
-                _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
-            self.reported_at[kind] = now
+    def _note_report(self, kind: ReportKind, now: float) -> None:
+        """Note a report of a status, and log it unless the last was a short time ago."""
+        if now - self.reported_at.get(kind, -math.inf) > REPORT_LIFE:
+            cause, remedy = REPORTS[kind]
+            _logger.warning("amplifier %s: %s", self.name, cause, extra={"remedy": remedy})
+        self.reported_at[kind] = now
 
     def wire_ramp(self, ramp: float) -> int:
         """Return the nearest ramp that the amplifier has: silence is never refused for it."""

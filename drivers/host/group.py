@@ -23,8 +23,7 @@ from drivers.host.feeding import Stopped
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Members, is_lost
-from drivers.host.silencing import Silencing
+from drivers.host.members import Members, is_lost, outcomes
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
@@ -75,8 +74,6 @@ class Group:
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self.silencing = Silencing(self.amplifiers)
-        """Stops and disarms that go on."""
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
@@ -119,7 +116,7 @@ class Group:
                 )
             if self.state is GroupState.STOPPED:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if self.silencing:  # the result would depend on the order of frames
+            if members.silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
@@ -132,20 +129,19 @@ class Group:
                     return
                 self._leave_armed()
                 before = members.epoch
-                await self.silencing.start(self._disarm, amplifiers, STOP_RAMP)
+                await members.silence(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
-            arming = asyncio.gather(
-                *[each.arm(session, self._watchdog) for each in amplifiers], return_exceptions=True
-            )
+            arms = [each.arm(session, self._watchdog) for each in amplifiers]
+            arming = asyncio.ensure_future(outcomes(arms))
             try:
                 members.checked(await asyncio.shield(arming))
                 members.check_none_since(before)
             except BaseException as error:
                 self._note(error)
-                await self.silencing.start(self._disarm_armed, arming)
+                await members.silence(self._disarm_armed, arming)
                 if isinstance(error, DriverError):
                     members.check_none_since(before)
                 if members.is_degraded_only(error):
@@ -156,19 +152,17 @@ class Group:
             self.sets.is_incomplete = False
             self.state = GroupState.ARMED
 
-    async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
+    async def _disarm_armed(self, arming: "asyncio.Future[Any]") -> None:
         """Disarm what may have been armed by this; any other may be another host's."""
         await arming
-        disarmed = await asyncio.gather(
-            *[
-                self.members.retried(each, partial(each.disarm, STOP_RAMP))
-                for each in self.amplifiers.values()
-                if each.may_be_armed
-            ],
-            return_exceptions=True,
-        )
+        retried = self.members.retried
+        disarms = [
+            retried(each, partial(each.disarm, STOP_RAMP))
+            for each in self.amplifiers.values()
+            if each.may_be_armed
+        ]
         # One that is mute stops none.
-        if not all(isinstance(each, LinkError | None) for each in disarmed):
+        if not all(isinstance(each, LinkError | None) for each in await outcomes(disarms)):
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
@@ -246,7 +240,7 @@ class Group:
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self.silencing.start(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.members.silence(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
@@ -267,17 +261,28 @@ class Group:
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        stops = self.silencing.stop(ramp)
+        members, stops = self.members, dict[str, asyncio.Future[Stopped]]()
+        for line in {each.line for each in self.amplifiers.values()}:
+            if len(line.members) > 1:  # so that none waits for the reply of another
+                try:
+                    members.broadcast_stop(line, ramp)
+                except Exception:  # each amplifier is stopped by itself as well
+                    _logger.exception("%s: the broadcast of a stop failed", line.name)
+        for name, amplifier in self.amplifiers.items():
+            try:
+                stops[name] = amplifier.stop(ramp)
+            except Exception as error:  # the others are stopped all the same
+                stops[name] = asyncio.get_running_loop().create_future()
+                stops[name].set_exception(error)
         names = stops if waits_for is None else waits_for
-        outcomes = self.silencing.outcomes
-        return self.silencing.start(outcomes, {name: stops[name] for name in names})
+        return members.silence(members.stopped, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
         Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
-        if self.silencing:
+        if self.members.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         before = self.members.epoch
         try:
@@ -326,10 +331,11 @@ class Group:
             ]
             try:
                 if amplifiers:
-                    await self.silencing.start(self._disarm, amplifiers, ramp)
+                    await self.members.silence(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
-            await self.silencing.ended()  # only then is a line closed
+            if self.members.silencing:  # only then is a line closed
+                await asyncio.wait({*self.members.silencing})
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""

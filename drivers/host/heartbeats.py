@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
-from drivers.host.jobs import Later, Priority
+from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
@@ -128,7 +128,7 @@ class Heartbeats:
 
     def _ahead(
         self, line: Line, of_line: Sequence[Amplifier], name: str, priority: Priority
-    ) -> Later | None:
+    ) -> Make | None:
         """Return what feeds all of a line ahead of a request of the control loop to one.
 
         Where one was surely fed long ago. By a commit of the newest token: it changes nothing on
@@ -156,4 +156,4 @@ class Heartbeats:
                 each.next_request(request, values, Priority.SET)
             return [values]
 
-        return Later(make)
+        return make

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from operator import itemgetter
-from typing import NamedTuple, Protocol, TypeAlias, final
+from typing import Protocol, TypeAlias, final
 
 from drivers.counters import LinkStatistics
 from drivers.errors import CommandRefused, Preempted
@@ -111,15 +111,11 @@ _SUPERSEDED = {
 }
 
 
-class Later(NamedTuple):
-    """What a request says, known once its turn has come.
+Make: TypeAlias = Callable[[], list[Values]]
+"""What a request says, known once its turn has come.
 
-    make: called once, then; returns the values of its messages, or raises CommandRefused. start:
-    where it goes out together with commits of other lines.
-    """
-
-    make: Callable[[], list[Values]]
-    start: JointStart | None = None
+Called once, then; returns the values of its messages, or raises CommandRefused.
+"""
 
 
 class Member(Protocol):
@@ -151,7 +147,7 @@ class Member(Protocol):
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    values: of the message on the line, or next. later: until its turn has come; parts: what it made
+    values: of the message on the line, or next. make: until its turn has come; parts: what it made
     that has no reply yet. attempts: left. start: of a commit that goes out together
     with those of other lines, until it was sent: is_held for them, then is_released. started_at
     [s]: when it went out behind what was sent before. longer: than on a fast wire its reply may
@@ -166,7 +162,7 @@ class Job:
     timeout: float
     queued_at: float
     result: "asyncio.Future[Values]"
-    later: Later | None = None
+    make: Make | None = None
     start: JointStart | None = None
     parts: Sequence[Values] = ()
     attempts: int = ATTEMPTS

@@ -5,7 +5,6 @@ At one moment on all, or on none. A token is newer than another by less than hal
 commits one that changes nothing before.
 """
 
-import asyncio
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +13,15 @@ from functools import partial
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
-from drivers.host.jobs import JointStart, Later, Priority
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
-from drivers.host.members import Members
+from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, STATES, name_of
 from drivers.protocol.timing import STOP_RAMP
-from registry import clock
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
@@ -69,14 +67,7 @@ class JointSets:
             if each.name in layers:
                 amplifiers.append(each)
                 staging.append(each.stage(token, layers[each.name], now=is_silent))
-        results: list[Staged | BaseException]
-        if len(staging) == 1:  # as in `Members.all`
-            try:
-                results = [await staging[0]]
-            except DriverError as error:
-                results = [error]
-        else:
-            results = await asyncio.gather(*staging, return_exceptions=True)
+        results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for each, result in zip(amplifiers, results, strict=True):
@@ -91,14 +82,13 @@ class JointSets:
         if not is_silent:
             self._members.check_none_since(before)
             self.is_incomplete = len(layers) > 1
-            began = clock.now()
             try:
                 await self._commit(staged)
             except CommandRefused as refusal:
                 if refusal.until is None or self._members.epoch != before:
                     raise
                 # Too late for what the ledgers have admitted.
-                if any(each.played_at >= began for each in staged):
+                if any(each.played_at >= one.since for each, one in staged.items()):
                     await self.silence(STOP_RAMP)
                     return Preempted(str(refusal))
                 self.is_incomplete = False
@@ -141,14 +131,15 @@ class JointSets:
             if len(sharing) == 1:
                 requests[sharing[0]] = sharing[0].commit(token, start=start)
                 continue
-            later = Later(partial(_commit_of, sharing, token), start)
-            broadcasts.append(line.submit(None, Priority.SET, "Commit", later))
+            make = partial(_commit_of, sharing, token)
+            broadcasts.append(line.submit(None, Priority.SET, "Commit", make, start=start))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
         # With the broadcasts: one that waits is not sent where this is given up.
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for each, status in zip(requests, statuses, strict=False):
-            await _check_plays(each, status, token)
+            if status["token"] != token or status["state"] in LATCHED:
+                await _check_plays(each, status, token)
 
     async def _close_gaps(self) -> None:
         """Have amplifiers whose token is far behind commit a set that changes nothing."""
@@ -160,7 +151,7 @@ class JointSets:
         if unchanged:
             self.token = token_after(self.token)
             sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
-            await asyncio.gather(*sets)
+            await self._members.all(sets)
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

@@ -13,7 +13,7 @@ from functools import partial
 from drivers import trace
 from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.failures import no_reply, refused_by_amplifier
-from drivers.host.jobs import Job, JobQueue, Later, Member, Priority
+from drivers.host.jobs import Job, JobQueue, JointStart, Make, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
 from drivers.protocol.table import BROADCAST
@@ -50,7 +50,7 @@ class Line:
         self.members: dict[int, Member] = {}
         self.seen: Callable[[str, int, str, object], None] | None = None
         """Called with each message: out, in, event or none; address, name, content. Must return."""
-        self.ahead: Callable[[str, Priority], Later | None] | None = None
+        self.ahead: Callable[[str, Priority], Make | None] | None = None
         """Called with each request to one amplifier: what to commit on all of the line ahead."""
         self._queue = JobQueue()
         self._current: Job | None = None
@@ -75,22 +75,20 @@ class Line:
         member: Member | None,
         priority: Priority,
         name: str,
-        values: Values | Later,
+        values: Values | Make,
         *,
+        start: JointStart | None = None,
         timeout: float = REPLY_TIMEOUT,
     ) -> "asyncio.Future[Values]":
         """Queue a request of an amplifier; the future has the values of its last reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
-        it was sent.
+        it was sent. start: of a commit that goes out together with those of other lines.
         """
         future, now = self._loop.create_future(), self.time()
-        later: Later | None = None
-        if isinstance(values, Later):
-            later, values = values, {}
-        start = None if later is None else later.start
-        job = Job(member, priority, name, values, timeout, now, future, later, start)
+        make, values = (values, Values()) if callable(values) else (None, values)
+        job = Job(member, priority, name, values, timeout, now, future, make, start)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -126,7 +124,7 @@ class Line:
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
                 self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
-                if self._must_yield(job):
+                if self._queue.jobs and self._must_yield(job):
                     self._not_answered(job)
                 else:
                     self._start(job, arrival.data)
@@ -222,8 +220,8 @@ class Line:
                         self._start(Job(None, beat, "Commit", {}, 0.0, now, result, ahead))
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
-                if job.later is not None:
-                    job.parts, job.later = job.later.make(), None
+                if job.make is not None:
+                    job.parts, job.make = job.make(), None
                     job.values = job.parts[0]
                 if member is not None:
                     job.longer = member.next_request(job.name, job.values, job.priority)

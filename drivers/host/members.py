@@ -1,16 +1,24 @@
-"""The amplifiers of a group: which reply, which are lost, and which of several errors counts."""
+"""The amplifiers of a group: which reply, which are lost, which of several errors counts.
+
+Their stops and disarms are begun at once, and go on to their end.
+"""
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
+from drivers.host.feeding import Stopped
+from drivers.host.jobs import Priority
+from drivers.host.line import Line
+from drivers.protocol.records import Values
 from registry import clock
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _need = attrgetter("feeding.since")
 
@@ -24,6 +32,9 @@ class Members:
         """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
         self.gives_up_at = math.inf
         """When [s] nothing is repeated any more, since all is being closed."""
+        self.silencing: set[asyncio.Future[Any]] = set()
+        """Stops and disarms that go on."""
+        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
 
     @property
     def by_need(self) -> list[Amplifier]:
@@ -73,18 +84,22 @@ class Members:
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
         """Await all requests to their ends, then raise the most severe error."""
-        if len(requests) == 1:  # without a further iteration of the event loop
-            return [await requests[0]]
-        return self.checked(await asyncio.gather(*requests, return_exceptions=True))
+        return self.checked(await outcomes(requests))
 
     def checked(self, results: Sequence[_T | BaseException]) -> list[_T]:
         """Return results; raises the most severe error.
 
         A lost link is first; last are what others have preempted and, after it, a degraded link.
         """
-        if errors := [each for each in results if isinstance(each, BaseException)]:
+        values, errors = list[_T](), list[BaseException]()
+        for each in results:
+            if isinstance(each, BaseException):
+                errors.append(each)
+            else:
+                values.append(each)
+        if errors:
             raise min(errors, key=self._severity)
-        return [each for each in results if not isinstance(each, BaseException)]
+        return values
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
@@ -102,6 +117,64 @@ class Members:
                 if is_lost(amplifier) or clock.now() > self.gives_up_at:
                     raise
                 await asyncio.sleep(_REPEAT_INTERVAL)
+
+    def silence(
+        self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
+    ) -> Coroutine[Any, Any, _T]:
+        """Start a stop or disarm, which goes on to its end whatever is cancelled meanwhile."""
+        task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
+        self.silencing.add(task)
+        task.add_done_callback(self.silencing.discard)
+        return _to_completion(task)
+
+    def broadcast_stop(self, line: Line, ramp: float) -> None:
+        """Request a stop of all amplifiers of a line along a ramp [s], unless one is queued."""
+        queued = self._broadcasts.get(line)
+        if queued is None or queued.done():
+            first = next(iter(self.amplifiers.values()))
+            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
+            # What each amplifier says afterwards decides.
+            sent.add_done_callback(lambda sent: sent.cancelled() or sent.exception())
+            self._broadcasts[line] = sent
+
+    async def stopped(
+        self, stops: Mapping[str, "asyncio.Future[Stopped]"]
+    ) -> Mapping[str, Stopped]:
+        """Await stops by name; of one that failed by itself it is said what it may play."""
+        said: dict[str, Stopped] = {}
+        for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
+            if isinstance(result, BaseException):
+                cause = f"{type(result).__name__}: {result}"
+                result = self.amplifiers[name].what_may_play(cause)
+            said[name] = result
+        return said
+
+
+async def _to_completion(task: "asyncio.Future[_T]") -> _T:
+    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
+    cancellation = None
+    while not task.done():
+        try:
+            await asyncio.wait({task})
+        except asyncio.CancelledError as error:
+            cancellation = error
+    if cancellation is not None:
+        task.exception()  # retrieved: what has failed is said by the amplifiers
+        raise cancellation
+    return task.result()
+
+
+async def outcomes(requests: Sequence[Awaitable[_T]]) -> Sequence[_T | BaseException]:
+    """Await all requests to their ends; returns the result or the error of each."""
+    if len(requests) > 1:
+        return await asyncio.gather(*requests, return_exceptions=True)
+    results = list[_T | BaseException]()
+    for request in requests:  # without a further iteration of the event loop
+        try:
+            results.append(await request)
+        except Exception as error:
+            results.append(error)
+    return results
 
 
 def is_lost(amplifier: Amplifier) -> bool:

@@ -1,17 +1,19 @@
 """What an amplifier reports of itself, for its user, and what contradicts its requests."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Literal
 
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, QUANTITIES, has_flag, name_of
+from drivers.protocol.table import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
 
 _HOT = 70.0  # °C, above which it is said; one that must not go on reports a fault
 REPORT_LIFE = 10.0
 """For how long [s] a report is shown after the last status that had it."""
+_PER_DEGREE = QUANTITIES["temperature"].per_unit
+_LIMITED, _OPEN = 1 << STATUS_FLAGS["limited"], 1 << STATUS_FLAGS["interlock_open"]
+_HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
 
 ReportKind = Literal["limited", "interlock_open", "hot"]
-
 
 REPORTS: dict[ReportKind, tuple[str, str]] = {
     "limited": (
@@ -27,14 +29,16 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
 """Cause and remedy of the reports of a status that are no fault, by kind."""
 
 
-def reports_of(status: Values) -> Iterable[ReportKind]:
-    """Return the kinds of reports of a status."""
-    shown = {
-        "limited": has_flag(status, "limited"),
-        "interlock_open": has_flag(status, "interlock_open"),
-        "hot": QUANTITIES["temperature"].from_wire(status["temperature"]) > _HOT,
-    }
-    return [kind for kind in REPORTS if shown[kind]]
+def reports_of(status: Values) -> Sequence[ReportKind]:
+    """Return the kinds of reports of a status; few calls, since every heartbeat has one."""
+    kinds: list[ReportKind] = []
+    if status["flags"] & _LIMITED:
+        kinds.append("limited")
+    if status["flags"] & _OPEN:
+        kinds.append("interlock_open")
+    if status["temperature"] > _HOT * _PER_DEGREE:
+        kinds.append("hot")
+    return kinds
 
 
 def armed_problem(status: Values, latch: int | None) -> str | None:
@@ -42,9 +46,9 @@ def armed_problem(status: Values, latch: int | None) -> str | None:
 
     latch: that of the reply to Arm, None before: a stop or fault since would have disarmed it.
     """
-    if not has_flag(status, "high_voltage"):
+    if not status["flags"] & _HIGH_VOLTAGE:
         return "high voltage must be on, got off"
-    if has_flag(status, "interlock_open"):
+    if status["flags"] & _OPEN:
         return "interlock must be closed while armed, got open"
     if status["fault"]:
         return f"fault must be NONE while armed, got {name_of(FAULTS, status['fault'])}"

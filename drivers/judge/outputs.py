@@ -5,7 +5,7 @@ asked of `drivers.playing.uncertain`.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, TypeAlias
 
 from drivers.playing.playback import Playback, playback_of
@@ -21,7 +21,6 @@ _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
 _LASTING = 3.0  # s; what ends after it is not awaited
-_FINE = 0.026  # Hz; half a step of the wire
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
 _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
 _ALL_LAYERS = {*range(_LAYERS)}
@@ -102,6 +101,17 @@ class ExpectedOutputs:
         half = self._plays.half[layer]
         return start - half <= self.playback.end_of(layer) <= end + half
 
+    def _faded(self, one: LayerSet, time: float) -> float:
+        """Return when what a layer plays has faded, however it ends by a time, also by a set."""
+        ramp = max(_RAMP.from_wire(one.ramp), self.playback.ramp_of(one.layer))
+        ends = [
+            voice.ended(time, ramp).transition.end
+            for voices in self.playback.all_voices
+            for voice in voices
+            if voice.layer == one.layer and not voice.has_ended
+        ]
+        return max([time + ramp, *ends])
+
     def play(
         self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
     ) -> None:
@@ -115,10 +125,9 @@ class ExpectedOutputs:
             if not (one.renew or one.after):
                 lasting.clear()
             lasting.add(one.valid_for)
-            if self._may_end(number, start, end) and (
-                one.renew or any(each.keep_phase for each in one.commands)
-            ):
-                self._unknown[number] = math.inf
+            if self._may_end(number, start, end):  # and then on other ways than by the set
+                goes_on = one.renew or any(each.keep_phase for each in one.commands)
+                self._unknown[number] = math.inf if goes_on else self._faded(one, end)
             elif not one.renew and not one.after:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)
@@ -185,7 +194,7 @@ class ExpectedOutputs:
         tokens, start = shown["tokens"], self._widened(when)[0]
         levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
         if sure := self.sure(when):
-            low = self._check_levels(levels, when, self._report)
+            low = self.check_levels(levels, when, self._report)
             for layer, token in enumerate(tokens):
                 possible = self.tokens_of(layer, sure)
                 if token not in possible:
@@ -207,34 +216,13 @@ class ExpectedOutputs:
             return math.inf
         return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
 
-    def check_sensors(
-        self,
-        levels: Sequence[float],
-        frequencies: Mapping[int, float],
-        time: float,
-        *,
-        report_low: Report | None,
-    ) -> None:
-        """Compare what sensors measure: levels, and frequencies [Hz] of channels that settled.
+    def check_levels(
+        self, levels: Sequence[float], when: Interval, report_low: Report | None
+    ) -> float:
+        """Compare levels of channels; returns the largest level that one surely has.
 
         report_low: takes levels that are too low, None where they may be.
         """
-        when = time, time
-        if sure := self.sure(when):
-            self._check_levels(levels, when, report_low)
-        lag = self._plays.lag + self._slack
-        for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
-            voices = self.playback.all_voices[channel]
-            lasting = sorted({each.frequency for each in voices if not each.has_ended})
-            is_settled = all(each.transition.end < time - lag for each in voices)
-            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
-                what = f"frequency of channel {channel}"
-                self._report("plays", time, what, must=one_of(lasting), seen=frequency)
-
-    def _check_levels(
-        self, levels: Sequence[float], when: Interval, report_low: Report | None
-    ) -> float:
-        """Compare levels of channels; returns the largest level that one surely has."""
         can_be_low = self.may_derate or not self.is_exact or report_low is None
         start, end = self._widened(when)
         largest = 0.0

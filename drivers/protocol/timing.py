@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from drivers.errors import CommandError
-from drivers.protocol.table import COMMAND, LAYER, MESSAGES, REACTION
+from drivers.protocol.table import MESSAGES, REACTION
 
 BOOT_TIME = 6.0
 """For the first reply on a line [s], of a board that restarts when its port is opened."""
@@ -23,11 +23,6 @@ _HEARTBEATS = 3  # a watchdog must outlast this many intervals
 
 SET_WORDS = MESSAGES["Set"].request.words
 """Of a part of a set, before its stream."""
-
-
-def set_words(channels: int) -> int:
-    """Return the words of a set of this many channels in one layer, without envelopes."""
-    return SET_WORDS + LAYER.words + COMMAND.words * channels
 
 
 def shortest_watchdog(round_trip: float) -> float:
@@ -50,10 +45,10 @@ def loss_detection_time(round_trips: Iterable[float]) -> float:
     """Return the longest time until silent amplifiers on one line are known to be so.
 
     At the worst all fall silent right after a reply, and each is sent a set next, one after the
-    other, with all attempts: one less on a slow wire. round_trips: of a set to each.
+    other, with all attempts: one less where it takes long. round_trips: of the longest set to each.
     """
     detected = HEARTBEAT
     for round_trip in round_trips:
-        longer = max(round_trip - FAST, 0.0)
-        detected += (ATTEMPTS - (longer > 0)) * (REPLY_TIMEOUT + longer)
+        slow = (ATTEMPTS - 1) * (REPLY_TIMEOUT + round_trip - FAST)
+        detected += max(ATTEMPTS * REPLY_TIMEOUT, slow)
     return detected

@@ -34,7 +34,6 @@ from drivers.protocol.table import (
     QUANTITIES,
     REFUSALS,
 )
-from drivers.protocol.timing import set_words
 
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
 """Channels and layers of the largest amplifier there can be."""
@@ -182,7 +181,3 @@ class Wire(Protocol):
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and a reply of so many words take [s]; 0 if unknown."""
         return self.transit(words) + self.transit(reply)
-
-    def set_time(self, channels: int) -> float:
-        """Return how long a set of so many channels and its reply take [s]; 0 if unknown."""
-        return self.exchange_time(set_words(channels), reply_words("Set"))

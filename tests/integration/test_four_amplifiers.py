@@ -22,6 +22,7 @@ from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
 from drivers.judge.asking import opened
+from drivers.judge.watching.config import TimeLimits
 from drivers.opening import Lines
 from long_form import in_turn, shortly
 from model.fem.mesh import Mesh
@@ -74,7 +75,7 @@ def four_amplifiers(wires: Mapping[str, Wire]) -> AbstractAsyncContextManager[Ch
     }
     table = SetTable(tones, rig.plate)
     # On one bus four heartbeats go one after the other, of 20 ms each over RTU.
-    return Chain.armed(wires, rig, table, judged={"times_s": {"heartbeat": 0.05 + 5 * 0.02}})
+    return Chain.armed(wires, rig, table, judged={"times": TimeLimits(heartbeat=0.05 + 5 * 0.02)})
 
 
 def touch(four: Chain) -> None:

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import math
 import os
 import re
 import signal
@@ -19,7 +18,6 @@ from typer.testing import CliRunner
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError
 from drivers.judge.watching.capture import read_capture
-from drivers.judge.watching.config import parse_config
 from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
@@ -133,8 +131,6 @@ SESSION = """
 """
 DAMAGED = "0.020 wire1 > 00 05 0C 03 01 08 02 07 05 3C 50 CD 6A 00\n"
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
-LIMITS = {0: {"frequency_hz": [40, 500], "level": 1.0}}
-CONFIG = {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": LIMITS}}}
 
 
 def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
@@ -208,26 +204,6 @@ def test_witness_refuses_invalid_arguments(
     result = CliRunner().invoke(app, ["witness", URL, *arguments])
     assert isinstance(result.exception, InputError | CommandError)
     assert named in str(result.exception)
-
-
-@pytest.mark.parametrize(
-    ("plan", "named"),
-    [
-        ({}, "wires"),
-        ({"wires": {"a": "smoke"}, "amplifiers": {}}, "wires.a"),
-        (CONFIG | {"amplifiers": {"m": {"wire": "b", "channels": LIMITS}}}, "amplifiers.m.wire"),
-        (
-            CONFIG | {"amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
-            "channels.0.frequency_hz",
-        ),
-        (CONFIG | {"times_s": {"lift": math.inf}}, "times_s.lift"),
-    ],
-)
-def test_witness_config_refuses_an_invalid_key(plan: dict[str, object], named: str) -> None:
-    """The error names the key."""
-    with pytest.raises(CommandError) as refused:
-        parse_config(plan)
-    assert named in str(refused.value)
 
 
 @pytest.mark.parametrize("room", [RLIM_INFINITY, 64])

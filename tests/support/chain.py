@@ -15,7 +15,6 @@ from typing import Any, Self, cast
 from controller.play.loop import Controller
 from controller.play.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame
-from drivers.judge.watching.witness import OperatorCommand
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
@@ -23,6 +22,7 @@ from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from plate_judge import STEP, WATCHDOG, PlateJudge
+from plate_witness import OperatorCommand
 from registry import clock
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming

@@ -4,7 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import hand_written as hand
-from drivers.judge.watching.witness import Witness
+from drivers.judge.watching.config import (
+    AmplifierConfig,
+    ChannelLimits,
+    TimeLimits,
+    WitnessConfig,
+)
+from plate_witness import PlateWitness
 
 TOOK = 0.001  # s; from a request to its reply
 HALF: dict[str, Any] = {"token": 5, "levels": (5000, 0), "tokens": (5, 0, 0, 0)}
@@ -21,22 +27,18 @@ class Talk:
         self,
         *,
         names: Sequence[str] = ("m",),
-        power: float = 9.0,
         expected: Sequence[tuple[float, float, float]] | None = None,
         **limits: Any,
     ) -> None:
-        limits = {"frequency_hz": [40, 500], "level": 0.8} | limits
+        of_all = ChannelLimits(**{"frequency": (40, 500), "level": 0.8, **limits})
         amplifiers = {
-            name: {
-                **{"wire": "a", "address": address, "power": power},
-                "channels": {0: limits, 1: limits},
-            }
+            name: AmplifierConfig("a", address, {0: of_all, 1: of_all})
             for address, name in enumerate(names, 1)
         }
-        times = {"slack": 0.002, "heartbeat": 3.0}
-        self.config = {"wires": {"a": "serial"}, "amplifiers": amplifiers, "times_s": times}
+        times = TimeLimits(slack=0.002, heartbeat=3.0)
+        self.config = WitnessConfig({"a": "serial"}, amplifiers, times)
         self.capture: list[str] = []
-        self.witness = Witness(self.config, record=self.capture.append)
+        self.witness = PlateWitness(self.config, record=self.capture.append)
         if expected is not None:
             self.witness.expect({names[0]: {0: list(expected)}})
         self.time = 1.0

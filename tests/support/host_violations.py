@@ -25,7 +25,7 @@ BROKEN: Broken = {
         "limits",
         lambda: Talk().armed().staged(5, hand.layer(4, hand.tone(0, 100, 0.5))),
     ),
-    "rise_too_steep": ("limits", lambda: Talk(slew_per_s=40).armed().playing()),  # 0.5 within 10 ms
+    "rise_too_steep": ("limits", lambda: Talk(slew=40).armed().playing()),  # 0.5 within 10 ms
     "message_of_an_unknown_type": ("garbage", lambda: Talk().armed().refused(27, (), 1)),
     "set_with_half_a_command": (
         "garbage",
@@ -55,15 +55,6 @@ BROKEN: Broken = {
             .playing()
             .staged(6, hand.layer(1, hand.tone(0, 150, 0.5)))
             .committed(6, levels=(5000, 0), tokens=(5, 6, 0, 0))
-        ),
-    ),
-    "channels_above_the_power_together": (
-        "limits",
-        lambda: (
-            Talk(power=0.4)
-            .armed()
-            .staged(5, hand.layer(0, hand.tone(0, 100, 0.5), hand.tone(1, 100, 0.5)))
-            .committed(5, tokens=(5, 0, 0, 0))
         ),
     ),
     "wrong_checksum": (

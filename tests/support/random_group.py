@@ -53,7 +53,7 @@ class RandomGroup(Chain):
             "capabilities": {"layers": _LAYERS},
             "watchdog": rng.choice((0.25, 0.5)),
         }
-        judged = {"frequency_hz": [20, 1000]}
+        judged = {"frequency": (20, 1000)}
         table = SetTable({}, rig.plate)
         return cls.on(wires, rig, table, judged=judged, sensed_every=0.002, **options)
 

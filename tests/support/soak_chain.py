@@ -18,9 +18,11 @@ from controller.operation.states import DaemonEvent, DaemonState, Trigger
 from controller.play.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
+from drivers.judge.watching.config import TimeLimits
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 from paper_plate import make_paper_rig
+from plate_witness import PlateTimes
 from registry import clock
 from rig_on_wire import after_each, on_two_amplifiers
 from sim.far_ends.opening import Wire
@@ -139,13 +141,13 @@ def _judged(plan: Plan) -> Mapping[str, Any]:
 
     gaps = any(line.kind == "modbus-rtu" for line in plan.lines) * _GAPS_BETWEEN_FEEDS
     return {
-        "times_s": {
-            "lift": release(_BYTES),
-            "release": release(_BYTES) + _RAMP,
-            "touch": _TOUCH,
-            "stop": release(_BYTES),
-            "heartbeat": _HEARTBEAT + release(_BYTES_BETWEEN_FEEDS) + gaps,
-        }
+        "limits": PlateTimes(
+            lift=release(_BYTES),
+            release=release(_BYTES) + _RAMP,
+            touch=_TOUCH,
+            stop=release(_BYTES),
+        ),
+        "times": TimeLimits(heartbeat=_HEARTBEAT + release(_BYTES_BETWEEN_FEEDS) + gaps),
     }
 
 

@@ -7,7 +7,13 @@ from functools import partial
 from typing import Any, get_args
 
 from controller.play.loop import Controller
-from drivers.judge.watching.witness import OperatorCommand, Witness
+from drivers.judge.watching.config import (
+    AmplifierConfig,
+    ChannelLimits,
+    TimeLimits,
+    WitnessConfig,
+)
+from plate_witness import OperatorCommand, PlateTimes, PlateWitness
 from registry import clock
 from sim.amplifier.contract import Amplifier
 from sim.faults.fault_window import FaultWindow
@@ -19,27 +25,23 @@ def witness_config(
     urls: Mapping[str, str],
     *,
     channels: int = 4,
-    times_s: Mapping[str, float] | None = None,
+    times: TimeLimits = TimeLimits(),  # noqa: B008  frozen
     **limits: Any,
-) -> dict[str, Any]:
+) -> WitnessConfig:
     """A configuration with wires named by their location; limits: of all channels."""
     endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
-    limits = {"frequency_hz": [40, 500], "level": 1.0} | limits
-    return {
-        "wires": {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
-        "amplifiers": {
-            name: {
-                "wire": endpoint.location,
-                "address": endpoint.address,
-                "channels": dict.fromkeys(range(channels), limits),
-            }
-            for name, endpoint in endpoints.items()
+    of_all = ChannelLimits(**{"frequency": (40, 500), "level": 1.0, **limits})
+    return WitnessConfig(
+        {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
+        {
+            name: AmplifierConfig(one.location, one.address, dict.fromkeys(range(channels), of_all))
+            for name, one in endpoints.items()
         },
-        "times_s": times_s or {},
-    }
+        times,
+    )
 
 
-def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None:
+def sense(witness: PlateWitness, now: float, name: str, amplifier: Amplifier) -> None:
     """Show the levels and frequencies of an amplifier's channels at a time [s]."""
     channels = range(amplifier.playback.channels)
     levels = [min(amplifier.playback.level(channel, now), 1.0) for channel in channels]
@@ -52,15 +54,20 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
     witness.levels(now, name, levels, frequencies=frequencies)
 
 
-class LoopWitness(Witness):
+class LoopWitness(PlateWitness):
     """A witness of all wires of a control loop, in virtual time, by the URLs of its amplifiers.
 
-    It hears only what a host hears that has the wires open. judged: by what it judges, as for
-    `witness_config`.
+    It hears only what a host hears that has the wires open. limits: see `PlateWitness`; judged: by
+    what it judges, as for `witness_config`.
     """
 
-    def __init__(self, urls: Mapping[str, str], **judged: Any) -> None:
-        super().__init__(witness_config(urls, **judged))
+    def __init__(
+        self,
+        urls: Mapping[str, str],
+        limits: PlateTimes = PlateTimes(),  # noqa: B008  frozen
+        **judged: Any,
+    ) -> None:
+        super().__init__(witness_config(urls, **judged), limits)
         self._is_open = False
         self._active_faults = 0
         loop = asyncio.get_running_loop()

@@ -18,8 +18,8 @@ from chain import Chain
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.judge.watching.capture import Violation
-from drivers.judge.watching.witness import OperatorCommand
 from model.vibration.excitation import Excitation, Tone
+from plate_witness import OperatorCommand
 from registry import clock
 from registry.limits import GuardLimits
 from set_table import STROKE, SetTable, make_rig
@@ -172,7 +172,7 @@ def play(
     async def run() -> tuple[Scene, list[Violation]]:
         rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
         table = SetTable(ALONE, rig.plate, SHARED)
-        judged = {"channels": 3, "level": 0.5, "slew_per_s": 100}
+        judged = {"channels": 3, "level": 0.5, "slew": 100}
         options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
         async with Scene.on(Wire(wire), rig, table, **options) as scene:
             scene.witness.contacts(clock.now(), ())

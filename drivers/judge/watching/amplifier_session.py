@@ -1,16 +1,14 @@
 """The host's communication with one amplifier, as far as rules need to remember it.
 
 Deadlines: what must have happened by a time is due later by the delays of the witness itself. Rules
-for one set that a host sends: token, limits and expected pattern.
+for one set that a host sends: token and limits.
 """
 
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TypeAlias
 
 from drivers.judge.outputs import silent
 from drivers.judge.watching.capture import ReportViolation
@@ -29,7 +27,7 @@ class AmplifierSession:
     """Requests to one amplifier by name, and the model of it; times [s].
 
     report_always: for violations that no fault of the wire excuses; report: for all others.
-    is_disturbed: whether faults were injected into the wire at or shortly before a time. played:
+    is_disturbed: whether what passed on the wire shortly before a time may have been lost. played:
     what it was sent to play; last_set: sent since Arm, token and layers; staged: the same, unless
     it was silenced since.
     """
@@ -44,7 +42,6 @@ class AmplifierSession:
     last_set: tuple[int, Sequence[LayerSet]] | None = None
     staged: tuple[int, Sequence[LayerSet]] | None = None
     session: int | None = None  # with which the host has armed it
-    last_vibration: float = -math.inf  # when a vibrating set was accepted
     last_silenced: float = -math.inf  # when a silencing request was sent
     committed_tokens: deque[int] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
     is_identified: bool | None = None
@@ -52,7 +49,6 @@ class AmplifierSession:
     is_stopped: bool = False
     is_requested: bool = False  # whether it is latched, by a host that has opened the wire since
     armed_at: float = -math.inf
-    stop_requested_at: float | None = None
     first_stop: float | None = None  # that is not confirmed yet
     is_disarming: bool = False  # until it has shown silence
     last_stop: float = -math.inf  # or status read
@@ -86,6 +82,7 @@ class AmplifierSession:
 
 
 _DELAYS_KEPT = 64
+_MAX_DEFER = 0.1  # s; before a deadline, within which delays defer it
 
 
 Expected = tuple[str, AmplifierSession, Callable[[], bool]]
@@ -93,13 +90,9 @@ Expected = tuple[str, AmplifierSession, Callable[[], bool]]
 
 
 class Deadlines:
-    """Rules for a host, each of which must be kept by a time [s]; delays of this program defer it.
+    """Rules for a host, each to be kept by a time [s]; delays of this program defer it."""
 
-    max_defer [s]: before a time within which delays defer it.
-    """
-
-    def __init__(self, max_defer: float) -> None:
-        self._max_defer = max_defer
+    def __init__(self) -> None:
         self._delays: deque[tuple[float, float]] = deque(maxlen=_DELAYS_KEPT)
         self._pending: list[tuple[float, Expected, str]] = []
 
@@ -121,7 +114,7 @@ class Deadlines:
         pending, self._pending = self._pending, []
         for due, expected, what in pending:
             rule, session, is_kept = expected
-            if due + self.delay_since(due - self._max_defer) >= time:
+            if due + self.delay_since(due - _MAX_DEFER) >= time:
                 self._pending.append((due, expected, what))
             elif not (session.is_disturbed(due) or is_kept()):
                 session.report_always(rule, due, what)
@@ -130,11 +123,7 @@ class Deadlines:
 _STEP = 0.6  # of a step of the wire; tolerance of rounding
 _FRACTIONS = 16  # of a transition at which sums are looked at
 _ABOVE = 1.01  # of a sum; what it may exceed a limit by, for moments that are not known
-_FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
-
-Tone: TypeAlias = tuple[float, float, float]
-ExpectedSets = Mapping[str, Mapping[int, Sequence[Tone]]]
-"""Expected tones by amplifier and channel, over all layers: frequency [Hz], level, phase [deg]."""
+_FREQUENCY, _LEVEL = QUANTITIES["frequency"], QUANTITIES["level"]
 
 
 def check_set(
@@ -167,7 +156,7 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
     limits = session.config.channels.get(command.channel)
     if limits is None:
         return "no such channel"
-    frequency, (low, high) = _FREQUENCY.from_wire(command.frequency), limits.frequency_hz
+    frequency, (low, high) = _FREQUENCY.from_wire(command.frequency), limits.frequency
     if not low - _FREQUENCY.step * _STEP <= frequency <= high + _FREQUENCY.step * _STEP:
         return f"frequency must be {low:g} to {high:g} Hz, got {frequency:g}"
     shapes = [shape for shape in (command.onset, command.ending) if shape is not None]
@@ -179,26 +168,23 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
 
 def check_sums(session: AmplifierSession, time: float) -> None:
     """Check what an amplifier plays from a time on, over all layers."""
-    levels, power, rises = _sums(session.amplifier.outputs.playback, time)
-    checked = [("power", power, session.config.power)]
+    sums = _sums(session.amplifier.outputs.playback, time)
     for channel, limits in session.config.channels.items():
-        name = f"channel {channel}, sum of all layers"
-        checked.append((f"level of {name}", levels.get(channel, 0.0), limits.level))
-        checked.append((f"rise of {name}", rises.get(channel, 0.0), limits.slew_per_s))
-    for what, value, limit in checked:
-        if value > limit * _ABOVE + _LEVEL.step:
-            session.report_always(
-                "limits", time, f"{session.name}: {what} must be at most {limit:g}, got {value:.4g}"
-            )
+        level, rise = sums.get(channel, (0.0, 0.0))
+        for what, value, limit in (("level", level, limits.level), ("rise", rise, limits.slew)):
+            if value > limit * _ABOVE + _LEVEL.step:
+                session.report_always(
+                    "limits",
+                    time,
+                    f"{session.name}: {what} of channel {channel}, sum of all layers, must be at "
+                    f"most {limit:g}, got {value:.4g}",
+                )
 
 
-def _sums(
-    playback: Playback, time: float
-) -> tuple[Mapping[int, float], float, Mapping[int, float]]:
-    """Return what follows from a time on: largest levels, power, and steepest rises.
+def _sums(playback: Playback, time: float) -> Mapping[int, tuple[float, float]]:
+    """Return the largest level and the steepest rise that follow from a time on, by channel.
 
-    Levels and rises by channel, in full levels and full levels/s; looked at along the transitions
-    under way.
+    In full levels and full levels/s; looked at along the transitions under way.
     """
     times = {time}
     playing = {each: one for each, one in enumerate(playback.all_voices) if one}
@@ -207,53 +193,9 @@ def _sums(
         steps = range(count + 1)
         times.update(way.start + (way.end - way.start) * part / count for part in steps)
     moments = sorted({round(at, 6) for at in times if at >= time})  # no sums of floats
-    levels, rises = dict[int, list[float]](), dict[int, float]()
+    sums: dict[int, tuple[float, float]] = {}
     for channel, voices in playing.items():
         row = [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
         steeps = zip(pairwise(row), pairwise(moments), strict=True)
-        levels[channel] = row
-        rises[channel] = max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
-    moment_by_moment = zip(*levels.values(), strict=True)
-    power = max((sum(v * v for v in each) for each in moment_by_moment), default=0.0)
-    return {channel: max(row) for channel, row in levels.items()}, power, rises
-
-
-def check_expected(
-    session: AmplifierSession,
-    time: float,
-    layers: Sequence[LayerSet],
-    expected: ExpectedSets,
-) -> None:
-    """Compare what all layers play once a set is committed with the expected pattern."""
-    after = deepcopy(session.played)
-    after.commit([replace(one, after=False) for one in layers], 1, time)
-    sent: dict[int, list[Tone]] = {}
-    for layer in after.tokens:
-        for command in after.playing(layer).commands:
-            sent.setdefault(command.channel, []).append(
-                (
-                    _FREQUENCY.from_wire(command.frequency),
-                    _LEVEL.from_wire(command.level),
-                    _PHASE.from_wire(command.phase),
-                )
-            )
-    must = {channel: tones for channel, tones in expected.get(session.name, {}).items() if tones}
-    same = sent.keys() == must.keys() and all(
-        len(sent[channel]) == len(tones)
-        and all(any(_is_same(tone, other) for other in sent[channel]) for tone in tones)
-        for channel, tones in must.items()
-    )
-    if not same:
-        session.report_always(
-            "pattern",
-            time,
-            f"{session.name} commanded {sent}, expected {must}: Hz, levels, degrees by channel",
-        )
-
-
-def _is_same(one: Tone, other: Tone) -> bool:
-    return (
-        abs(one[0] - other[0]) < _FREQUENCY.step * _STEP
-        and abs(one[1] - other[1]) < _LEVEL.step * _STEP
-        and abs(math.remainder(one[2] - other[2], 360.0)) < _PHASE.step * _STEP
-    )
+        sums[channel] = max(row), max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
+    return sums

@@ -4,7 +4,6 @@ A request without a reply may have been carried out: the next status says so.
 """
 
 import math
-from collections.abc import Mapping, Sequence
 from functools import partial
 
 from drivers.judge.amplifier import OFF, ExpectedAmplifier
@@ -168,16 +167,3 @@ class WatchedAmplifier(ExpectedAmplifier):
         if not self.note_state(event, (time, time)):
             self._adopt(event, (time, time))
         self.last_status = time
-
-    def check_sensors(
-        self, levels: Sequence[float], frequencies: Mapping[int, float], time: float
-    ) -> None:
-        """Compare what sensors measure on its channels: levels, and known frequencies [Hz]."""
-        self.advance(time)
-        if self.unanswered:
-            return
-        is_fault_possible = self.is_enabled or not self.is_shown
-        report_low = self.report_silence if is_fault_possible else self.report
-        may_be_off = self.is_enabled and time > self.expiry[0] - self.slack
-        report = None if may_be_off else report_low
-        self.outputs.check_sensors(levels, frequencies, time, report_low=report)

@@ -25,7 +25,7 @@ from drivers.judge.watching.decoded import (
 from drivers.judge.watching.host_rules import HostRules
 from drivers.judge.watching.modbus_decoder import ModbusDecoder
 
-_RECOVERY = 0.5  # s; after a fault a wire counts as disturbed for so long
+RECOVERY = 0.5  # s; after a disturbance a wire counts as disturbed for so long
 _COPIES = 64  # frames kept to recognise repeated ones
 _PENDING_TIMEOUT = 1.0  # s; then a reply matches nothing any more
 _PRESENT = ("GetStatus", "GetFaults")
@@ -62,19 +62,21 @@ class WatchedWire:
         self._kind = kind
         self._decoder = DECODERS[kind]()
         self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
-        self._started_at: dict[Direction, float] = {}  # start of partial frames [s]
+        self.started_at: dict[Direction, float] = {}
+        """When [s] partial frames began."""
         self._pending: dict[Hashable, Request] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
         self._damaged_at = -math.inf  # when a frame of the host was damaged last [s]
-        self._faults_until = self._disturbed_until = -math.inf
+        self.disturbed_until = -math.inf
+        """Before this time [s] only rules are checked that nothing excuses."""
 
-    # host and faults
+    # host
 
     def opened(self, time: float) -> None:
         """Note that a host has opened it: its amplifiers are not identified yet."""
-        self._decoder, self._started_at = DECODERS[self._kind](), {}
+        self._decoder, self.started_at = DECODERS[self._kind](), {}
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None
@@ -89,7 +91,7 @@ class WatchedWire:
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
-            session.stop_requested_at = session.last_feed = session.first_stop = None
+            session.last_feed = session.first_stop = None
 
     def _forget_pending(self, time: float) -> None:
         """Abandon the pending requests; their replies may still arrive, and at another host."""
@@ -106,38 +108,22 @@ class WatchedWire:
             if self.sessions[sent.address] is not session
         }
 
-    def is_pending(self, session: AmplifierSession) -> bool:
-        """Whether an amplifier has not replied to a request yet."""
-        return any(self.sessions[one.address] is session for one in self._pending.values())
-
     def is_disturbed(self, time: float) -> bool:
-        """Whether faults are injected at a time [s], or were shortly before."""
-        return time <= self._disturbed_until
+        """Whether replies may have been lost shortly before a time [s]."""
+        return time <= self.disturbed_until
 
     def disturb(self, time: float) -> None:
         """Count as disturbed for a while from a time [s] on."""
-        self._disturbed_until = max(self._disturbed_until, time + _RECOVERY)
-
-    def set_disturbed(self, time: float, *, is_on: bool) -> None:
-        """Note the start or the end of injected faults."""
-        self._faults_until = math.inf if is_on else time
-        self._disturbed_until = self._faults_until + _RECOVERY
-        for session in () if is_on else self.sessions.values():
-            session.amplifier.forget()  # what it did meanwhile may be unseen
+        self.disturbed_until = max(self.disturbed_until, time + RECOVERY)
 
     # frames
 
     def feed(self, direction: Direction, time: float, data: bytes) -> int:
-        """Process bytes; returns how many frames they complete.
-
-        Bytes that follow a frame cut by a fault are read as its rest, and are a disturbance too.
-        """
-        started_at = self._started_at.pop(direction, time)
-        if started_at < time and started_at <= self._faults_until < time:
-            self.disturb(time)
+        """Process bytes; returns how many frames they complete."""
+        started_at = self.started_at.pop(direction, time)
         found = self._decoder.feed(direction, time, data)
         if self._decoder.rest[direction]:
-            self._started_at[direction] = time if found else started_at
+            self.started_at[direction] = time if found else started_at
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
@@ -153,7 +139,7 @@ class WatchedWire:
     def advance(self, now: float) -> None:
         """Report replies that are overdue."""
         for key, sent in list(self._pending.items()):
-            since = max(sent.since, self._started_at.get("host", -math.inf))
+            since = max(sent.since, self.started_at.get("host", -math.inf))
             due = since + self._times.reply + self._times.slack
             due += self._deadlines.delay_since(since)
             if now > due and not sent.is_overdue:

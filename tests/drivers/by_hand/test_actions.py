@@ -63,9 +63,9 @@ async def test_stop_of_a_mute_amplifier_may_play() -> None:
 
 
 async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
-    """Frames of 32 and 18 bytes for sets of one channel: 10 and 3 words, and 12 bytes each.
+    """Frames of 252 and 18 bytes for the longest part of a set: 120 and 3 words, and 12 bytes each.
 
-    At 115 200 baud these 500 bits are 4.34 ms, 230 sets a second.
+    At 115 200 baud these 2700 bits are 23.4 ms, 42 sets a second.
     """
     async with WORD_WIRES["serial"](1) as far:
         rows = await actions.identify(f"{far.url(1)}&baud=115200")
@@ -75,9 +75,9 @@ async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
         *("frequency_min_hz", "frequency_max_hz", "level_max")
     }
     assert "events" in rows["features"]
-    assert rows["wire_round_trip_s"] == pytest.approx(500 / 115_200, abs=1e-6)
-    assert rows["sets_per_second_max"] == 230
-    assert rows["watchdog_shortest_s"] == pytest.approx(0.15 + 500 / 115_200, abs=1e-6)
+    assert rows["wire_round_trip_s"] == pytest.approx(2700 / 115_200, abs=1e-6)
+    assert rows["sets_per_second_max"] == 42
+    assert rows["watchdog_shortest_s"] == pytest.approx(0.15 + 2700 / 115_200, abs=1e-6)
 
 
 @pytest.mark.parametrize("wire", WORD_WIRES)

@@ -70,8 +70,10 @@ def test_check_links_warns_of_eras_on_several_links() -> None:
 @pytest.mark.parametrize(
     ("urls", "times"),
     [
-        # 86 bytes of 11 bits, four silences of 1.75 ms, 10 ms for the amplifier: twice each.
-        ([f"modbus+rtu:///dev/ttyS1?baud=38400#{unit}" for unit in (1, 2)], ["217 ms"]),
+        # 282 bytes of 11 bits, four silences of 1.75 ms, 10 ms for the amplifier: twice each.
+        ([f"modbus+rtu:///dev/ttyS1?baud=38400#{unit}" for unit in (1, 2)], ["441 ms"]),
+        # At 115 200 baud the longest set is repeated once in 88 ms, a short one twice in 90 ms.
+        ([f"modbus+rtu:///dev/ttyS1?baud=115200#{unit}" for unit in (1, 2)], ["230 ms"]),
         (["serial:///dev/ttyUSB0"], []),
         # Three times 30 ms each, after a heartbeat of 50 ms.
         (["serial:///dev/ttyUSB0?address=1", "serial:///dev/ttyUSB0?address=2"], ["230 ms"]),

@@ -12,6 +12,7 @@ import host_violations
 from drivers.judge.watching.capture import read_capture
 from drivers.judge.watching.witness import Witness
 from hand_written_talk import HALF, Talk
+from plate_witness import RULES
 
 BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
 FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
@@ -25,11 +26,11 @@ def test_witness_finds_a_broken_rule(name: str) -> None:
     assert {*talk().found} == {rule}
 
 
-def test_every_rule_of_the_page_is_found_broken() -> None:
-    """By a conversation of its own."""
+def test_every_rule_is_found_broken() -> None:
+    """Those of the page and those of the plate, by a conversation of its own each."""
     rules = PAGE.read_text(encoding="utf-8").partition("## The rules")[2].partition("## In tests")
     listed = set(re.findall(r"^\| (\w+) \|", rules[0], flags=re.M)) - {"name"}
-    assert {rule for rule, _ in BROKEN.values()} == listed
+    assert {rule for rule, _ in BROKEN.values()} == listed | RULES.keys()
 
 
 @pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])
@@ -102,6 +103,24 @@ def test_loop_that_stalls_between_two_commits_sends_the_second_no_more() -> None
     talk.staged(5, amplifier_violations.LOUD, address=2)
     talk.committed(5, tokens=(5, 0, 0, 0)).told("set_stalled").rest(0.03)
     assert talk.found == []
+
+
+@pytest.mark.parametrize(
+    ("after", "level", "broken"), [(0.017, 1917, []), (0.1, 0, []), (0.1, 1917, ["plays"])]
+)
+def test_layer_may_have_ended_by_itself_just_before_a_set(
+    after: float, level: int, broken: list[str]
+) -> None:
+    """60 ms after its commit, whose reply took 12; the set that silences it came 3 ms later.
+
+    20 ms behind that the fade of 40 ms is 23 ms old: 0.25 (1 + cos(23/40 pi)).
+    """
+    talk = Talk().armed()
+    talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=40, valid_for=60))
+    talk.sends(hand.COMMIT, (9, 5)).rest(0.012)
+    talk.replies(hand.COMMIT, hand.status(token=5, tokens=(5, 0, 0, 0)))
+    talk.rest(0.049).staged(6, hand.layer(0, ramp=40)).committed(6, levels=(4878, 0))
+    assert talk.rest(after).says(token=6, levels=(level, 0)).found == broken
 
 
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:

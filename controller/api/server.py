@@ -27,7 +27,8 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, TouchParams
+from controller.api.methods import TouchParams
+from controller.api.registered import METHODS
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
 from controller.sources.contacts import CONTACT_TIMEOUT

@@ -22,7 +22,6 @@ from controller.operation.states import (
     Operation,
     Trigger,
     acknowledge,
-    check_lease,
     failed,
     step,
 )
@@ -102,12 +101,11 @@ class Operator:
         """Apply an event at once and carry out its actions in a task."""
         self._spawn(self._in_background(self._applied(event)))
 
-    def renew(self, token: str) -> Lease:
-        """Renew the lease of a token; raises RpcError if it has expired or is another's."""
-        now = clock.now()
-        lease = check_lease(self.operation.lease, token, now).renewed(now)
-        self.operation = replace(self.operation, lease=lease)
-        return lease
+    def renew(self, lease: Lease) -> Lease:
+        """Renew the lease of who armed, which must not have ended."""
+        renewed = lease.renewed(clock.now())
+        self.operation = replace(self.operation, lease=renewed)
+        return renewed
 
     def withdraw(self, token: str, cause: str) -> None:
         """Disarm, unless the lease of a token has ended."""

@@ -75,7 +75,10 @@ class Watched(Acted):
 
     def renews(self) -> None:
         """Renew the lease."""
-        self.supervisor.renew(self.lease)
+        lease = self.supervisor.operation.lease
+        assert lease is not None
+        assert lease.token == self.lease
+        self.supervisor.renew(lease)
 
     async def stops(self, **confirmed: bool) -> None:
         """Stop all; it is confirmed, or not, that they are silent."""

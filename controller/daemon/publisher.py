@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import logging
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Literal
 
@@ -48,7 +48,7 @@ class EventPublisher:
 
     operation: of the plate; amplifiers: their statuses; player: of effects; layout: the surface
     layout; inputs: state of the touch inputs; learning: what is learned of the plate, None where
-    nothing is to be.
+    nothing is to be; noted: called with a record of each change of contacts and each decision.
     """
 
     def __init__(
@@ -60,6 +60,7 @@ class EventPublisher:
         layout: SurfaceLayout | None,
         inputs: Callable[[], InputsEvent],
         learning: Callable[[], LearningStatus | None],
+        noted: Callable[[Mapping[str, object]], object],
     ) -> None:
         self.view = PlateView(player.effect_of, why_not=self._why_not)
         self._player = player
@@ -67,6 +68,7 @@ class EventPublisher:
         self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
+        self._noted = noted
         self.amplifiers = amplifiers
         self.inputs = inputs
         self._operation = operation
@@ -94,7 +96,7 @@ class EventPublisher:
             contacts_changed=self._contacts_changed,
             pattern_applied=partial(self._reported, "pattern"),
             silenced=partial(self._reported, "silence"),
-            refused=lambda reason: _logger.warning("refused: %s", reason),
+            refused=self._refused,
         )
 
     def state_changed(self, old: Operation, new: Operation) -> None:
@@ -176,13 +178,20 @@ class EventPublisher:
         status = self._learning()
         return None if status is None else plate_event(status)
 
+    def _refused(self, reason: str) -> None:
+        self._noted({"time_s": clock.now(), "refused": reason})
+        _logger.warning("refused: %s", reason)
+
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
+        self._noted({"time_s": clock.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _reported(self, topic: Literal["pattern", "silence"], report: Applied | Silenced) -> None:
         """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
         self.view.report = report
+        why = report.reason if isinstance(report, Silenced) else ""
+        self._noted({"time_s": report.time, topic: report.targets, "reason": why})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)

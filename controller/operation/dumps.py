@@ -168,7 +168,7 @@ def _line(record: Mapping[str, Any]) -> str:
     }
     text = json.dumps(known, default=_content)
     if len(text) > MAX_LINE:
-        text = json.dumps({"time_s": record["time_s"], "left_out": f"{len(text)} characters"})
+        text = json.dumps({"time_s": record["time_s"], "skipped": f"{len(text)} characters"})
     return json.dumps(json.loads(text, parse_constant=lambda _: None)) + "\n"
 
 

@@ -75,13 +75,16 @@ class Turns:
             if waits_in is not None:
                 waits_in.waiting.remove(connection)
             lane.waiting.append(connection)
-            self._schedule(lane)
+            if lane.is_urgent:  # before what has arrived meanwhile
+                asyncio.get_running_loop().call_soon(self._take_turn, lane)
+            else:
+                self._schedule(lane)
 
     def _schedule(self, lane: _Lane, delay: float = 0.0) -> None:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first, but not before what is urgent.
+        first.
         """
         if not lane.waiting or lane.is_scheduled:
             return
@@ -89,8 +92,6 @@ class Turns:
         loop = asyncio.get_running_loop()
         if delay > 0:
             loop.call_later(delay, self._take_turn, lane)
-        elif lane.is_urgent:
-            loop.call_soon(self._take_turn, lane)
         else:
             loop.call_soon(loop.call_soon, self._take_turn, lane)
 

@@ -176,7 +176,9 @@ class ApiService:
     @api_method()
     def renew(self, client: Connection, params: RenewParams) -> RenewResult:
         """Extend the lease."""
-        lease = self._supervisor.renew(self._held(params.lease))
+        lease = self._supervisor.renew(
+            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+        )
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
@@ -187,7 +189,7 @@ class ApiService:
         Any client may. While a link is lost it stops all amplifiers.
         """
         if params.lease is not None:
-            self._held(params.lease)
+            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
         if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
             await self.stop(client, params)
         cause = f"disarmed by {params.client or client.name!a}"
@@ -325,10 +327,6 @@ class ApiService:
         """Receive no more notifications of topics."""
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
-
-    def _held(self, token: str) -> Lease:
-        """The lease of who armed, for the client that has its token; raises RpcError."""
-        return check_lease(self._supervisor.operation.lease, token, clock.now())
 
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""

@@ -95,7 +95,7 @@ class Daemon:
             player=self._layout,
             layout=config.layout,
             inputs=lambda: self._inputs.event,
-            learning=lambda: None if self.learning is None else self.learning.status,
+            learning=lambda: self.learning,
             noted=self._dumps.decisions.append,
         )
         self.learning: Learning | None = None

@@ -6,7 +6,6 @@ from importlib.metadata import version
 from typing import Any
 
 from controller.api.amplifier_status import AmplifierStatus
-from controller.api.learning_status import LearningStatus
 from controller.api.methods import EffectsResult, HelloResult
 from controller.api.schema import (
     API_VERSION,
@@ -15,8 +14,7 @@ from controller.api.schema import (
     ContactStatus,
     EffectDescription,
     EraPosition,
-    LatencySummary,
-    LearningSummary,
+    LearningStatus,
     LinkCounters,
     Message,
     PlateEvent,
@@ -372,21 +370,9 @@ def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
 
 
-def learning_summary(
-    status: LearningStatus, latencies: LatencySummary, *, now: float
-) -> LearningSummary:
-    """Describe what is learned of the plate at a time [s]."""
-    return LearningSummary(
-        **_same(status, LearningSummary),
-        robust=status.are_robust,
-        last_estimate_s=None if status.last_at is None else max(0.0, now - status.last_at),
-        latency_ms=latencies,
-    )
-
-
 def plate_event(status: LearningStatus) -> PlateEvent:
     """The event of topic `plate`."""
-    return PlateEvent(**_same(status, PlateEvent), robust=status.are_robust)
+    return PlateEvent(**_same(status, PlateEvent))
 
 
 def _same(status: object, message: type[Message]) -> dict[str, Any]:

@@ -165,10 +165,6 @@ class Operator:
         actions = self._step(event)
         return self._carry_out(actions, self.operation.epoch)
 
-    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
-        for action in actions:
-            await self._do(action, epoch)
-
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
         before, self.operation = self.operation, failed(self.operation, failure_text(error))
@@ -218,26 +214,28 @@ class Operator:
         report = partial(self._link_observer, change, lost, message)
         call_guarded(partial(self._reports.add, report))
 
-    async def _do(self, action: Action, epoch: int) -> None:
-        match action:
-            case Action.VERIFY:
-                await self._over_link(self._verify(epoch), epoch)
-            case Action.ARM:
-                await self._over_link(self._arm(), epoch)
-            case Action.DISARM:
-                await self._over_link(self.controller.disarm(), epoch)
-            case Action.STOP:
-                await self._stop()
-            case Action.REACT:
-                await self._stop()
-                await self.handle(DaemonEvent(Trigger.REACTION_DONE))
-            case Action.CLEAR:
-                await self._over_link(self._clear(epoch), epoch)
-            case Action.RECONNECT:
-                await self.controller.release()
-                self._changed.set()
-            case Action.CLOSE:
-                await self.controller.close()
+    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
+        """Carry out the actions of a transition to an epoch, one after the other."""
+        for action in actions:
+            match action:
+                case Action.VERIFY:
+                    await self._over_link(self._verify(epoch), epoch)
+                case Action.ARM:
+                    await self._over_link(self._arm(), epoch)
+                case Action.DISARM:
+                    await self._over_link(self.controller.disarm(), epoch)
+                case Action.STOP:
+                    await self._stop()
+                case Action.REACT:
+                    await self._stop()
+                    await self.handle(DaemonEvent(Trigger.REACTION_DONE))
+                case Action.CLEAR:
+                    await self._over_link(self._clear(epoch), epoch)
+                case Action.RECONNECT:
+                    await self.controller.release()
+                    self._changed.set()
+                case Action.CLOSE:
+                    await self.controller.close()
 
     async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
         """Await work that needs the link; a loss or refusal becomes an event, then is raised.

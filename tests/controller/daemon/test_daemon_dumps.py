@@ -90,7 +90,8 @@ async def test_dump_names_the_last_touch_and_request_before_a_stop(
     assert "unknown effect" in last("request", "play")["refused"]
     assert last("request", "stop" if kind == "stop" else "touch")["time_s"] >= finger["since"]
     assert last("state")["state"].startswith("OPERATION_ENABLED -> ")
-    assert last("message", "Arm")["time_s"] < finger["since"] <= last("state")["time_s"]
+    assert {"Arm", "Set", "Commit", "Reply"} <= {each.get("message") for each in lines}
+    assert (times := [each["time_s"] for each in lines]) == sorted(times)
 
 
 def test_what_is_kept_for_a_dump_is_bounded(tmp_path: Path) -> None:

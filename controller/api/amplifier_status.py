@@ -1,6 +1,6 @@
 """The status of an amplifier, with a key for each reading of the protocol.
 
-`amplifier_status.pyi`, written by docs/generators/client_stub.py, has them for editors and mypy.
+`amplifier_status.pyi`, which `make pages` writes, has them for editors and mypy.
 """
 
 from typing import Any

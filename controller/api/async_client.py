@@ -29,15 +29,9 @@ from controller.api.client_protocol import (
 )
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import DaemonLink
-from controller.api.methods import (
-    DEFAULT_LEASE,
-    METHODS,
-    SILENCING,
-    ArmResult,
-    ClearParams,
-    HelloParams,
-)
+from controller.api.methods import DEFAULT_LEASE, ArmResult, ClearParams, HelloParams
 from controller.api.place import find_socket
+from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import Empty, Message, Topic, headline
 from registry.pauses import pauses
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from controller.api.client_protocol import make_params
-from controller.api.methods import METHODS, Method
+from controller.api.methods import Method
+from controller.api.registered import METHODS
 from controller.api.schema import Empty, Message
 from controller.api.summaries import SUMMARIES
 

@@ -16,7 +16,8 @@ from controller.api.async_client import AsyncClient
 from controller.api.calls import Calls
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
 from controller.api.jsonrpc import RpcError
-from controller.api.methods import DEFAULT_LEASE, METHODS, ArmResult
+from controller.api.methods import DEFAULT_LEASE, ArmResult
+from controller.api.registered import METHODS
 from registry.threads import LoopThread
 
 _T = TypeVar("_T")

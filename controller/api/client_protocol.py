@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError, read_error
-from controller.api.methods import METHODS
+from controller.api.registered import METHODS
 from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
 from model.arguments import shown

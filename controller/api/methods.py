@@ -1,10 +1,12 @@
-"""The thirteen methods of the API: parameters, results and the table `METHODS` of them.
+"""The parameters and results of the API's methods, and how a method is registered.
 
-The server, the clients, the reference in docs/reference/api.md and the gateway's OpenAPI
-description all use this table.
+A method is registered by `api_method` where it is handled (`controller/daemon/methods.py`). From
+that `make pages` writes what clients, gateway and pages read, so that they start without the
+daemon: `registered.py`, `summaries.py`, `calls.pyi` and docs/reference/api.md.
 """
 
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
 from pydantic import FailFast, Field
 
@@ -18,7 +20,6 @@ from controller.api.schema import (
     Count,
     DaemonStateName,
     EffectDescription,
-    Empty,
     Epoch,
     Explained,
     LatencySummary,
@@ -215,24 +216,19 @@ class Method(NamedTuple):
     over_http: bool = True
 
 
-METHODS: dict[str, Method] = {
-    "hello": Method(HelloParams, HelloResult, in_reserve=True),
-    "status": Method(Empty, StatusResult, in_reserve=True),
-    "arm": Method(ArmParams, ArmResult, needs_reply=True, is_repeated=False),
-    "renew": Method(RenewParams, RenewResult),
-    "disarm": Method(DisarmParams, Empty, silences=True, in_reserve=True),
-    "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
-    # Sent again, it would acknowledge a stop that came meanwhile.
-    "clear": Method(ClearParams, Empty, is_repeated=False),
-    "forget": Method(RequestedBy, Empty),
-    # The newest frame counts, so they never queue up.
-    "touch": Method(TouchParams, Empty, is_limited=False),
-    "effects": Method(Empty, EffectsResult),
-    "play": Method(PlayParams, Empty, is_repeated=False),
-    "subscribe": Method(SubscribeParams, Empty, over_http=False),
-    "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
-}
-"""Every method of the API, by name; SUMMARIES say what each does."""
+_HandlerT = TypeVar("_HandlerT", bound=Callable[..., Any])
 
-SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
-"""Methods that end what plays."""
+
+def api_method(**treatment: bool) -> Callable[[_HandlerT], _HandlerT]:
+    """Register a handler as the method of its name; treatment: as of `Method`.
+
+    Parameters and result are those of its annotations, its docstring is the help.
+    """
+
+    def register(handler: _HandlerT) -> _HandlerT:
+        kinds = get_type_hints(handler)
+        result, *_ = *get_args(kinds["return"]), kinds["return"]  # awaited or not
+        vars(handler)["method"] = Method(kinds["params"], result, **treatment)
+        return handler
+
+    return register

@@ -5,7 +5,6 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from controller.api.learning_status import LearningState
 from drivers.host.reports import ReportKind
 
 API_VERSION = "1.0"
@@ -339,6 +338,22 @@ class LatencySummary(Message):
     )
 
 
+LearningState: TypeAlias = Literal[
+    "off",
+    "starting",
+    "following",
+    "explaining",
+    "changed",
+    "only_alarms",
+    "restarting",
+    "failed",
+]
+"""What happens to what settled patterns show of the plate."""
+
+BAD: tuple[LearningState, ...] = ("changed", "restarting", "failed")
+"""States in which somebody should look after the plate or the estimator."""
+
+
 class PlateEvent(Explained):
     """What is known of the plate has changed, or whether it is followed."""
 
@@ -350,8 +365,8 @@ class PlateEvent(Explained):
     alarms: Count = Field(description="patterns so far that show another plate than the known one")
 
 
-class LearningSummary(PlateEvent):
-    """What is learned of the plate while it plays, and how often."""
+class LearningStatus(PlateEvent):
+    """The same with counts since the start."""
 
     readings: Count = Field(description="settled patterns that were measured")
     estimates: Count = Field(description="of these, by the estimator")
@@ -363,6 +378,11 @@ class LearningSummary(PlateEvent):
     )
     corrections: Count = Field(description="of the answers to touches")
     restarts: Count = Field(description="of the estimator")
+
+
+class LearningSummary(LearningStatus):
+    """What is learned of the plate while it plays, and how often."""
+
     last_estimate_s: float | None = Field(description="time since the last estimate")
     latency_ms: LatencySummary = Field(
         description="from the end of a measurement to the answers that follow it"

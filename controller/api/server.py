@@ -10,7 +10,7 @@ import math
 import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -27,7 +27,8 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, TouchParams
+from controller.api.methods import TouchParams
+from controller.api.registered import METHODS
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
 from controller.sources.contacts import CONTACT_TIMEOUT
@@ -46,15 +47,16 @@ _busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewe
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Call:
-    """A line as read: a method with its parameters, or an error."""
+    """A line as read: a method with its parameters, or an error; record: what is noted of it."""
 
     id: Id
     expects_response: bool
     method: str = ""
     params: Message | None = None
     error: Exception | None = None
+    record: dict[str, Any] = field(default_factory=dict)
 
     def is_superseded_by(self, other: "_Call | None") -> bool:
         """Whether both are touch frames of one source without an id, and the newer one is enough.
@@ -93,7 +95,8 @@ class ApiServer:
     every client that disconnects; holds_lease: whether a client does, and must not be evicted;
     is_busy: whether a touch is on its way to the wire,
     for which clients wait; stop_all: requests a stop of all amplifiers, whatever has failed on the
-    way of a client's; clock [s]; processor_time: of this thread [s].
+    way of a client's; requested: notes a request by its client, its method and when it came [s],
+    and returns the record that gets its outcome; clock [s]; processor_time: of this thread [s].
     """
 
     def __init__(
@@ -104,12 +107,14 @@ class ApiServer:
         holds_lease: Callable[[Connection], bool],
         is_busy: Callable[[], bool] = lambda: False,
         stop_all: Callable[[], object] = lambda: None,
+        requested: Callable[[str, str, float], dict[str, Any]] = lambda *_: {},
         clock: Callable[[], float] = clock.now,
         processor_time: Callable[[], float] = time.thread_time,
     ) -> None:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
         self._stop_all = stop_all
+        self._requested = requested
         self._clock = clock
         self._admission = Admission(holds_lease=holds_lease, clock=clock)
         self._turns = Turns(
@@ -159,7 +164,17 @@ class ApiServer:
         if call is None:
             return
         try:
-            result = self._call(connection, call)
+            call.record = self._requested(connection.name, call.method, connection.received_at)
+            self._check(connection, call)
+            method, handle = METHODS[call.method], self._handlers[call.method]
+            connection.silenced += method.silences
+            if not method.needs_reply:
+                result = handle(connection, call.params)
+            elif call.expects_response:
+                work = partial(handle, connection, call.params)
+                result = _for_one_who_stays(connection, connection.silenced, work)
+            else:
+                result = Empty()
             if isinstance(result, Message):
                 self._respond(connection, call, result)
                 return
@@ -220,13 +235,11 @@ class ApiServer:
             self._turns.add(connection)
         connection.close_if_finished()
 
-    def _call(self, connection: Connection, call: _Call) -> Message | Awaitable[Message]:
+    def _check(self, connection: Connection, call: _Call) -> None:
+        """Raise why a call is not carried out."""
         if call.error is not None:
             raise call.error
-        method, handle = METHODS[call.method], self._handlers[call.method]
-        if method.needs_reply and not call.expects_response:
-            return Empty()
-        if not method.in_reserve and not self._admission.promote(connection):
+        if not METHODS[call.method].in_reserve and not self._admission.promote(connection):
             raise RpcError(
                 ErrorCode.BUSY,
                 f"too many clients; only {', '.join(_RESERVE_METHODS)} are served here",
@@ -234,12 +247,6 @@ class ApiServer:
             )
         if call.method != "stop" and len(connection.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
-        if method.needs_reply:
-            return _for_one_who_stays(
-                connection, connection.silenced, lambda: handle(connection, call.params)
-            )
-        connection.silenced += method.silences
-        return handle(connection, call.params)
 
     async def _finish(
         self, connection: Connection, call: _Call, result: Awaitable[Message]
@@ -250,12 +257,15 @@ class ApiServer:
             self._respond(connection, call, error)
 
     def _respond(self, connection: Connection, call: _Call, outcome: Message | Exception) -> None:
-        if not call.expects_response:
-            return
         if isinstance(outcome, Message):
-            connection.respond(result_line(call.id, outcome.model_dump_json()))
-        else:
-            connection.respond(error_line(call.id, _rpc_error(outcome)))
+            call.record["outcome"] = "done"
+            if call.expects_response:
+                connection.respond(result_line(call.id, outcome.model_dump_json()))
+            return
+        error = _rpc_error(outcome)
+        call.record["outcome"] = call.record["refused"] = str(error)
+        if call.expects_response:
+            connection.respond(error_line(call.id, error))
 
 
 async def _for_one_who_stays(

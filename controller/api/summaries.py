@@ -1,4 +1,6 @@
-"""What every method of the API does: in the reference, in OpenAPI, and in the help of `era`.
+# Written by docs/generators/client_stub.py.
+# ruff: noqa: E501
+"""What every method of the API does: in reference, OpenAPI, and the help of `era`.
 
 Apart from what messages are made of, which would double the time of help.
 """
@@ -8,23 +10,13 @@ SUMMARIES = {
     "status": "Show daemon, amplifiers and contacts.",
     "arm": "Switch the high voltage on. Touches are felt until the lease expires.",
     "renew": "Extend the lease.",
-    "disarm": (
-        "Ramp to silence, then switch the high voltage off. Any client may. While a link is lost "
-        "it stops all amplifiers."
-    ),
-    "stop": (
-        "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client may, at "
-        "any time; error 1006 unless every amplifier is confirmed silent."
-    ),
+    "disarm": "Ramp to silence, then switch the high voltage off. Any client may. While a link is lost it stops all amplifiers.",
+    "stop": "Quick-stop all amplifiers, latched until clear. Not an emergency stop. Any client may, at any time; error 1006 unless every amplifier is confirmed silent.",
     "clear": "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.",
-    "forget": (
-        "Discard what was learned of the plate, and learn anew. Answers are those of the table at "
-        "once."
-    ),
+    "forget": "Discard what was learned of the plate, and learn anew. Answers are those of the table at once.",
     "touch": "Report all fingers of a touch source of this client.",
     "effects": "List the effects.",
     "play": "Play an effect at a finger; only while armed.",
     "subscribe": "Receive notifications of topics.",
     "unsubscribe": "Receive no more notifications of topics.",
 }
-"""Summaries of METHODS (`controller.api.methods`) in sentences, by name."""

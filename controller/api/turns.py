@@ -9,6 +9,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from controller.api.connection import Connection
 from controller.process.rate_limit import RateLimiter
@@ -18,6 +19,20 @@ SHARE = 0.25  # of the event loop's time, for those that touch, and for the othe
 BURST = 0.02  # s of processor time, saved up
 MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
 _RECHECK = 0.0005  # s; of a turn that is deferred
+
+
+@dataclass(eq=False, slots=True)
+class _Lane:
+    """Clients that wait, and what is known of their next turn.
+
+    budget: of processor time; is_urgent: they wait for nothing, but count in it.
+    """
+
+    budget: RateLimiter
+    is_urgent: bool = False
+    waiting: deque[Connection] = field(default_factory=deque)
+    is_scheduled: bool = False
+    deferred_since: float | None = None
 
 
 class Turns:
@@ -37,19 +52,19 @@ class Turns:
         clock: Callable[[], float],
         processor_time: Callable[[], float],
     ) -> None:
-        self.serve = serve
-        self.is_busy = is_busy
-        self.clock = clock
-        self.processor_time = processor_time
+        self._serve = serve
+        self._is_busy = is_busy
+        self._clock = clock
+        self._processor_time = processor_time
         self._is_first = is_first
         first, others = (RateLimiter(SHARE, burst=BURST, clock=clock) for _ in range(2))
-        self._first, self._others = _Lane(self, first), _Lane(self, others)
-        self._urgent = _Lane(self, others, is_urgent=True)
-        self._lanes = (self._urgent, self._first, self._others)
+        self._first, self._others = _Lane(first), _Lane(others)
+        self._urgent = _Lane(others, is_urgent=True)
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
-        waits_in = next((each for each in self._lanes if connection in each.waiting), None)
+        lanes = (self._urgent, self._first, self._others)
+        waits_in = next((each for each in lanes if connection in each.waiting), None)
         if connection.is_urgent:
             lane = self._urgent
         elif waits_in is not None:
@@ -60,71 +75,56 @@ class Turns:
             if waits_in is not None:
                 waits_in.waiting.remove(connection)
             lane.waiting.append(connection)
-            lane.schedule()
+            if lane.is_urgent:  # before what has arrived meanwhile
+                asyncio.get_running_loop().call_soon(self._take_turn, lane)
+            else:
+                self._schedule(lane)
 
-
-class _Lane:
-    """Clients that wait, and when their next turn is.
-
-    budget: of processor time; is_urgent: they wait for nothing, but count in it.
-    """
-
-    def __init__(self, turns: Turns, budget: RateLimiter, *, is_urgent: bool = False) -> None:
-        self.waiting: deque[Connection] = deque()
-        self._turns = turns
-        self._budget = budget
-        self._is_urgent = is_urgent
-        self._is_turn_scheduled = False
-        self._deferred_since: float | None = None
-
-    def schedule(self, delay: float = 0.0) -> None:
+    def _schedule(self, lane: _Lane, delay: float = 0.0) -> None:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first, but not before what is urgent.
+        first.
         """
-        if not self.waiting or self._is_turn_scheduled:
+        if not lane.waiting or lane.is_scheduled:
             return
-        self._is_turn_scheduled = True
+        lane.is_scheduled = True
         loop = asyncio.get_running_loop()
         if delay > 0:
-            loop.call_later(delay, self._take_turn)
-        elif self._is_urgent:
-            loop.call_soon(self._take_turn)
+            loop.call_later(delay, self._take_turn, lane)
         else:
-            loop.call_soon(loop.call_soon, self._take_turn)
+            loop.call_soon(loop.call_soon, self._take_turn, lane)
 
-    def _take_turn(self) -> None:
+    def _take_turn(self, lane: _Lane) -> None:
         """Serve a line of each client, round and round, until the turn's time is up."""
-        self._is_turn_scheduled = False
-        if not self._is_urgent and (delay := self._delay()) > 0:
-            self.schedule(delay)
+        lane.is_scheduled = False
+        if not lane.is_urgent and (delay := self._delay(lane)) > 0:
+            self._schedule(lane, delay)
             return
-        turns = self._turns
-        began_at, end = turns.processor_time(), time.perf_counter() + MAX_TURN
+        began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
         reading_time = 0.0
-        self._deferred_since = None
+        lane.deferred_since = None
         try:
-            while self.waiting:
-                connection = self.waiting.popleft()
-                turns.serve(connection)
+            while lane.waiting:
+                connection = lane.waiting.popleft()
+                self._serve(connection)
                 reading_time += connection.reading_time
                 connection.reading_time = 0.0
                 if connection.has_lines:
-                    turns.add(connection)
+                    self.add(connection)
                 connection.close_if_finished()
                 if time.perf_counter() >= end:
                     break
         finally:  # whatever fails: others wait, perhaps with a stop
-            self._budget.spend(turns.processor_time() - began_at + reading_time)
-            self.schedule()
+            lane.budget.spend(self._processor_time() - began_at + reading_time)
+            self._schedule(lane)
 
-    def _delay(self) -> float:
+    def _delay(self, lane: _Lane) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""
-        if self._turns.is_busy():
-            now = self._turns.clock()
-            if self._deferred_since is None:
-                self._deferred_since = now
-            if now - self._deferred_since < MAX_DEFERRAL:
+        if self._is_busy():
+            now = self._clock()
+            if lane.deferred_since is None:
+                lane.deferred_since = now
+            if now - lane.deferred_since < MAX_DEFERRAL:
                 return _RECHECK
-        return self._budget.pause()
+        return lane.budget.pause()

@@ -19,12 +19,13 @@ from controller.sources.touch import (
 )
 from drivers.by_hand.rig_check import check_links
 from model.config.document import ConfigError, Document, read_document
+from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Validation
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.identification.learned_file import was_learned
 from model.rig.file import rig_of
-from model.rig.kind import whole_url
+from model.rig.kind import gain_notes, whole_url
 from model.rig.rig import Rig
 from model.structure.support import check_supported
 
@@ -319,3 +320,30 @@ def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None
                 ("serial_numbers", name),
                 f"unknown amplifier; the rig has {', '.join(rig.amplifiers)}",
             )
+
+
+def _checked(document: Document) -> CheckedFile:
+    """Check a file and the files that it names; return a one-line summary."""
+    config = daemon_config_of(document)
+    rig = config.rig
+    _, warnings = check_links(config.urls, channels=rig.channel_counts, limits=rig.limits)
+    daemon = f"era daemon {document.source}"
+    hint = "" if config.table is None else f". {daemon} --check reads its table, too"
+    line = (
+        f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
+        f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
+        f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
+        f"socket {config.socket}{hint}"
+    )
+    note = rig.uncertainty.note
+    notes = [*gain_notes(rig), *([note] if note else [])]
+    return CheckedFile(line, [*warnings, *notes])
+
+
+DAEMON = ConfigKind(
+    "A daemon of era-haptics",
+    recognises=is_daemon_document,
+    check=_checked,
+    example_file=Path(__file__).with_name("example.yaml"),
+    keys=DaemonSection.model_json_schema,
+)

@@ -95,7 +95,8 @@ class Daemon:
             player=self._layout,
             layout=config.layout,
             inputs=lambda: self._inputs.event,
-            learning=lambda: None if self.learning is None else self.learning.status,
+            learning=lambda: self.learning,
+            noted=self._dumps.decisions.append,
         )
         self.learning: Learning | None = None
         """What learns the plate, if anything is to be learned."""
@@ -147,6 +148,7 @@ class Daemon:
             holds_lease=self._api.holds_lease,
             is_busy=lambda: self._controller.is_preparing,
             stop_all=self._supervisor.stop_anyhow,
+            requested=self._dumps.requested,
             clock=clock.now,
         )
         self._gateway: asyncio.Task[None] | None = None

@@ -6,7 +6,6 @@ from importlib.metadata import version
 from typing import Any
 
 from controller.api.amplifier_status import AmplifierStatus
-from controller.api.learning_status import LearningStatus
 from controller.api.methods import EffectsResult, HelloResult
 from controller.api.schema import (
     API_VERSION,
@@ -15,9 +14,9 @@ from controller.api.schema import (
     ContactStatus,
     EffectDescription,
     EraPosition,
-    LatencySummary,
-    LearningSummary,
+    LearningStatus,
     LinkCounters,
+    Message,
     PlateEvent,
     PlayedTone,
     RigSummary,
@@ -152,12 +151,18 @@ def playing_of(applied: Applied | None) -> dict[str, Any]:
     return {
         "drive": {} if applied is None else played_tones(applied.drive),
         "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
-        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
-        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
-        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
-        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
-        "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
+        **{key: pattern and _finite(getattr(pattern, name)) for key, name in _PREDICTED.items()},
     }
+
+
+_PREDICTED = {
+    "robust_felt_contrast_db": "robust_felt_contrast_db",
+    "predicted_felt_contrast_db": "felt_contrast_db",
+    "robust_contrast_db": "robust_contrast_db",
+    "predicted_contrast_db": "contrast_db",
+    "predicted_level_db_sl": "level_db_sl",
+}
+"""Keys of a `Playing`, and what of a pattern they have."""
 
 
 def played_tones(drive: Drive) -> dict[str, PlayedTone]:
@@ -351,14 +356,7 @@ def _amplifier_status(
         if status is None or is_degraded
         else None,
         statistics=LinkCounters(
-            frames_out=counts.frames_out,
-            frames_in=counts.frames_in,
-            invalid_frames=counts.invalid_frames,
-            unexpected_frames=counts.unexpected_frames,
-            events=counts.events,
-            retries=counts.retries,
-            timeouts=counts.timeouts,
-            refusals=counts.refusals,
+            **_same(counts, LinkCounters),
             round_trip_ms=None if counts.last_round_trip is None else 1e3 * counts.last_round_trip,
         ),
     )
@@ -372,32 +370,14 @@ def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
 
 
-def learning_summary(
-    status: LearningStatus, latencies: LatencySummary, *, now: float
-) -> LearningSummary:
-    """Describe what is learned of the plate at a time [s]."""
-    return LearningSummary(
-        **plate_event(status).model_dump(),
-        readings=status.readings,
-        estimates=status.estimates,
-        discarded=status.discarded,
-        disturbed=status.disturbed,
-        corrections=status.corrections,
-        restarts=status.restarts,
-        last_estimate_s=None if status.last_at is None else max(0.0, now - status.last_at),
-        latency_ms=latencies,
-    )
-
-
 def plate_event(status: LearningStatus) -> PlateEvent:
     """The event of topic `plate`."""
-    return PlateEvent(
-        state=status.state,
-        cause=status.cause,
-        remedy=status.remedy,
-        robust=status.are_robust,
-        alarms=status.alarms,
-    )
+    return PlateEvent(**_same(status, PlateEvent))
+
+
+def _same(status: object, message: type[Message]) -> dict[str, Any]:
+    """What of a status has a key of the same name in a message."""
+    return {key: getattr(status, key) for key in message.model_fields if hasattr(status, key)}
 
 
 def _finite(value: float | None) -> float | None:

@@ -4,13 +4,13 @@ import asyncio
 import itertools
 import logging
 import math
+import secrets
 import time
 from collections.abc import Awaitable, Mapping
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
-    METHODS,
     ArmParams,
     ArmResult,
     ClearParams,
@@ -27,7 +27,9 @@ from controller.api.methods import (
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
+    api_method,
 )
+from controller.api.registered import METHODS
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
 from controller.daemon.config import API_SOURCES, DaemonConfig
@@ -44,7 +46,6 @@ from controller.operation.states import (
     Lease,
     Operation,
     Trigger,
-    check_lease,
 )
 from controller.play.loop import Controller
 from controller.play.table_query import MAX_DB_SL
@@ -89,7 +90,7 @@ class ApiService:
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
-        return {name: getattr(self, f"_{name}") for name in METHODS}
+        return {name: getattr(self, name) for name in METHODS}
 
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
@@ -102,7 +103,21 @@ class ApiService:
         lease = self._supervisor.operation.lease_at(clock.now())
         return lease is not None and client.lease == lease.token
 
-    def _status(self, client: Connection, params: Empty) -> StatusResult:
+    @api_method(in_reserve=True)
+    def hello(self, client: Connection, params: HelloParams) -> HelloResult:
+        """Introduce the client; returns what the daemon drives."""
+        client.name = params.client
+        return hello_result(
+            self._config,
+            self._table,
+            self._controller.amplifiers,
+            drive_mode=self._controller.drive_mode,
+            layout=self._publisher.layout_event().layout,
+        )
+
+    @api_method(in_reserve=True)
+    def status(self, client: Connection, params: Empty) -> StatusResult:
+        """Show daemon, amplifiers and contacts."""
         operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
         lease = operation.lease_at(now)
         return StatusResult(
@@ -133,17 +148,9 @@ class ApiService:
             uptime_s=now - self._started,
         )
 
-    def _hello(self, client: Connection, params: HelloParams) -> HelloResult:
-        client.name = params.client
-        return hello_result(
-            self._config,
-            self._table,
-            self._controller.amplifiers,
-            drive_mode=self._controller.drive_mode,
-            layout=self._publisher.layout_event().layout,
-        )
-
-    async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
+    @api_method(needs_reply=True, is_repeated=False)
+    async def arm(self, client: Connection, params: ArmParams) -> ArmResult:
+        """Switch the high voltage on. Touches are felt until the lease expires."""
         if self._supervisor.operation.is_lease_over(clock.now()):  # what plays is not inherited
             await self._supervisor.handle(LEASE_OVER)
         lease = Lease(params.owner, params.lease_s)
@@ -166,16 +173,25 @@ class ApiService:
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
-    def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
-        lease = self._supervisor.renew(params.lease)
+    @api_method()
+    def renew(self, client: Connection, params: RenewParams) -> RenewResult:
+        """Extend the lease."""
+        lease = self._supervisor.renew(
+            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+        )
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
-    async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
+    @api_method(silences=True, in_reserve=True)
+    async def disarm(self, client: Connection, params: DisarmParams) -> Empty:
+        """Ramp to silence, then switch the high voltage off.
+
+        Any client may. While a link is lost it stops all amplifiers.
+        """
         if params.lease is not None:
             check_lease(self._supervisor.operation.lease, params.lease, clock.now())
         if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
-            await self._stop(client, params)
+            await self.stop(client, params)
         cause = f"disarmed by {params.client or client.name!a}"
         await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
         operation = self._supervisor.operation
@@ -183,13 +199,21 @@ class ApiService:
             raise _wrong_state(operation)
         return Empty()
 
-    def _stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
-        """Stop; the amplifiers' requests are queued when this returns."""
+    @api_method(is_limited=False, silences=True, in_reserve=True)
+    def stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
+        """Quick-stop all amplifiers, latched until clear.
+
+        Not an emergency stop. Any client may, at any time; error 1006 unless every
+        amplifier is confirmed silent.
+        """
+        # The requests to the amplifiers are queued when this returns.
         cause = f"stopped by {params.client or client.name!a}"
         stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
         return _silence(stopping, self._supervisor.operation.epoch)
 
-    async def _clear(self, client: Connection, params: ClearParams) -> Empty:
+    @api_method(is_repeated=False)  # sent again, it would acknowledge a stop that came meanwhile
+    async def clear(self, client: Connection, params: ClearParams) -> Empty:
+        """Acknowledge a stop, or a fault whose cause has gone. Stays disarmed."""
         operation = self._supervisor.operation
         if operation.state is DaemonState.COMM_LOST:
             raise _wrong_state(operation, ErrorCode.LINK)
@@ -210,7 +234,12 @@ class ApiService:
             raise _wrong_state(operation)
         return Empty()
 
-    async def _forget(self, client: Connection, params: RequestedBy) -> Empty:
+    @api_method()
+    async def forget(self, client: Connection, params: RequestedBy) -> Empty:
+        """Discard what was learned of the plate, and learn anew.
+
+        Answers are those of the table at once.
+        """
         if self._learning is None:
             raise RpcError(
                 ErrorCode.WRONG_STATE,
@@ -221,7 +250,9 @@ class ApiService:
         _logger.info("plate: forgotten by %a", params.client or client.name)
         return Empty()
 
-    def _touch(self, client: Connection, params: TouchParams) -> Empty:
+    @api_method(is_limited=False)  # the newest frame counts, so they never queue up
+    def touch(self, client: Connection, params: TouchParams) -> Empty:
+        """Report all fingers of a touch source of this client."""
         if client.number is None:
             client.number = next(self._next_number)
         plate, origin = self._config.rig.plate, _origin(client)
@@ -234,11 +265,15 @@ class ApiService:
         self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
-    def _effects(self, client: Connection, params: Empty) -> EffectsResult:
+    @api_method()
+    def effects(self, client: Connection, params: Empty) -> EffectsResult:
+        """List the effects."""
         return effects_result(self._layout.layout)
 
-    def _play(self, client: Connection, params: PlayParams) -> Empty:
-        """Start an effect at the contact nearest to a position, at its own level or below."""
+    @api_method(is_repeated=False)
+    def play(self, client: Connection, params: PlayParams) -> Empty:
+        """Play an effect at a finger; only while armed."""
+        # At the contact nearest to the position, at the effect's own level or below.
         operation = self._supervisor.operation
         if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
@@ -276,7 +311,9 @@ class ApiService:
         self._controller.request_update()
         return Empty()
 
-    def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
+    @api_method(over_http=False)
+    def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
+        """Receive notifications of topics."""
         # After the reply, so that no event precedes it.
         asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
         return Empty()
@@ -285,7 +322,9 @@ class ApiService:
         if client.is_open:
             self._publisher.hub.subscribe(client, params.topics, rate=params.rate_hz)
 
-    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
+    @api_method(over_http=False)
+    def unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
+        """Receive no more notifications of topics."""
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
 
@@ -293,6 +332,19 @@ class ApiService:
         """Disarm if the client disconnected before it received its lease."""
         if client.has_left:
             self._supervisor.withdraw(token, "the arming client disconnected")
+
+
+def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
+    """Return a lease; raises RpcError if it has expired [s], or is not that of a token."""
+    if lease is None or now >= lease.expires_at:
+        raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
+    if not secrets.compare_digest(lease.token.encode(), token.encode()):
+        raise RpcError(
+            ErrorCode.LEASE,
+            f"lease belongs to {lease.owner!a}",
+            remedy="wait until it expires, or disarm first: every client may",
+        )
+    return lease
 
 
 def _origin(client: Connection) -> str:

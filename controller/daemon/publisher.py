@@ -4,17 +4,17 @@ import asyncio
 import contextlib
 import logging
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from controller.api.amplifier_status import AmplifierStatus
-from controller.api.learning_status import LearningStatus
 from controller.api.schema import (
     STATE_WORDS,
     LatencySummary,
+    LearningStatus,
     LearningSummary,
     PlateEvent,
 )
@@ -29,9 +29,10 @@ from controller.api.topics import (
     SilenceEvent,
     StateEvent,
 )
-from controller.daemon.messages import PlateView, learning_summary, plate_event
+from controller.daemon.messages import PlateView, plate_event
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
 from controller.play.observer import Applied, Observer, Silenced
@@ -47,8 +48,9 @@ class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
     operation: of the plate; amplifiers: their statuses; player: of effects; layout: the surface
-    layout; inputs: state of the touch inputs; learning: what is learned of the plate, None where
-    nothing is to be.
+    layout; inputs: state of the touch inputs; learning: what learns the plate, None where
+    nothing is to be learned; noted: called with a record of each change of contacts and each
+    decision.
     """
 
     def __init__(
@@ -59,7 +61,8 @@ class EventPublisher:
         player: EffectPlayer,
         layout: SurfaceLayout | None,
         inputs: Callable[[], InputsEvent],
-        learning: Callable[[], LearningStatus | None],
+        learning: Callable[[], Learning | None],
+        noted: Callable[[Mapping[str, object]], object],
     ) -> None:
         self.view = PlateView(player.effect_of, why_not=self._why_not)
         self._player = player
@@ -67,6 +70,7 @@ class EventPublisher:
         self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
+        self._noted = noted
         self.amplifiers = amplifiers
         self.inputs = inputs
         self._operation = operation
@@ -94,7 +98,7 @@ class EventPublisher:
             contacts_changed=self._contacts_changed,
             pattern_applied=partial(self._reported, "pattern"),
             silenced=partial(self._reported, "silence"),
-            refused=lambda reason: _logger.warning("refused: %s", reason),
+            refused=self._refused,
         )
 
     def state_changed(self, old: Operation, new: Operation) -> None:
@@ -167,22 +171,34 @@ class EventPublisher:
 
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""
-        status = self._learning()
-        if status is None:
+        learning = self._learning()
+        if learning is None:
             return None
-        return learning_summary(status, self.learning_latencies.summary(), now=clock.now())
+        at = learning.estimated_at
+        return LearningSummary(
+            **learning.status.model_dump(),
+            last_estimate_s=None if at is None else max(0.0, clock.now() - at),
+            latency_ms=self.learning_latencies.summary(),
+        )
 
     def _plate_event(self) -> PlateEvent | None:
-        status = self._learning()
-        return None if status is None else plate_event(status)
+        learning = self._learning()
+        return None if learning is None else plate_event(learning.status)
+
+    def _refused(self, reason: str) -> None:
+        self._noted({"time_s": clock.now(), "refused": reason})
+        _logger.warning("refused: %s", reason)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
+        self._noted({"time_s": clock.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _reported(self, topic: Literal["pattern", "silence"], report: Applied | Silenced) -> None:
         """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
         self.view.report = report
+        why = report.reason if isinstance(report, Silenced) else ""
+        self._noted({"time_s": report.time, topic: report.targets, "reason": why})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies
             latencies.add(report.latency)

@@ -30,7 +30,8 @@ from controller.api.jsonrpc import (
     request_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, SILENCING, Method
+from controller.api.methods import Method
+from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access

@@ -14,7 +14,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, read_request
 from controller.api.link import DaemonLink
-from controller.api.methods import SILENCING
+from controller.api.registered import SILENCING
 from controller.gateway.field import DrawnField
 
 SEND_TIMEOUT = 5.0  # s; for one frame

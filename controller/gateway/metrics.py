@@ -14,11 +14,11 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from controller.api.amplifier_status import AmplifierStatus
-from controller.api.learning_status import LearningState
 from controller.api.methods import StatusResult
 from controller.api.schema import (
     DaemonStateName,
     LatencySummary,
+    LearningState,
     LearningSummary,
 )
 from drivers.host.reports import ReportKind

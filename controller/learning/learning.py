@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controller.api.learning_status import BAD, LearningState, LearningStatus
+from controller.api.schema import BAD, LearningState, LearningStatus
 from controller.diagnosis.plate_sensors import PlateSensor, check_common_start, plate_sensors
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator_process import (
@@ -69,7 +69,20 @@ class Learning:
         estimated: Callable[[float], None] = lambda latency: None,
         timeouts: EstimatorTimeouts = DEFAULT_TIMEOUTS,
     ) -> None:
-        self.status = LearningStatus()
+        self.status = LearningStatus(
+            state="off",
+            cause="amplifiers not asked for their sensors yet",
+            remedy=None,
+            robust=False,
+            alarms=0,
+            readings=0,
+            estimates=0,
+            discarded=0,
+            disturbed=0,
+            corrections=0,
+            restarts=0,
+        )
+        self.estimated_at: float | None = None  # s; the last estimate
         self._rig, self._base, self._file = rig, table, file
         self._controller = controller
         self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
@@ -188,7 +201,7 @@ class Learning:
                 self._take(reply)
             case Refreshed():
                 self._robust = reply.robust
-                if not self.status.are_robust and not self._is_held:
+                if not self.status.robust and not self._is_held:
                     self._correct(reply.answers)
             case Note():
                 _logger.warning("plate: %s", reply.text)
@@ -201,7 +214,7 @@ class Learning:
         self._only_alarms = ready.only_alarms
         if ready.answers is not None:
             self._correct(ready.answers, are_robust=bool(ready.change))
-        elif self.status.are_robust:
+        elif self.status.robust:
             self._reset()
         if "readings" not in self._tasks:
             self._spawn("readings", self._read(ready.settling))
@@ -227,7 +240,7 @@ class Learning:
         self._count(readings=1, discarded=0 if is_taken else 1)
 
     def _take(self, estimate: Estimate) -> None:
-        self.status = replace(self.status, last_at=clock.now())
+        self.estimated_at = clock.now()
         self._is_held = estimate.is_held
         if self._readings is not None:
             self._end_outage()
@@ -254,11 +267,11 @@ class Learning:
 
     def _reset(self) -> None:
         self._answers.reset()
-        self.status = replace(self.status, are_robust=False)
+        self.status = self.status.model_copy(update={"robust": False})
 
     def _correct(self, answers: Answers, *, are_robust: bool = False) -> None:
         self._answers.replace(answers)
-        self.status = replace(self.status, are_robust=are_robust)
+        self.status = self.status.model_copy(update={"robust": are_robust})
         self._count(corrections=1)
         if answers.is_complete:
             self._spawn("shaping", self._answers.shape_anew())
@@ -292,7 +305,7 @@ class Learning:
 
     def _answer_robustly(self) -> None:
         """Trust what was learned no longer, since nobody watches the plate."""
-        if self._robust is None or self.status.are_robust:
+        if self._robust is None or self.status.robust:
             return
         self._correct(self._robust, are_robust=True)
         _logger.warning(
@@ -310,14 +323,15 @@ class Learning:
         is_alarm: bool = False,
     ) -> None:
         """Note a state, and tell of it."""
-        self.status = replace(self.status, state=state, cause=cause, remedy=remedy)
+        said = {"state": state, "cause": cause, "remedy": remedy}
+        self.status = self.status.model_copy(update=said)
         level = logging.WARNING if state in BAD or is_alarm else logging.INFO
         _logger.log(level, "plate: %s: %s", state, cause, extra={"topic": "plate"})
         self._changed(self.status)
 
     def _count(self, **counts: int) -> None:
         now = {key: getattr(self.status, key) + more for key, more in counts.items()}
-        self.status = replace(self.status, **now)
+        self.status = self.status.model_copy(update=now)
 
     def _spawn(self, name: str, work: Coroutine[Any, Any, None]) -> None:
         """Run work in the only task of a name; the daemon goes on if it fails."""

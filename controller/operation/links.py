@@ -152,7 +152,7 @@ class Supervisor(Operator):
     async def _fail(self, error: Exception) -> None:
         await super()._fail(error)
         if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
-            await self._do(Action.RECONNECT, self.operation.epoch)
+            await self._carry_out([Action.RECONNECT], self.operation.epoch)
 
     async def _restore_link(self) -> None:
         """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""

@@ -22,7 +22,6 @@ from controller.operation.states import (
     Operation,
     Trigger,
     acknowledge,
-    check_lease,
     failed,
     step,
 )
@@ -102,12 +101,11 @@ class Operator:
         """Apply an event at once and carry out its actions in a task."""
         self._spawn(self._in_background(self._applied(event)))
 
-    def renew(self, token: str) -> Lease:
-        """Renew the lease of a token; raises RpcError if it has expired or is another's."""
-        now = clock.now()
-        lease = check_lease(self.operation.lease, token, now).renewed(now)
-        self.operation = replace(self.operation, lease=lease)
-        return lease
+    def renew(self, lease: Lease) -> Lease:
+        """Renew the lease of who armed, which must not have ended."""
+        renewed = lease.renewed(clock.now())
+        self.operation = replace(self.operation, lease=renewed)
+        return renewed
 
     def withdraw(self, token: str, cause: str) -> None:
         """Disarm, unless the lease of a token has ended."""
@@ -167,10 +165,6 @@ class Operator:
         actions = self._step(event)
         return self._carry_out(actions, self.operation.epoch)
 
-    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
-        for action in actions:
-            await self._do(action, epoch)
-
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
         before, self.operation = self.operation, failed(self.operation, failure_text(error))
@@ -220,26 +214,28 @@ class Operator:
         report = partial(self._link_observer, change, lost, message)
         call_guarded(partial(self._reports.add, report))
 
-    async def _do(self, action: Action, epoch: int) -> None:
-        match action:
-            case Action.VERIFY:
-                await self._over_link(self._verify(epoch), epoch)
-            case Action.ARM:
-                await self._over_link(self._arm(), epoch)
-            case Action.DISARM:
-                await self._over_link(self.controller.disarm(), epoch)
-            case Action.STOP:
-                await self._stop()
-            case Action.REACT:
-                await self._stop()
-                await self.handle(DaemonEvent(Trigger.REACTION_DONE))
-            case Action.CLEAR:
-                await self._over_link(self._clear(epoch), epoch)
-            case Action.RECONNECT:
-                await self.controller.release()
-                self._changed.set()
-            case Action.CLOSE:
-                await self.controller.close()
+    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
+        """Carry out the actions of a transition to an epoch, one after the other."""
+        for action in actions:
+            match action:
+                case Action.VERIFY:
+                    await self._over_link(self._verify(epoch), epoch)
+                case Action.ARM:
+                    await self._over_link(self._arm(), epoch)
+                case Action.DISARM:
+                    await self._over_link(self.controller.disarm(), epoch)
+                case Action.STOP:
+                    await self._stop()
+                case Action.REACT:
+                    await self._stop()
+                    await self.handle(DaemonEvent(Trigger.REACTION_DONE))
+                case Action.CLEAR:
+                    await self._over_link(self._clear(epoch), epoch)
+                case Action.RECONNECT:
+                    await self.controller.release()
+                    self._changed.set()
+                case Action.CLOSE:
+                    await self.controller.close()
 
     async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
         """Await work that needs the link; a loss or refusal becomes an event, then is raised.

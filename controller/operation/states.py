@@ -19,8 +19,6 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple, Self
 
-from controller.api.jsonrpc import ErrorCode, RpcError
-
 _REMEDIES = {
     "WATCHDOG": "end programs that take the processor, or check the wire: it received nothing in "
     "time",
@@ -306,16 +304,3 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
         degraded=(),
         lease=updated.lease if to in ENERGISED else None,
     )
-
-
-def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
-    """Return a lease; raises RpcError if it has expired [s], or is not that of a token."""
-    if lease is None or now >= lease.expires_at:
-        raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
-    if not secrets.compare_digest(lease.token.encode(), token.encode()):
-        raise RpcError(
-            ErrorCode.LEASE,
-            f"lease belongs to {lease.owner!a}",
-            remedy="wait until it expires, or disarm first: every client may",
-        )
-    return lease

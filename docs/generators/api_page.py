@@ -5,7 +5,8 @@ from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from controller.api.jsonrpc import ERROR_MEANINGS
-from controller.api.methods import METHODS
+from controller.api.methods import Method
+from controller.api.registered import METHODS
 from controller.api.schema import Message
 from controller.api.summaries import SUMMARIES
 from controller.api.topics import TOPICS, EventParams
@@ -17,7 +18,8 @@ def api_reference() -> str:
     lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
-        lines += ["", f"#### {name}", "", SUMMARIES[name], "", *_HEAD, *rows]
+        lines += ["", f"#### {name}", "", " ".join([SUMMARIES[name], *_notes(method)]), ""]
+        lines += [*_HEAD, *rows]
     lines += ["", "### Topics", "", "The parameters of every `event` notification, and its `data`:"]
     lines += ["", *_HEAD, *_rows("", EventParams, models)]
     for topic, entry in TOPICS.items():
@@ -37,6 +39,21 @@ def api_reference() -> str:
 
 
 _HEAD = ("| key | type | |", "|---|---|---|")
+
+
+def _notes(method: Method) -> Iterator[str]:
+    """Who may call a method, and how its requests are treated."""
+    lease = method.params.model_fields.get("lease")
+    if lease is not None and lease.is_required():
+        yield "Only with the lease of the client that has armed."
+    if method.in_reserve:
+        yield "Served to clients in reserve, too."
+    if method.needs_reply:
+        yield "Only with an `id`."
+    if not method.is_repeated:
+        yield "The Python clients do not send it again where the reply is lost."
+    if not method.over_http:
+        yield "Over a lasting connection alone, not over HTTP."
 
 
 def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:

@@ -1,15 +1,81 @@
-"""Signatures of what the API makes from a table: methods of the clients, readings of amplifiers."""
+"""What clients and gateway have of the methods of the API, from where these are handled.
+
+Also the readings of amplifiers in their status.
+"""
 
 import inspect
 import types
+from collections.abc import Iterator
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from controller.api.calls import BY_HAND, signature_of
-from controller.api.methods import METHODS
+from controller.api.methods import Method
 from controller.api.schema import Empty
+from controller.daemon.methods import ApiService
 from drivers.protocol.table import READINGS
 
 _HEAD = "# Written by docs/generators/client_stub.py."
+
+
+def registered() -> dict[str, tuple[Method, str]]:
+    """The methods that the daemon handles, by name, with what each does."""
+    return {
+        name: (handler.method, " ".join((handler.__doc__ or "").split()))
+        for name, handler in vars(ApiService).items()
+        if hasattr(handler, "method")
+    }
+
+
+def table() -> str:
+    """The whole file registered.py."""
+    methods = {name: method for name, (method, _) in registered().items()}
+    kinds = {kind for each in methods.values() for kind in (each.params, each.result)} - {Empty}
+    lines = [
+        _HEAD,
+        '"""Every method of the API, by name, and those that end what plays."""',
+        "",
+        *_import("controller.api.methods", "Method", *(each.__name__ for each in kinds)),
+        "from controller.api.schema import Empty",
+        "",
+        "METHODS: dict[str, Method] = {",
+        *(f'    "{name}": {_call(method)},' for name, method in methods.items()),
+        "}",
+        "SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _call(method: Method) -> str:
+    """A registration as Python."""
+    changed = [
+        f"{key}={value}"
+        for key, default in Method._field_defaults.items()
+        if (value := getattr(method, key)) != default
+    ]
+    return f"Method({', '.join([method.params.__name__, method.result.__name__, *changed])})"
+
+
+def _import(module: str, *names: str) -> Iterator[str]:
+    yield f"from {module} import ("
+    yield from (f"    {name}," for name in sorted(names))
+    yield ")"
+
+
+def summaries() -> str:
+    """The whole file summaries.py."""
+    lines = [
+        _HEAD,
+        "# ruff: noqa: E501",
+        '"""What every method of the API does: in reference, OpenAPI, and the help of `era`.',
+        "",
+        "Apart from what messages are made of, which would double the time of help.",
+        '"""',
+        "",
+        "SUMMARIES = {",
+        *(f'    "{name}": "{summary}",' for name, (_, summary) in registered().items()),
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def status_stub() -> str:
@@ -24,16 +90,14 @@ def status_stub() -> str:
 
 def stub() -> str:
     """The whole file calls.pyi."""
-    made = {name: method for name, method in METHODS.items() if name not in BY_HAND}
-    results = sorted({each.result.__name__ for each in made.values() if each.result is not Empty})
+    made = {name: each for name, (each, _) in registered().items() if name not in BY_HAND}
+    results = {each.result.__name__ for each in made.values() if each.result is not Empty}
     lines = [
         _HEAD,
         "",
         "import inspect",
         "",
-        "from controller.api.methods import (",
-        *(f"    {name}," for name in sorted(["Method", *results])),
-        ")",
+        *_import("controller.api.methods", "Method", *results),
         "",
         "BY_HAND: tuple[str, ...]",
         "",

@@ -18,7 +18,7 @@ import rig_page
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from api_page import api_reference
-from client_stub import status_stub, stub
+from client_stub import status_stub, stub, summaries, table
 from command_page import command_reference
 from firmware_header import header
 from firmware_records import records_header
@@ -63,6 +63,8 @@ def _of_protocol(page: str) -> list[Writer]:
 
 
 WRITTEN: Mapping[str, Sequence[Writer]] = {
+    "controller/api/registered.py": [whole(table)],
+    "controller/api/summaries.py": [whole(summaries)],
     "controller/api/calls.pyi": [whole(stub)],  # before python-api.md, which shows it
     "controller/api/amplifier_status.pyi": [whole(status_stub)],
     "firmware/core/protocol.h": [whole(header)],

@@ -50,7 +50,7 @@ class ConfigKind:
 
 
 _KINDS = {
-    "daemon": "controller.daemon.config_kind:DAEMON",
+    "daemon": "controller.daemon.config:DAEMON",
     "layout": "controller.effects.layout_file:LAYOUT",
     DEFAULT_KIND: "model.rig.kind:RIG",
 }

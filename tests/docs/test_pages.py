@@ -51,7 +51,7 @@ def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
         path.relative_to(pages.ROOT).as_posix()
         for folder in (".", "docs/reference", "docs/how-to", "controller/api", "firmware/core")
         for path in (pages.ROOT / folder).glob("*.*")
-        if path.suffix in (".md", ".pyi", ".h") and claimed.search(path.read_text("utf-8"))
+        if path.suffix in (".md", ".py", ".pyi", ".h") and claimed.search(path.read_text("utf-8"))
     }
     assert len(found) > 6
     assert found <= set(pages.WRITTEN)

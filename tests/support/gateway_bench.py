@@ -29,7 +29,6 @@ from controller.api.client import Client
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
-    METHODS,
     ArmResult,
     EffectsResult,
     HelloParams,
@@ -39,6 +38,7 @@ from controller.api.methods import (
     StopResult,
     SubscribeParams,
 )
+from controller.api.registered import METHODS
 from controller.api.schema import (
     API_VERSION,
     AmplifierSilence,

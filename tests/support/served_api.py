@@ -8,7 +8,7 @@ from typing import Any
 
 import virtual_loop
 from controller.api.connection import Connection
-from controller.api.methods import METHODS
+from controller.api.registered import METHODS
 from controller.api.schema import Empty, Message
 from controller.api.server import ApiServer
 

@@ -29,7 +29,6 @@ class Watched(Acted):
     alive: list[float] = field(default_factory=list)
     cycles: list[float] = field(default_factory=list)
     failing: str = ""
-    lease: str = ""
 
     @property
     def state(self) -> DaemonState:
@@ -69,13 +68,12 @@ class Watched(Acted):
 
     async def leases(self, seconds: float) -> None:
         """Arm for a client, for so long."""
-        lease = Lease("me", seconds)
-        self.lease = lease.token
-        await self.handle(DaemonEvent(Trigger.ARM, lease=lease))
+        await self.handle(DaemonEvent(Trigger.ARM, lease=Lease("me", seconds)))
 
     def renews(self) -> None:
         """Renew the lease."""
-        self.supervisor.renew(self.lease)
+        assert self.supervisor.operation.lease is not None
+        self.supervisor.renew(self.supervisor.operation.lease)
 
     async def stops(self, **confirmed: bool) -> None:
         """Stop all; it is confirmed, or not, that they are silent."""

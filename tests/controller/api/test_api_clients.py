@@ -23,8 +23,8 @@ from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, event_line
 from controller.api.link import DaemonLink
-from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
+from controller.api.registered import METHODS
 from controller.api.topics import LogEvent
 from daemon_bench import (
     PLACE,

@@ -2,13 +2,11 @@
 
 import inspect
 import json
-from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.api.connection import Connection
 from controller.api.jsonrpc import (
     ErrorCode,
     InvalidRequest,
@@ -19,8 +17,10 @@ from controller.api.jsonrpc import (
     request_line,
     result_line,
 )
-from controller.api.methods import METHODS, ArmParams, SubscribeParams
+from controller.api.methods import ArmParams, SubscribeParams
+from controller.api.registered import METHODS
 from controller.api.schema import Empty, Message
+from controller.api.summaries import SUMMARIES
 from controller.daemon.methods import ApiService
 
 
@@ -226,11 +226,10 @@ def test_params_of_any_shape_are_valid_or_refused(method: str, params: dict[str,
     assert text == "" or text.isprintable()
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_handler_takes_and_returns_what_is_registered(name: str) -> None:
-    """The daemon finds its handlers by name, so that nothing else compares them."""
-    handler = getattr(ApiService, f"_{name}")
-    parameters = [each.annotation for each in inspect.signature(handler).parameters.values()]
-    assert parameters[1:] == [Connection, METHODS[name].params]
-    result = inspect.signature(handler).return_annotation
-    assert METHODS[name].result in (result, *get_args(result))
+def test_table_has_what_is_registered_where_it_is_handled() -> None:
+    """Names, parameters, results, treatment and help of all handlers, in their order."""
+    handlers = {name: each for name, each in vars(ApiService).items() if hasattr(each, "method")}
+    assert {name: each.method for name, each in handlers.items()} == METHODS
+    assert [*SUMMARIES] == [*handlers]
+    for name, each in handlers.items():
+        assert inspect.cleandoc(each.__doc__).split() == SUMMARIES[name].split()

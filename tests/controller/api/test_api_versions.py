@@ -11,7 +11,7 @@ import pytest
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.connection import Connection
-from controller.api.methods import METHODS
+from controller.api.registered import METHODS
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
 from daemon_bench import PLACE, holding, running_daemon, until_state

@@ -14,6 +14,7 @@ import serial
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
+from controller.daemon.methods import check_lease
 from controller.operation.links import Supervisor
 from controller.operation.states import (
     ENERGISED,
@@ -22,7 +23,6 @@ from controller.operation.states import (
     Lease,
     Operation,
     Trigger,
-    check_lease,
     step,
 )
 from daemon_bench import (
@@ -298,7 +298,7 @@ async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
     async with ready_daemon(tmp_path) as (bench, era):
         api, released = bench.daemon._api, delay_arming(bench.daemon, monkeypatch)
         client = SimpleNamespace(has_left=False)
-        arming = asyncio.create_task(api._arm(client, ArmParams(owner="me", lease_s=60)))  # type: ignore[arg-type]
+        arming = asyncio.create_task(api.arm(client, ArmParams(owner="me", lease_s=60)))  # type: ignore[arg-type]
         await until_state(era, "SWITCHED_ON")
         arming.cancel()
         with pytest.raises(asyncio.CancelledError):

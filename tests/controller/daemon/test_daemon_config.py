@@ -8,8 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.place import default_socket
-from controller.daemon.config import load_daemon_config
-from controller.daemon.config_kind import DAEMON
+from controller.daemon.config import DAEMON, load_daemon_config
 from controller.daemon.config_sections import DaemonSection
 from controller.sources.touch import Touch
 from model.commands.config_cli import config_app

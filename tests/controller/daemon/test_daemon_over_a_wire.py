@@ -1,7 +1,6 @@
 """A whole daemon in virtual time: requests of clients, actions at the amplifier, events."""
 
 import asyncio
-import json
 import re
 from pathlib import Path
 
@@ -112,9 +111,9 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
 
 
 @in_virtual_time
-async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None:
-    """Over-voltage: silent, latched, and the last messages in a file in order of time."""
-    async with ready_daemon(tmp_path, "dumps: {folder: dumps}\n") as (bench, era):
+async def test_fault_stops_and_must_be_cleared(tmp_path: Path) -> None:
+    """Over-voltage: silent and latched."""
+    async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=30)
         async with holding(era, far=bench.far):
             bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
@@ -124,13 +123,6 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
         assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
         await era.clear()
         await until_state(era, READY)
-        (dump,) = (tmp_path / "dumps").iterdir()
-        head, *lines = [json.loads(line) for line in dump.read_text("utf-8").splitlines()]
-        assert "OVER_VOLTAGE" in head["cause"]
-        messages = {line["message"] for line in lines}
-        assert {"Arm", "Set", "Commit", "Reply"} <= messages
-        times = [line["time_s"] for line in lines]
-        assert times == sorted(times)
 
 
 @in_virtual_time

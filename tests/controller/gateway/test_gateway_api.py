@@ -12,7 +12,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from controller.api.methods import METHODS, RequestedBy
+from controller.api.methods import RequestedBy
+from controller.api.registered import METHODS
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from controller.gateway import app

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import pytest
 
-from controller.api.learning_status import LearningState
+from controller.api.schema import LearningState
 from controller.learning import learning as module
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator import Estimator
@@ -210,7 +210,7 @@ async def test_status_follows_the_estimator(
             estimators.reply(told.reply)
             status = learning.status
             assert status.state is told.state, told
-            assert told.are_robust in (None, status.are_robust), told
+            assert told.are_robust in (None, status.robust), told
             assert told.taken in (None, len(taking.taken)), told
             assert told.levels in (None, [each.levelname for each in caplog.records]), told
 
@@ -248,7 +248,7 @@ async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_p
         estimators.reply(QUIET)
         assert learning.status.state == "following"
         await asyncio.sleep(61.0)
-        assert not learning.status.are_robust
+        assert not learning.status.robust
 
 
 @in_virtual_time
@@ -261,7 +261,7 @@ async def test_readings_that_stay_away_make_answers_robust(
         await asyncio.sleep(0.1)
         Readings.ending.set()
         await asyncio.sleep(61.0)
-        assert learning.status.are_robust
+        assert learning.status.robust
 
 
 @in_virtual_time

@@ -33,9 +33,9 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, SILENCING, Method
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
-from controller.gateway.access import SUBPROTOCOL, Access
+from controller.gateway.access import SUBPROTOCOL, VERSIONS, Access
 from controller.gateway.bridge import bridge
-from controller.gateway.connections import CLIENT_TIMEOUT, connection_of
+from controller.gateway.connections import CLIENT_TIMEOUT, CONNECTION, CONTINUE
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -144,7 +144,7 @@ MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewe
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 _HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
-_CLOSE_TIMEOUT = 1.0  # s; for a browser to close its side
+_CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
 _MAX_FILES = 4  # in one turn of the event loop
 _PAGE = Path(__file__).parent / "page"
 
@@ -156,7 +156,7 @@ class Gateway:
         self.field = DrawnField(settings.socket)
         self._access = Access(settings)
         self._daemon = settings.socket
-        self._sessions: set[asyncio.Task[None]] = set()
+        self._sessions: set[web.WebSocketResponse] = set()
         self._places = asyncio.Semaphore(MAX_REQUESTS)
         # Of connections to the daemon, by host.
         self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
@@ -174,9 +174,9 @@ class Gateway:
         self.app.add_routes(
             [
                 web.get("/api/v1/{file:openapi.json}", self._file),
-                web.get("/api/v1/ws", self._serve),
+                web.get("/api/v1/ws", self._serve, allow_head=False),
                 web.options("/api/v1/{method}", self._access.preflight),
-                web.post("/api/v1/{method}", self._call, expect_handler=_unasked),
+                web.post("/api/v1/{method}", self._call),
                 web.get("/metrics", self._metrics),
                 web.get("/{file:[^/]*}", self._file),
             ]
@@ -206,8 +206,8 @@ class Gateway:
 
         A client may have left meanwhile: its stop is carried out all the same.
         """
-        connection = None if request.transport is None else connection_of(request)
-        if connection is not None:
+        connection = CONNECTION.get()
+        if request.version in VERSIONS:  # else it is answered as what is no HTTP
             connection.start_response()
         try:
             self._access.check(request)
@@ -218,10 +218,12 @@ class Gateway:
                 status=403 if "Upgrade" in request.headers else error.status,
                 headers=[each for each in error.headers.items() if each[0] == "Allow"],
             )
+        connection.is_refused = not request.content.is_eof()
+        if connection.is_refused:
+            response.force_close()
         await response.prepare(request)
         await response.write_eof()
-        if connection is not None:
-            connection.end_response()
+        connection.end_response()
         return response
 
     async def _file(self, request: web.Request) -> web.Response:
@@ -256,36 +258,41 @@ class Gateway:
             async with self._places:
                 result = await self._request(request, method, await _body(request))
             return web.json_response(result)
-        except RpcError as error:
+        except (RpcError, Unreachable) as problem:
+            error = (
+                RpcError(ErrorCode.LINK, str(problem))
+                if isinstance(problem, Unreachable)
+                else problem
+            )
             failed = json.loads(error_line(None, error))["error"]
             content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
             return web.json_response(content, status=HTTP_STATUS[error.code])
 
     async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
-        """The daemon's result, over the connection that this one keeps; raises RpcError."""
-        name = f"http {getattr(request.transport, 'address', request.remote)}"
-        try:
-            if method in SILENCING:  # over the own connection, from any client
-                return await self._silence(name, method, params)
-            may_open = partial(self.may_connect, request.remote)
-            kept = connection_of(request).link
-            line = await kept.request(self._daemon, name, method, params, may_open=may_open)
-            return result_of(read_line(line))
-        except Unreachable as error:
-            raise RpcError(ErrorCode.LINK, str(error)) from error
+        """The daemon's result, over the connection that the client's keeps.
+
+        Raises RpcError and Unreachable.
+        """
+        connection = CONNECTION.get()
+        name = f"http {connection.address}"
+        if method in SILENCING:  # over the own connection, from any client
+            return await self._silence(name, method, params)
+        may_open = partial(self.may_connect, request.remote)
+        line = await connection.link.request(self._daemon, name, method, params, may_open=may_open)
+        return result_of(read_line(line))
 
     async def _silence(self, name: str, method: str, params: bytes) -> Any:
         """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
         read = read_request(request_line(name, method, params))
-        given = read_params(METHODS[method].params, read)
-        given = given.model_copy(update={"client": read.params.get("client") or name})
+        update = {"client": read.params.get("client") or name}
+        given = read_params(METHODS[method].params, read).model_copy(update=update)
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
             result = await self._own.call(method, given, METHODS[method].result)
         return result.model_dump(mode="json")
 
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one browser."""
-        connection = connection_of(request)
+        connection = CONNECTION.get()
         protocols = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
         socket = web.WebSocketResponse(
             protocols=[SUBPROTOCOL],
@@ -293,31 +300,33 @@ class Gateway:
             heartbeat=_HEARTBEAT,
             max_msg_size=MAX_BODY + 1,  # the first that is refused
             timeout=_CLOSE_TIMEOUT,
+            autoclose=False,  # by the bridge
         )
         if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
             raise web.HTTPForbidden(text="too many clients")
-        is_valid = SUBPROTOCOL in map(str.strip, protocols) and not request.can_read_body
-        try:
-            is_valid = is_valid and bool(socket.can_prepare(request))
-        except ValueError:  # of a key that is not ASCII
-            is_valid = False
-        if not (is_valid and connection.upgrade()):
+        if not (
+            request.version == HttpVersion11
+            and SUBPROTOCOL in map(str.strip, protocols)
+            and request.headers.get("Sec-WebSocket-Key", "").isascii()
+            and socket.can_prepare(request)
+            and not request.can_read_body
+            and connection.upgrade()
+        ):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
-        self._sessions.add(request.task)  # before the first await, so that the limit holds
+        self._sessions.add(socket)  # before the first await, so that the limit holds
         try:
             await socket.prepare(request)
             field = self.field if "field" in request.query else None
             await bridge(socket, connection.address, self._daemon, field)
-        except asyncio.CancelledError:  # the gateway ends
-            await socket.close(code=WSCloseCode.SERVICE_RESTART)
-            raise
         finally:
-            self._sessions.discard(request.task)
+            self._sessions.discard(socket)
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:
-        for session in self._sessions:
-            session.cancel()
+        closing = (each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions)
+        with contextlib.suppress(TimeoutError):  # one may not read
+            async with asyncio.timeout(_CLOSE_TIMEOUT):
+                await asyncio.gather(*closing, return_exceptions=True)
 
 
 async def _body(request: web.Request) -> bytes:
@@ -331,8 +340,8 @@ async def _body(request: web.Request) -> bytes:
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
     has_expectation = request.headers.get("Expect", "").lower() == "100-continue"
-    if has_expectation and request.version >= HttpVersion11:
-        connection_of(request).write(b"HTTP/1.1 100 Continue\r\n\r\n")
+    if has_expectation and request.version == HttpVersion11:
+        CONNECTION.get().write(CONTINUE)
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
             body = await request.read()
@@ -342,7 +351,3 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")
     return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
-
-
-async def _unasked(_: web.Request) -> None:
-    """Leave it to the route to ask for a body that the client announces (`Expect`)."""

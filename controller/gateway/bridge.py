@@ -6,7 +6,8 @@ On a WebSocket frames are lines of the API to the daemon, and the other way.
 import asyncio
 import contextlib
 import itertools
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -21,6 +22,7 @@ SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for
 # all of them
 
+_CLOSE_CODES = 5000  # end of their range
 NO_DAEMON = 4001  # one of those for private use; the page connects again
 
 _numbers = itertools.count(1)
@@ -42,9 +44,11 @@ async def bridge(
                 await socket.send_str(link.hello.decode())
                 async with asyncio.TaskGroup() as ways:
                     ways.create_task(_to_daemon(socket, link))
-                    ways.create_task(_to_browser(socket, link))
+                    as_text = partial(socket.send_frame, opcode=WSMsgType.TEXT)
+                    ways.create_task(_to_browser(link.next_line, as_text))
                     if field is not None:
-                        ways.create_task(_draw(socket, field))
+                        next_field = field.frames().__anext__
+                        ways.create_task(_to_browser(next_field, socket.send_bytes))
             finally:
                 await _silence(socket, link)
     except* (RpcError, Unreachable):
@@ -63,6 +67,10 @@ async def _to_daemon(socket: web.WebSocketResponse, link: DaemonLink) -> None:
                 code=WSCloseCode.UNSUPPORTED_DATA, message=b"send text frames of one line"
             )
         await asyncio.sleep(0)  # between two of those that wait others are served
+    code = socket.close_code or 0  # RFC 6455 7.4: one of these is never sent, or not defined
+    is_refused = code == WSCloseCode.ABNORMAL_CLOSURE or code >= _CLOSE_CODES
+    answer = WSCloseCode.PROTOCOL_ERROR if is_refused else WSCloseCode.OK
+    await socket.close(code=answer, drain=False)
     raise ConnectionResetError
 
 
@@ -87,22 +95,15 @@ def _method_of(line: bytes) -> str:
         return ""
 
 
-async def _to_browser(socket: web.WebSocketResponse, link: DaemonLink) -> None:
-    """Pass the daemon's lines on; raises Unreachable, and TimeoutError if one is not read."""
+async def _to_browser(
+    take: Callable[[], Awaitable[bytes]], send: Callable[[bytes], Awaitable[None]]
+) -> None:
+    """Pass the daemon's lines, or pictures, on; raises TimeoutError if one is not read."""
     while True:
-        line = await link.next_line()
+        message = await take()
         async with asyncio.timeout(SEND_TIMEOUT):
-            await socket.send_str(line.decode())
+            await send(message)
         await asyncio.sleep(0)  # of lines that came together none goes to a browser that has left
-
-
-async def _draw(socket: web.WebSocketResponse, field: DrawnField) -> None:
-    """Send the plate's vibration, now and whenever it changes."""
-    frame = None
-    while True:
-        frame = await field.newer_than(frame)
-        async with asyncio.timeout(SEND_TIMEOUT):
-            await socket.send_bytes(frame)
 
 
 MAX_KEPT = 8  # connections; the daemon has 32

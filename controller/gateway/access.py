@@ -51,15 +51,13 @@ class Access:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._scheme = "https" if settings.is_encrypted else "http"
         self._origins = {origin.lower() for origin in settings.origins}
 
     def check(self, request: web.Request) -> None:
         """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
         headers = request.headers
-        host = headers.get("Host", "")
-        origin = ", ".join(headers.getall("Origin", []))
-        own = f"{self._scheme}://{host}".lower()
+        host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
+        own = f"{'https' if self._settings.is_encrypted else 'http'}://{host}".lower()
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
         is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
         for is_refused, error, text in (
@@ -92,30 +90,24 @@ class Access:
             if is_refused:
                 raise error(text=text)
 
-    async def preflight(self, request: web.Request) -> web.Response:
+    async def preflight(self, _: web.Request) -> web.Response:
         """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""
-        if not self._is_elsewhere(request):
-            raise web.HTTPMethodNotAllowed("OPTIONS", ["POST"])
-        return web.Response()
+        return web.Response(headers={"Allow": "OPTIONS, POST"})
 
     async def protect(self, request: web.Request, response: web.StreamResponse) -> None:
         """Add the security headers to a response, and remove the name of the web server."""
         response.headers.update(HEADERS)
         response.headers.pop("Server", None)
-        if self._is_elsewhere(request):
+        if request.headers.get("Origin", "").lower() in self._origins:
             response.headers.update(_CORS)
             response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
-
-    def _is_elsewhere(self, request: web.Request) -> bool:
-        """Whether it comes of a page of another, allowed origin."""
-        return request.headers.get("Origin", "").lower() in self._origins
 
     def _needs_token(self, request: web.Request) -> bool:
         """Whether it needs the token, unlike the page, the OpenAPI description and a preflight."""
         path = request.path
         is_method = path.startswith("/api/") and path != "/api/v1/openapi.json"
-        is_secret = is_method or (path == "/metrics" and not self._settings.is_loopback)
-        return is_secret and request.method != "OPTIONS"
+        is_remote = path == "/metrics" and not self._settings.is_loopback
+        return (is_method or is_remote) and request.method != "OPTIONS"
 
     def _has_token(self, request: web.Request) -> bool:
         tokens = [

@@ -3,11 +3,8 @@
 import asyncio
 import contextlib
 import json
-import math
 import mimetypes
-import operator
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,10 +78,9 @@ def openapi() -> dict[str, Any]:
     """The description, OpenAPI 3.1."""
     params = {method.params for method in HTTP_METHODS.values()}
     results = {method.result for method in HTTP_METHODS.values()} | {ErrorBody}
-    by_name = operator.attrgetter("__name__")
     references, definitions = models_json_schema(
-        [(model, "validation") for model in sorted(params, key=by_name)]
-        + [(model, "serialization") for model in sorted(results, key=by_name)],
+        [(model, "validation") for model in sorted(params, key=repr)]
+        + [(model, "serialization") for model in sorted(results, key=repr)],
         ref_template="#/components/schemas/{model}",
     )
     return {
@@ -150,7 +146,7 @@ _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `app` is the application, `run` to be run beside it."""
+    """State shared by the routes; `field.run` and `keep_connected` are to be run beside `app`."""
 
     def __init__(self, settings: Settings) -> None:
         self.field = DrawnField(settings.socket)
@@ -165,7 +161,7 @@ class Gateway:
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._reading = asyncio.Lock()
-        self._read_at = -math.inf  # s; when the metrics were read
+        self._read_at = float("-inf")  # s; when the metrics were read
         self._exposition = b""
         self._file_permits = asyncio.Semaphore(_MAX_FILES)
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
@@ -184,18 +180,12 @@ class Gateway:
         self.app.on_response_prepare.append(self._access.protect)
         self.app.on_shutdown.append(self._end_sessions)
 
-    async def run(self) -> None:
-        """Keep what it has of the daemon for all browsers, until cancelled."""
-        async with asyncio.TaskGroup() as own:
-            own.create_task(self.field.run())
-            own.create_task(self._keep_connected())
-
     def may_connect(self, host: str | None) -> bool:
         """Whether a client's host may open a connection to the daemon; counts it."""
         return self._rates.of(host).take() and self._rate.take()
 
-    async def _keep_connected(self) -> None:
-        """Connect again after every loss, so that no stop has to wait for it."""
+    async def keep_connected(self) -> None:
+        """Connect to the daemon again after every loss, so that no stop has to wait for it."""
         while True:
             with contextlib.suppress(RpcError, Unreachable):
                 await self._own.next_event()  # it subscribes to none
@@ -233,17 +223,18 @@ class Gateway:
             raise web.HTTPNotFound
         async with self._file_permits:  # of many requests at once some go out in each turn
             await asyncio.sleep(0)
-        media, _ = mimetypes.guess_type(name)
-        return web.Response(body=self._files[name], content_type=media, charset="utf-8")
+        return web.Response(
+            body=self._files[name], content_type=mimetypes.guess_type(name)[0], charset="utf-8"
+        )
 
     async def _metrics(self, _: web.Request) -> web.Response:
         """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
         async with self._reading:
             if time.monotonic() >= self._read_at + _METRICS_TIME:
-                status = None
-                with contextlib.suppress(RpcError, Unreachable):
-                    status = await self._own.status()
-                self._exposition = exposition(status)
+                try:
+                    self._exposition = exposition(await self._own.status())
+                except (RpcError, Unreachable):
+                    self._exposition = exposition(None)
                 self._read_at = time.monotonic()
         return web.Response(body=self._exposition, headers={"Content-Type": CONTENT_TYPE_LATEST})
 
@@ -265,8 +256,10 @@ class Gateway:
                 else problem
             )
             failed = json.loads(error_line(None, error))["error"]
-            content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
-            return web.json_response(content, status=HTTP_STATUS[error.code])
+            return web.json_response(
+                {"error": failed["message"], "code": failed["code"], "data": failed["data"]},
+                status=HTTP_STATUS[error.code],
+            )
 
     async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
         """The daemon's result, over the connection that the client's keeps.
@@ -277,23 +270,26 @@ class Gateway:
         name = f"http {connection.address}"
         if method in SILENCING:  # over the own connection, from any client
             return await self._silence(name, method, params)
-        may_open = partial(self.may_connect, request.remote)
-        line = await connection.link.request(self._daemon, name, method, params, may_open=may_open)
+        line = await connection.link.request(
+            *(self._daemon, name, method, params),
+            may_open=lambda: self.may_connect(request.remote),
+        )
         return result_of(read_line(line))
 
     async def _silence(self, name: str, method: str, params: bytes) -> Any:
         """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
         read = read_request(request_line(name, method, params))
-        update = {"client": read.params.get("client") or name}
-        given = read_params(METHODS[method].params, read).model_copy(update=update)
+        given = read_params(METHODS[method].params, read).model_copy(
+            update={"client": read.params.get("client") or name}
+        )
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
-            result = await self._own.call(method, given, METHODS[method].result)
-        return result.model_dump(mode="json")
+            return (await self._own.call(method, given, METHODS[method].result)).model_dump(
+                mode="json"
+            )
 
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one browser."""
         connection = CONNECTION.get()
-        protocols = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
         socket = web.WebSocketResponse(
             protocols=[SUBPROTOCOL],
             compress=False,  # no decompression bombs
@@ -306,7 +302,8 @@ class Gateway:
             raise web.HTTPForbidden(text="too many clients")
         if not (
             request.version == HttpVersion11
-            and SUBPROTOCOL in map(str.strip, protocols)
+            and SUBPROTOCOL
+            in map(str.strip, request.headers.get("Sec-WebSocket-Protocol", "").split(","))
             and request.headers.get("Sec-WebSocket-Key", "").isascii()
             and socket.can_prepare(request)
             and not request.can_read_body
@@ -316,17 +313,21 @@ class Gateway:
         self._sessions.add(socket)  # before the first await, so that the limit holds
         try:
             await socket.prepare(request)
-            field = self.field if "field" in request.query else None
-            await bridge(socket, connection.address, self._daemon, field)
+            await bridge(
+                *(socket, connection.address, self._daemon),
+                field=self.field if "field" in request.query else None,
+            )
         finally:
             self._sessions.discard(socket)
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:
-        closing = (each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions)
         with contextlib.suppress(TimeoutError):  # one may not read
             async with asyncio.timeout(_CLOSE_TIMEOUT):
-                await asyncio.gather(*closing, return_exceptions=True)
+                await asyncio.gather(
+                    *(each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions),
+                    return_exceptions=True,
+                )
 
 
 async def _body(request: web.Request) -> bytes:
@@ -339,14 +340,11 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
-    has_expectation = request.headers.get("Expect", "").lower() == "100-continue"
-    if has_expectation and request.version == HttpVersion11:
+    if "Expect" in request.headers and request.version == HttpVersion11:
         CONNECTION.get().write(CONTINUE)
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
             body = await request.read()
-    except web.RequestPayloadError as error:
-        raise web.HTTPBadRequest(text="the body is not valid HTTP/1.1") from error
     except TimeoutError as error:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")

@@ -10,6 +10,7 @@ import socket
 import ssl
 from collections.abc import Callable, Hashable
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from typing import Any
 
 from controller.gateway.access import HEADERS
@@ -39,17 +40,19 @@ _END_OF_HEAD = b"\r\n\r\n"
 _PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 
 
+@dataclass
 class Deadlines:
     """What has to happen within a time, in a bounded number: the oldest expires for a new one."""
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = {}
+    limit: int
+    _all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = field(
+        default_factory=dict
+    )
 
     def start(self, key: Hashable, expire: Callable[[], object]) -> None:
         """Start the time of something, anew if it runs already; expire: called at its end."""
         self.cancel(key)
-        if len(self._all) >= self._limit:
+        if len(self._all) >= self.limit:
             oldest, (expire_oldest, _) = next(iter(self._all.items()))
             self.cancel(oldest)
             expire_oldest()
@@ -93,14 +96,12 @@ class ClientConnection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand data on, unless they are frames that are not allowed."""
-        if self.is_refused:
-            return
         self._received = (self._received + data)[:_MAX_UPGRADE]
-        if self._frames is None or self._frames.accept(data):
-            self._server.data_received(data)
-        else:
+        if self._frames is not None and not self._frames.accept(data):
             self._transport.write(_PROTOCOL_ERROR)
             self._transport.abort()  # after a flood it might not be read
+        elif not self.is_refused:
+            self._server.data_received(data)
 
     def pause_writing(self) -> None:
         """Start the time for reading."""
@@ -163,8 +164,7 @@ class ClientConnection(asyncio.Protocol):
 
     def upgrade(self) -> bool:
         """Expect frames, unless some came too early, before this was accepted; whether it does."""
-        is_head_alone = self._received.split(_END_OF_HEAD)[1:] == [b""]
-        if is_head_alone and len(self._received) < _MAX_UPGRADE:
+        if self._received.split(_END_OF_HEAD)[1:] == [b""] and len(self._received) < _MAX_UPGRADE:
             self._frames = FrameHeads()
         return self._frames is not None
 
@@ -173,21 +173,19 @@ CONNECTION: ContextVar[ClientConnection] = ContextVar("CONNECTION")
 """The connection that a request came by, also after its end."""
 
 
+@dataclass
 class Acceptor:
     """Accepts connections of a listening socket for a web server.
 
     make_server: makes the web server's protocol of a connection; tls: None without.
     """
 
-    def __init__(
-        self, make_server: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None
-    ) -> None:
-        self.links: set[KeptLink] = set()
-        self.idle = Deadlines(MAX_WAITING)
-        self.unread = Deadlines(MAX_WAITING)
-        self._handshakes = Deadlines(MAX_HANDSHAKES)
-        self.make_server = make_server
-        self._tls = tls
+    make_server: Callable[[], asyncio.Protocol]
+    tls: ssl.SSLContext | None
+    links: set[KeptLink] = field(default_factory=set)
+    idle: Deadlines = field(default_factory=lambda: Deadlines(MAX_WAITING))
+    unread: Deadlines = field(default_factory=lambda: Deadlines(MAX_WAITING))
+    _handshakes: Deadlines = field(default_factory=lambda: Deadlines(MAX_HANDSHAKES))
 
     async def run(self, listening: socket.socket) -> None:
         """Accept connections until cancelled."""
@@ -204,7 +202,7 @@ class Acceptor:
     async def _admit(self, accepted: socket.socket) -> None:
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: ClientConnection(self), accepted, ssl=self._tls
+                lambda: ClientConnection(self), accepted, ssl=self.tls
             )
         except (OSError, asyncio.CancelledError):
             accepted.close()

@@ -1,7 +1,6 @@
 """The plate's vibration for drawing, as the daemon reports that it plays."""
 
 import asyncio
-import cmath
 import json
 import logging
 import math
@@ -42,10 +41,9 @@ class FieldSolver:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
-        longer = max(rig.plate.length, rig.plate.width)
+        sides = rig.plate.length, rig.plate.width
         self.columns, self.rows = (
-            max(2, math.ceil(_COLUMNS * side / longer))
-            for side in (rig.plate.length, rig.plate.width)
+            max(2, math.ceil(_COLUMNS * each / max(sides))) for each in sides
         )
         self._points = lattice(
             np.linspace(0, rig.plate.length, self.columns),
@@ -68,18 +66,24 @@ class FieldSolver:
         )
         for number, drive in sorted(layers.items()):
             for name, tone in drive.items():
-                weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
+                weight = tone.level * np.exp(1j * math.radians(tone.phase_deg))
                 response = self._response(tone.frequency_hz)[names.index(name)]
                 fields[number, tone.frequency_hz] += weight * response
         parts = np.array([*fields.values()], complex).view(float)  # real, imaginary, real, ...
         scale = float(np.abs(parts).max(initial=0.0))
-        whole = np.rint(parts / (scale or 1.0) * _FULL_SCALE).astype("<i2")
         frequencies = np.array([frequency for _, frequency in fields])
-        thresholds = detection_threshold(frequencies, self._rig.threshold)
-        sizes = np.array([self.columns, self.rows, len(fields), 0], dtype="<u2")
-        numbers = np.array([scale, *frequencies, *thresholds], dtype="<f4")
-        of_layer = np.array([number for number, _ in fields], dtype="<u2")
-        return b"".join(each.tobytes() for each in (sizes, numbers, of_layer, whole))
+        return b"".join(
+            np.array(numbers).astype(type_).tobytes()
+            for numbers, type_ in (
+                ([self.columns, self.rows, len(fields), 0], "<u2"),
+                (
+                    [scale, *frequencies, *detection_threshold(frequencies, self._rig.threshold)],
+                    "<f4",
+                ),
+                ([number for number, _ in fields], "<u2"),
+                (np.rint(parts / (scale or 1.0) * _FULL_SCALE), "<i2"),
+            )
+        )
 
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""

@@ -1,6 +1,7 @@
 """The daemon's status as Prometheus metrics."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, TypeAlias, get_args
 
@@ -52,21 +53,22 @@ _LINK_COUNTERS = {
 }
 
 
+@dataclass
 class _Metrics(Collector):
     """Metrics of one status."""
 
-    def __init__(self, status: StatusResult | None) -> None:
-        self._status = status
+    status: StatusResult | None
 
     def collect(self) -> Iterator[Metric]:
         """All of which a value is known."""
-        is_up = float(self._status is not None)
-        yield GaugeMetricFamily("era_up", "Whether the daemon responds.", value=is_up)
-        if self._status is None:
+        yield GaugeMetricFamily(
+            "era_up", "Whether the daemon responds.", value=float(self.status is not None)
+        )
+        if self.status is None:
             return
         for kind, rows in (
-            (GaugeMetricFamily, _gauges(self._status)),
-            (CounterMetricFamily, _counters(self._status)),
+            (GaugeMetricFamily, _gauges(self.status)),
+            (CounterMetricFamily, _counters(self.status)),
         ):
             for name, text, values, labels in rows:
                 family = kind(f"era_{name}", text, labels=labels)
@@ -75,7 +77,7 @@ class _Metrics(Collector):
                         family.add_metric(key, float(value))
                 if family.samples:
                     yield family
-        for name, text, latency in _histograms(self._status):
+        for name, text, latency in _histograms(self.status):
             if latency is not None:
                 yield _histogram(f"era_{name}_seconds", text, latency)
 

@@ -140,12 +140,9 @@ def read_token(path: Path) -> str:
     return content.decode().strip()
 
 
-_LIBRARIES = ("aiohttp", "prometheus_client")
-
-
 def require_gateway() -> None:
     """Raise InputError if a library of the gateway is missing."""
-    for name in _LIBRARIES:
+    for name in ("aiohttp", "prometheus_client"):
         if find_spec(name) is None:
             raise InputError(
                 f"the gateway needs {name}, which is not installed; "

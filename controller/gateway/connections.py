@@ -130,6 +130,7 @@ class ClientConnection(asyncio.Protocol):
             self._transport.write(data)
         elif data != CONTINUE and not self._transport.is_closing():
             self._transport.write(_MALFORMED)
+            self.is_refused = False
             self.close()
 
     def writelines(self, parts: list[bytes]) -> None:

@@ -211,6 +211,7 @@ class Gateway:
         connection.is_refused = not request.content.is_eof()
         if connection.is_refused:
             response.force_close()
+            connection.resume_reading()
         await response.prepare(request)
         await response.write_eof()
         connection.end_response()

@@ -23,7 +23,6 @@ _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
 _SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
 _RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
-_READ = 1 << 12  # bytes of a body that are kept before it is read
 _QUEUE = 512  # connections that wait to be accepted
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
@@ -48,7 +47,7 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         max_field_size=_MAX_LINE,
         max_headers=_MAX_LINES,
         lingering_time=0,  # the connections'
-        read_bufsize=_READ,
+        read_bufsize=1 << 12,  # bytes of a body that wait to be read
         keepalive_timeout=2 * CLIENT_TIMEOUT,  # the acceptor's comes first
         shutdown_timeout=_SHUTDOWN_TIMEOUT,
     )

@@ -214,6 +214,17 @@ def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: 
     assert response.headers.startswith("HTTP/1.")
 
 
+@pytest.mark.parametrize("body", [b" " * 5_000_000, b"1\r\n \r\n" * 500_000])
+def test_refusal_is_read_after_the_whole_body_is_sent(gateway: GatewayProcess, body: bytes) -> None:
+    """By a client that reads only then: sized or in chunks, the body is discarded meanwhile."""
+    head = filled(CHUNKED, gateway)
+    if body.startswith(b" "):
+        head = head.replace(b"Transfer-Encoding: chunked", b"Content-Length: 5000001")
+    with gateway.connect() as connection:
+        connection.sendall(head + body)
+        assert connection.recv(1 << 16)[9:12] in (b"411", b"413")
+
+
 LENGTH = b"Content-Length: %d" % len(ARM)
 AMBIGUOUS = {
     "line feeds alone": GRANTED.replace(b"\r\n", b"\n"),

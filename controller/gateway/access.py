@@ -7,12 +7,13 @@ token stops other users of the machine.
 import hmac
 import re
 
-from aiohttp import web
+from aiohttp import HttpVersion10, HttpVersion11, web
 
 from controller.gateway.settings import Settings
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
+VERSIONS = (HttpVersion10, HttpVersion11)
 _PORT = re.compile(r":[0-9]+\Z")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
@@ -50,61 +51,63 @@ class Access:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._scheme = "https" if settings.is_encrypted else "http"
         self._origins = {origin.lower() for origin in settings.origins}
 
     def check(self, request: web.Request) -> None:
         """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
         headers = request.headers
-        # Routes would take an escaped line feed for another path, and ignore the host in a URL.
-        if _CONTROL.search(request.path) or not request.raw_path.startswith("/"):
-            raise web.HTTPBadRequest(text="the target must be a path without control characters")
-        hosts = headers.getall("Host", [])
-        if len(hosts) != 1 or not self._is_allowed_host(hosts[0]):
-            raise web.HTTPMisdirectedRequest(text="this Host is not allowed; see --allow-host")
-        origins = headers.getall("Origin", [])
-        if origins and not self._is_allowed_origin(origins, hosts[0]):
-            raise web.HTTPForbidden(text="this Origin is not allowed; see --allow-origin")
+        host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
+        own = f"{'https' if self._settings.is_encrypted else 'http'}://{host}".lower()
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
-        if headers.get("Sec-Fetch-Site") == "cross-site" and not (origins or is_link):
-            raise web.HTTPForbidden(text="cross-site requests are not allowed")
-        is_effective = request.method != "OPTIONS"
-        if is_effective and self._needs_token(request.path) and not self._has_token(request):
-            raise web.HTTPUnauthorized(
-                text="the token is missing or wrong; open the URL that the gateway printed"
-            )
+        is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
+        for is_refused, error, text in (
+            (request.version not in VERSIONS, web.HTTPVersionNotSupported, "use HTTP/1.1"),
+            # Small chunks would take the time of others.
+            ("Transfer-Encoding" in headers, web.HTTPLengthRequired, "send a Content-Length"),
+            # Routes would take an escaped line feed for another path, and ignore the host in a URL.
+            (
+                _CONTROL.search(request.path) or not request.raw_path.startswith("/"),
+                web.HTTPBadRequest,
+                "the target must be a path without control characters",
+            ),
+            (
+                _PORT.sub("", host).lower() not in self._settings.allowed_names,  # with any port
+                web.HTTPMisdirectedRequest,
+                "this Host is not allowed; see --allow-host",
+            ),
+            (
+                "Origin" in headers and origin.lower() not in {own, *self._origins},
+                web.HTTPForbidden,
+                "this Origin is not allowed; see --allow-origin",
+            ),
+            (is_embedded, web.HTTPForbidden, "cross-site requests are not allowed"),
+            (
+                self._needs_token(request) and not self._has_token(request),
+                web.HTTPUnauthorized,
+                "the token is missing or wrong; open the URL that the gateway printed",
+            ),
+        ):
+            if is_refused:
+                raise error(text=text)
 
-    async def preflight(self, request: web.Request) -> web.Response:
+    async def preflight(self, _: web.Request) -> web.Response:
         """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""
-        if not self._is_elsewhere(request):
-            raise web.HTTPMethodNotAllowed("OPTIONS", ["POST"])
-        return web.Response()
+        return web.Response(headers={"Allow": "OPTIONS, POST"})
 
     async def protect(self, request: web.Request, response: web.StreamResponse) -> None:
         """Add the security headers to a response, and remove the name of the web server."""
         response.headers.update(HEADERS)
         response.headers.pop("Server", None)
-        if self._is_elsewhere(request):
+        if request.headers.get("Origin", "").lower() in self._origins:
             response.headers.update(_CORS)
             response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
 
-    def _is_elsewhere(self, request: web.Request) -> bool:
-        """Whether it comes of a page of another, allowed origin."""
-        return request.headers.get("Origin", "").lower() in self._origins
-
-    def _is_allowed_host(self, host: str) -> bool:
-        """Whether a Host header names this gateway, with any port (a proxy may have another)."""
-        return _PORT.sub("", host).lower() in self._settings.allowed_names
-
-    def _is_allowed_origin(self, origins: list[str], host: str) -> bool:
-        """Whether an Origin is the gateway's own or an allowed one."""
-        own = f"{self._scheme}://{host}".lower()
-        return len(origins) == 1 and origins[0].lower() in {own, *self._origins}
-
-    def _needs_token(self, path: str) -> bool:
-        """Whether a path needs the token, unlike the page and the OpenAPI description."""
+    def _needs_token(self, request: web.Request) -> bool:
+        """Whether it needs the token, unlike the page, the OpenAPI description and a preflight."""
+        path = request.path
         is_method = path.startswith("/api/") and path != "/api/v1/openapi.json"
-        return is_method or (path == "/metrics" and not self._settings.is_loopback)
+        is_remote = path == "/metrics" and not self._settings.is_loopback
+        return (is_method or is_remote) and request.method != "OPTIONS"
 
     def _has_token(self, request: web.Request) -> bool:
         tokens = [

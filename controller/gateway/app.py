@@ -3,11 +3,8 @@
 import asyncio
 import contextlib
 import json
-import math
 import mimetypes
-import operator
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +31,9 @@ from controller.api.methods import Method
 from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
-from controller.gateway.access import SUBPROTOCOL, Access
+from controller.gateway.access import SUBPROTOCOL, VERSIONS, Access
 from controller.gateway.bridge import bridge
-from controller.gateway.connections import CLIENT_TIMEOUT, connection_of
+from controller.gateway.connections import CLIENT_TIMEOUT, CONNECTION, CONTINUE
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -82,10 +79,9 @@ def openapi() -> dict[str, Any]:
     """The description, OpenAPI 3.1."""
     params = {method.params for method in HTTP_METHODS.values()}
     results = {method.result for method in HTTP_METHODS.values()} | {ErrorBody}
-    by_name = operator.attrgetter("__name__")
     references, definitions = models_json_schema(
-        [(model, "validation") for model in sorted(params, key=by_name)]
-        + [(model, "serialization") for model in sorted(results, key=by_name)],
+        [(model, "validation") for model in sorted(params, key=repr)]
+        + [(model, "serialization") for model in sorted(results, key=repr)],
         ref_template="#/components/schemas/{model}",
     )
     return {
@@ -145,19 +141,19 @@ MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewe
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 _HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
-_CLOSE_TIMEOUT = 1.0  # s; for a browser to close its side
+_CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
 _MAX_FILES = 4  # in one turn of the event loop
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `app` is the application, `run` to be run beside it."""
+    """State shared by the routes; `field.run` and `keep_connected` are to be run beside `app`."""
 
     def __init__(self, settings: Settings) -> None:
         self.field = DrawnField(settings.socket)
         self._access = Access(settings)
         self._daemon = settings.socket
-        self._sessions: set[asyncio.Task[None]] = set()
+        self._sessions: set[web.WebSocketResponse] = set()
         self._places = asyncio.Semaphore(MAX_REQUESTS)
         # Of connections to the daemon, by host.
         self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
@@ -166,7 +162,7 @@ class Gateway:
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._reading = asyncio.Lock()
-        self._read_at = -math.inf  # s; when the metrics were read
+        self._read_at = float("-inf")  # s; when the metrics were read
         self._exposition = b""
         self._file_permits = asyncio.Semaphore(_MAX_FILES)
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
@@ -175,9 +171,9 @@ class Gateway:
         self.app.add_routes(
             [
                 web.get("/api/v1/{file:openapi.json}", self._file),
-                web.get("/api/v1/ws", self._serve),
+                web.get("/api/v1/ws", self._serve, allow_head=False),
                 web.options("/api/v1/{method}", self._access.preflight),
-                web.post("/api/v1/{method}", self._call, expect_handler=_unasked),
+                web.post("/api/v1/{method}", self._call),
                 web.get("/metrics", self._metrics),
                 web.get("/{file:[^/]*}", self._file),
             ]
@@ -185,18 +181,12 @@ class Gateway:
         self.app.on_response_prepare.append(self._access.protect)
         self.app.on_shutdown.append(self._end_sessions)
 
-    async def run(self) -> None:
-        """Keep what it has of the daemon for all browsers, until cancelled."""
-        async with asyncio.TaskGroup() as own:
-            own.create_task(self.field.run())
-            own.create_task(self._keep_connected())
-
     def may_connect(self, host: str | None) -> bool:
         """Whether a client's host may open a connection to the daemon; counts it."""
         return self._rates.of(host).take() and self._rate.take()
 
-    async def _keep_connected(self) -> None:
-        """Connect again after every loss, so that no stop has to wait for it."""
+    async def keep_connected(self) -> None:
+        """Connect to the daemon again after every loss, so that no stop has to wait for it."""
         while True:
             with contextlib.suppress(RpcError, Unreachable):
                 await self._own.next_event()  # it subscribes to none
@@ -207,8 +197,8 @@ class Gateway:
 
         A client may have left meanwhile: its stop is carried out all the same.
         """
-        connection = None if request.transport is None else connection_of(request)
-        if connection is not None:
+        connection = CONNECTION.get()
+        if request.version in VERSIONS:  # else it is answered as what is no HTTP
             connection.start_response()
         try:
             self._access.check(request)
@@ -219,10 +209,13 @@ class Gateway:
                 status=403 if "Upgrade" in request.headers else error.status,
                 headers=[each for each in error.headers.items() if each[0] == "Allow"],
             )
+        connection.is_refused = not request.content.is_eof()
+        if connection.is_refused:
+            response.force_close()
+            connection.resume_reading()
         await response.prepare(request)
         await response.write_eof()
-        if connection is not None:
-            connection.end_response()
+        connection.end_response()
         return response
 
     async def _file(self, request: web.Request) -> web.Response:
@@ -232,17 +225,18 @@ class Gateway:
             raise web.HTTPNotFound
         async with self._file_permits:  # of many requests at once some go out in each turn
             await asyncio.sleep(0)
-        media, _ = mimetypes.guess_type(name)
-        return web.Response(body=self._files[name], content_type=media, charset="utf-8")
+        return web.Response(
+            body=self._files[name], content_type=mimetypes.guess_type(name)[0], charset="utf-8"
+        )
 
     async def _metrics(self, _: web.Request) -> web.Response:
         """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
         async with self._reading:
             if time.monotonic() >= self._read_at + _METRICS_TIME:
-                status = None
-                with contextlib.suppress(RpcError, Unreachable):
-                    status = await self._own.status()
-                self._exposition = exposition(status)
+                try:
+                    self._exposition = exposition(await self._own.status())
+                except (RpcError, Unreachable):
+                    self._exposition = exposition(None)
                 self._read_at = time.monotonic()
         return web.Response(body=self._exposition, headers={"Content-Type": CONTENT_TYPE_LATEST})
 
@@ -257,68 +251,85 @@ class Gateway:
             async with self._places:
                 result = await self._request(request, method, await _body(request))
             return web.json_response(result)
-        except RpcError as error:
+        except (RpcError, Unreachable) as problem:
+            error = (
+                RpcError(ErrorCode.LINK, str(problem))
+                if isinstance(problem, Unreachable)
+                else problem
+            )
             failed = json.loads(error_line(None, error))["error"]
-            content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
-            return web.json_response(content, status=HTTP_STATUS[error.code])
+            return web.json_response(
+                {"error": failed["message"], "code": failed["code"], "data": failed["data"]},
+                status=HTTP_STATUS[error.code],
+            )
 
     async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
-        """The daemon's result, over the connection that this one keeps; raises RpcError."""
-        name = f"http {getattr(request.transport, 'address', request.remote)}"
-        try:
-            if method in SILENCING:  # over the own connection, from any client
-                return await self._silence(name, method, params)
-            may_open = partial(self.may_connect, request.remote)
-            kept = connection_of(request).link
-            line = await kept.request(self._daemon, name, method, params, may_open=may_open)
-            return result_of(read_line(line))
-        except Unreachable as error:
-            raise RpcError(ErrorCode.LINK, str(error)) from error
+        """The daemon's result, over the connection that the client's keeps.
+
+        Raises RpcError and Unreachable.
+        """
+        connection = CONNECTION.get()
+        name = f"http {connection.address}"
+        if method in SILENCING:  # over the own connection, from any client
+            return await self._silence(name, method, params)
+        line = await connection.link.request(
+            *(self._daemon, name, method, params),
+            may_open=lambda: self.may_connect(request.remote),
+        )
+        return result_of(read_line(line))
 
     async def _silence(self, name: str, method: str, params: bytes) -> Any:
         """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
         read = read_request(request_line(name, method, params))
-        given = read_params(METHODS[method].params, read)
-        given = given.model_copy(update={"client": read.params.get("client") or name})
+        given = read_params(METHODS[method].params, read).model_copy(
+            update={"client": read.params.get("client") or name}
+        )
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
-            result = await self._own.call(method, given, METHODS[method].result)
-        return result.model_dump(mode="json")
+            return (await self._own.call(method, given, METHODS[method].result)).model_dump(
+                mode="json"
+            )
 
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one browser."""
-        connection = connection_of(request)
-        protocols = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
+        connection = CONNECTION.get()
         socket = web.WebSocketResponse(
             protocols=[SUBPROTOCOL],
             compress=False,  # no decompression bombs
             heartbeat=_HEARTBEAT,
             max_msg_size=MAX_BODY + 1,  # the first that is refused
             timeout=_CLOSE_TIMEOUT,
+            autoclose=False,  # by the bridge
         )
         if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
             raise web.HTTPForbidden(text="too many clients")
-        is_valid = SUBPROTOCOL in map(str.strip, protocols) and not request.can_read_body
-        try:
-            is_valid = is_valid and bool(socket.can_prepare(request))
-        except ValueError:  # of a key that is not ASCII
-            is_valid = False
-        if not (is_valid and connection.upgrade()):
+        if not (
+            request.version == HttpVersion11
+            and SUBPROTOCOL
+            in map(str.strip, request.headers.get("Sec-WebSocket-Protocol", "").split(","))
+            and request.headers.get("Sec-WebSocket-Key", "").isascii()
+            and socket.can_prepare(request)
+            and not request.can_read_body
+            and connection.upgrade()
+        ):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
-        self._sessions.add(request.task)  # before the first await, so that the limit holds
+        self._sessions.add(socket)  # before the first await, so that the limit holds
         try:
             await socket.prepare(request)
-            field = self.field if "field" in request.query else None
-            await bridge(socket, connection.address, self._daemon, field)
-        except asyncio.CancelledError:  # the gateway ends
-            await socket.close(code=WSCloseCode.SERVICE_RESTART)
-            raise
+            await bridge(
+                *(socket, connection.address, self._daemon),
+                field=self.field if "field" in request.query else None,
+            )
         finally:
-            self._sessions.discard(request.task)
+            self._sessions.discard(socket)
         return socket
 
     async def _end_sessions(self, _: web.Application) -> None:
-        for session in self._sessions:
-            session.cancel()
+        with contextlib.suppress(TimeoutError):  # one may not read
+            async with asyncio.timeout(_CLOSE_TIMEOUT):
+                await asyncio.gather(
+                    *(each.close(code=WSCloseCode.SERVICE_RESTART) for each in self._sessions),
+                    return_exceptions=True,
+                )
 
 
 async def _body(request: web.Request) -> bytes:
@@ -331,19 +342,12 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
-    has_expectation = request.headers.get("Expect", "").lower() == "100-continue"
-    if has_expectation and request.version >= HttpVersion11:
-        connection_of(request).write(b"HTTP/1.1 100 Continue\r\n\r\n")
+    if "Expect" in request.headers and request.version == HttpVersion11:
+        CONNECTION.get().write(CONTINUE)
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
             body = await request.read()
-    except web.RequestPayloadError as error:
-        raise web.HTTPBadRequest(text="the body is not valid HTTP/1.1") from error
     except TimeoutError as error:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")
     return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
-
-
-async def _unasked(_: web.Request) -> None:
-    """Leave it to the route to ask for a body that the client announces (`Expect`)."""

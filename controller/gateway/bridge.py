@@ -6,7 +6,9 @@ On a WebSocket frames are lines of the API to the daemon, and the other way.
 import asyncio
 import contextlib
 import itertools
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -21,6 +23,8 @@ SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for
 # all of them
 
+_INVALID_CODES = (WSCloseCode.ABNORMAL_CLOSURE, *range(5000, 1 << 16))  # of those that aiohttp
+# takes; RFC 6455 7.4: the first is never sent, and the others are not defined
 NO_DAEMON = 4001  # one of those for private use; the page connects again
 
 _numbers = itertools.count(1)
@@ -42,9 +46,13 @@ async def bridge(
                 await socket.send_str(link.hello.decode())
                 async with asyncio.TaskGroup() as ways:
                     ways.create_task(_to_daemon(socket, link))
-                    ways.create_task(_to_browser(socket, link))
+                    ways.create_task(
+                        _to_browser(
+                            link.next_line, partial(socket.send_frame, opcode=WSMsgType.TEXT)
+                        )
+                    )
                     if field is not None:
-                        ways.create_task(_draw(socket, field))
+                        ways.create_task(_to_browser(field.frames().__anext__, socket.send_bytes))
             finally:
                 await _silence(socket, link)
     except* (RpcError, Unreachable):
@@ -63,6 +71,10 @@ async def _to_daemon(socket: web.WebSocketResponse, link: DaemonLink) -> None:
                 code=WSCloseCode.UNSUPPORTED_DATA, message=b"send text frames of one line"
             )
         await asyncio.sleep(0)  # between two of those that wait others are served
+    is_invalid = socket.close_code in _INVALID_CODES
+    await socket.close(
+        code=WSCloseCode.PROTOCOL_ERROR if is_invalid else WSCloseCode.OK, drain=False
+    )
     raise ConnectionResetError
 
 
@@ -74,50 +86,38 @@ async def _silence(socket: web.WebSocketResponse, link: DaemonLink) -> None:
         async with asyncio.timeout(_LAST_FRAME) as limit:
             async for message in socket:
                 line = message.data.encode() if message.type is WSMsgType.TEXT else b""
-                if link.is_open and b"\n" not in line and _method_of(line) in SILENCING:
-                    link.write(line + b"\n")
+                with contextlib.suppress(RpcError):
+                    is_whole = link.is_open and b"\n" not in line
+                    if is_whole and read_request(line).method in SILENCING:
+                        link.write(line + b"\n")
                 await asyncio.sleep(0)
                 limit.reschedule(min(end, loop.time() + _LAST_FRAME))
 
 
-def _method_of(line: bytes) -> str:
-    try:
-        return read_request(line).method
-    except RpcError:
-        return ""
-
-
-async def _to_browser(socket: web.WebSocketResponse, link: DaemonLink) -> None:
-    """Pass the daemon's lines on; raises Unreachable, and TimeoutError if one is not read."""
+async def _to_browser(
+    take: Callable[[], Awaitable[bytes]], send: Callable[[bytes], Awaitable[None]]
+) -> None:
+    """Pass the daemon's lines, or pictures, on; raises TimeoutError if one is not read."""
     while True:
-        line = await link.next_line()
+        message = await take()
         async with asyncio.timeout(SEND_TIMEOUT):
-            await socket.send_str(line.decode())
+            await send(message)
         await asyncio.sleep(0)  # of lines that came together none goes to a browser that has left
-
-
-async def _draw(socket: web.WebSocketResponse, field: DrawnField) -> None:
-    """Send the plate's vibration, now and whenever it changes."""
-    frame = None
-    while True:
-        frame = await field.newer_than(frame)
-        async with asyncio.timeout(SEND_TIMEOUT):
-            await socket.send_bytes(frame)
 
 
 MAX_KEPT = 8  # connections; the daemon has 32
 
 
+@dataclass(eq=False)
 class KeptLink:
     """The connection to the daemon that an HTTP connection keeps, from its first request on.
 
     kept: those of all HTTP connections, which leave places of the daemon to others.
     """
 
-    def __init__(self, kept: "set[KeptLink]") -> None:
-        self._kept = kept
-        self._link: DaemonLink | None = None
-        self._is_over = False
+    kept: "set[KeptLink]"
+    _link: DaemonLink | None = None
+    _is_over: bool = False
 
     @property
     def is_open(self) -> bool:
@@ -134,22 +134,21 @@ class KeptLink:
         """
         try:
             if self._link is None or not self._link.is_open:
-                if len(self._kept - {self}) >= MAX_KEPT or not may_open():
+                if len(self.kept - {self}) >= MAX_KEPT or not may_open():
                     raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
-                self._kept.add(self)
+                self.kept.add(self)
                 self._link = await DaemonLink.open(path, name)
             if self._is_over:  # sent all the same
                 asyncio.get_running_loop().call_soon(self.close)
             return await self._link.request(method, params, id=name)
         finally:
             if not self.is_open:
-                self._kept.discard(self)
+                self.kept.discard(self)
 
     def close(self) -> None:
         """Close it: the HTTP connection is over."""
         self._is_over = True
-        if self._link is None:  # it may be on its way to the daemon, and has its place until then
-            return
-        self._kept.discard(self)
-        if self._link.is_open:
-            self._link.close()
+        if self._link is not None:  # else it may be on its way, and has its place until then
+            self.kept.discard(self)
+            if self._link.is_open:
+                self._link.close()

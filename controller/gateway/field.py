@@ -1,17 +1,18 @@
 """The plate's vibration for drawing, as the daemon reports that it plays."""
 
 import asyncio
-import cmath
 import json
 import logging
 import math
-import threading
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import AsyncIterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from controller.api.client_protocol import Notification, read_line, result_of
 from controller.api.jsonrpc import request_line
@@ -29,6 +30,7 @@ _FULL_SCALE = 32767
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no fields, scale 0
 _RETRY_INTERVAL = 0.5  # s; of connecting to the daemon
 _TOPICS = b'{"topics":["pattern","silence"]}'
+_LAYERS = TypeAdapter(dict[int, dict[str, PlayedTone]])
 
 _logger = logging.getLogger(__name__)
 
@@ -39,10 +41,9 @@ class FieldSolver:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
-        longer = max(rig.plate.length, rig.plate.width)
+        sides = rig.plate.length, rig.plate.width
         self.columns, self.rows = (
-            max(2, math.ceil(_COLUMNS * side / longer))
-            for side in (rig.plate.length, rig.plate.width)
+            max(2, math.ceil(_COLUMNS * each / max(sides))) for each in sides
         )
         self._points = lattice(
             np.linspace(0, rig.plate.length, self.columns),
@@ -60,23 +61,29 @@ class FieldSolver:
         InputError.
         """
         names = [era.name for era in self._rig.eras]
-        fields: dict[tuple[int, float], ComplexArray] = {}
+        fields: defaultdict[tuple[int, float], ComplexArray] = defaultdict(
+            lambda: np.zeros(self.rows * self.columns, complex)
+        )
         for number, drive in sorted(layers.items()):
             for name, tone in drive.items():
-                weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
-                moved = weight * self._response(tone.frequency_hz)[names.index(name)]
-                place = number, tone.frequency_hz
-                fields[place] = fields[place] + moved if place in fields else moved
-        amplitude = np.array([*fields.values()]).reshape(len(fields), self.rows * self.columns)
-        parts = np.stack([amplitude.real, amplitude.imag], axis=-1)
+                weight = tone.level * np.exp(1j * math.radians(tone.phase_deg))
+                response = self._response(tone.frequency_hz)[names.index(name)]
+                fields[number, tone.frequency_hz] += weight * response
+        parts = np.array([*fields.values()], complex).view(float)  # real, imaginary, real, ...
         scale = float(np.abs(parts).max(initial=0.0))
-        whole = np.rint(parts / (scale or 1.0) * _FULL_SCALE).astype("<i2")
         frequencies = np.array([frequency for _, frequency in fields])
-        thresholds = detection_threshold(frequencies, self._rig.threshold)
-        sizes = np.array([self.columns, self.rows, len(fields), 0], dtype="<u2")
-        numbers = np.array([scale, *frequencies, *thresholds], dtype="<f4")
-        of_layer = np.array([number for number, _ in fields], dtype="<u2")
-        return b"".join(each.tobytes() for each in (sizes, numbers, of_layer, whole))
+        return b"".join(
+            np.array(numbers).astype(type_).tobytes()
+            for numbers, type_ in (
+                ([self.columns, self.rows, len(fields), 0], "<u2"),
+                (
+                    [scale, *frequencies, *detection_threshold(frequencies, self._rig.threshold)],
+                    "<f4",
+                ),
+                ([number for number, _ in fields], "<u2"),
+                (np.rint(parts / (scale or 1.0) * _FULL_SCALE), "<i2"),
+            )
+        )
 
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
@@ -96,27 +103,29 @@ class DrawnField:
         self._daemon = daemon
         self._frame = _NO_FIELD
         self._changed = asyncio.Event()
-        self._due = threading.Event()
+        self._due = asyncio.Event()
         self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and drives by layer
+        self._solver = lru_cache(1)(lambda text: FieldSolver(parse_rig("the daemon's rig", text)))
         self._problem = ""
 
-    async def newer_than(self, frame: bytes | None) -> bytes:
-        """Wait for another frame than one, which is the current one at once for None."""
-        while self._frame is frame:
-            await self._changed.wait()
-        return self._frame
+    async def frames(self) -> AsyncIterator[bytes]:
+        """Yield the current frame, and then the newest whenever it changes."""
+        while True:
+            changed = self._changed
+            yield self._frame
+            await changed.wait()
 
     async def run(self) -> None:
         """Follow the daemon at the socket, and connect again after a loss, until cancelled."""
-        draw = threading.Thread(target=self._draw, args=(asyncio.get_running_loop(),), daemon=True)
-        draw.start()
-        while True:
-            try:
-                await self._follow()
-            except Exception as error:
-                self._note("not connected to a daemon", error)
-            self._show(None)
-            await asyncio.sleep(_RETRY_INTERVAL)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._draw())
+            while True:
+                try:
+                    await self._follow()
+                except Exception as error:
+                    self._note("not connected to a daemon", error)
+                self._show(None)
+                await asyncio.sleep(_RETRY_INTERVAL)
 
     async def _follow(self) -> None:
         """Have what plays drawn until the daemon disconnects; raises RpcError and Unreachable."""
@@ -138,25 +147,25 @@ class DrawnField:
         self._plays = plays
         self._due.set()
 
-    def _draw(self, loop: asyncio.AbstractEventLoop) -> None:
+    async def _draw(self) -> None:
         """Draw what plays whenever it changes: in a thread, for the first takes a while."""
-        solvers = lru_cache(1)(lambda text: FieldSolver(parse_rig("the daemon's rig", text)))
-        while not loop.is_closed():
-            self._due.wait()
+        loop, thread = asyncio.get_running_loop(), ThreadPoolExecutor(1)
+        while True:
+            await self._due.wait()
             self._due.clear()
-            frame, plays = _NO_FIELD, self._plays
+            frame = _NO_FIELD
             try:
-                if plays is not None:
-                    frame = solvers(plays[0]).frame(_drives(plays[1]))
+                if self._plays is not None:
+                    frame = await loop.run_in_executor(thread, self._drawn, *self._plays)
             except Exception as error:
                 self._note("field of the plate not drawn", error)
-            if not (self._due.is_set() or loop.is_closed()):
-                loop.call_soon_threadsafe(self._publish, frame)
+            self._frame = frame
+            self._changed.set()
+            self._changed = asyncio.Event()
 
-    def _publish(self, frame: bytes) -> None:
-        self._frame = frame
-        self._changed.set()
-        self._changed = asyncio.Event()
+    def _drawn(self, rig_text: str, layers: Mapping[str, Any]) -> bytes:
+        """The frame of what plays, without what a later daemon may add to it."""
+        return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
     def _note(self, what: str, error: Exception) -> None:
         """Log a problem, once while it lasts."""
@@ -165,13 +174,3 @@ class DrawnField:
         if problem != self._problem:
             self._problem = problem
             _logger.warning("%s", problem)
-
-
-def _drives(layers: Mapping[str, Mapping[str, Any]]) -> dict[int, dict[str, PlayedTone]]:
-    """Tones by layer and ERA, without what a later daemon may add to them."""
-    return {
-        int(number): {
-            era: PlayedTone.model_validate(tone, extra="ignore") for era, tone in drive.items()
-        }
-        for number, drive in layers.items()
-    }

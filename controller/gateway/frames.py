@@ -35,13 +35,10 @@ class FrameHeads:
                 break
             if not is_control:
                 self._fragments = 0 if is_final else self._fragments + 1
-            if not is_masked or self._fragments > MAX_FRAGMENTS:
+            has_rate = not is_control or self._controls.take()
+            if not is_masked or self._fragments > MAX_FRAGMENTS or not has_rate:
                 return False
-            if is_control and not self._controls.take():
-                return False
-            if end > start:
-                length = int.from_bytes(data[start:end], "big")
-            at = end + _MASKING_KEY + length
+            at = end + _MASKING_KEY + int.from_bytes(data[start:end] or bytes([length]), "big")
         self._incomplete = data[at:]
         self._payload_left = max(0, at - len(data))
         return True

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import logging
 import os
-import re
 import signal
 import socket
 import ssl
@@ -47,18 +46,22 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         max_line_size=_MAX_LINE,
         max_field_size=_MAX_LINE,
         max_headers=_MAX_LINES,
-        lingering_time=CLIENT_TIMEOUT,
+        lingering_time=0,  # the connections'
+        read_bufsize=1 << 12,  # bytes of a body that wait to be read
         keepalive_timeout=2 * CLIENT_TIMEOUT,  # the acceptor's comes first
         shutdown_timeout=_SHUTDOWN_TIMEOUT,
     )
     await runner.setup()
     assert runner.server is not None  # noqa: S101 (it is set up)
     over = asyncio.Event()
-    loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, over.set)
+        asyncio.get_running_loop().add_signal_handler(number, over.set)
     # It never ends by itself: a part that fails ends the process, which then says why.
-    own = asyncio.gather(gateway.run(), Acceptor(runner.server, tls).run(listening))
+    own = asyncio.gather(
+        gateway.field.run(),
+        gateway.keep_connected(),
+        Acceptor(runner.server, tls).run(listening),
+    )
     own.add_done_callback(lambda _: over.set())
     announce(listening.getsockname()[1])
     with no_long_collections():  # of connections that a storm leaves, nothing else is visited
@@ -87,8 +90,7 @@ def load_certificate(settings: Settings) -> ssl.SSLContext | None:
             password="",  # without it OpenSSL would prompt for one
         )
     except (OSError, ValueError) as error:
-        text = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
-        reason = re.sub(r"^\[\w+\] | \(_ssl\.c:\d+\)$", "", str(text))
+        reason = str(getattr(error, "strerror", None) or error).partition(" (_ssl.c")[0]
         raise InputError(
             f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}); give a "
             "certificate chain and its key, both PEM, the key without password"

@@ -4,15 +4,16 @@ import ipaddress
 import os
 import re
 import secrets
-import stat
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
 from model.errors import InputError
+from registry.regular_file import regular_file
 
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{22,128}")  # valid in a URL and in a WebSocket subprotocol
 _HOST_NAME = re.compile(r"[A-Za-z0-9._-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
+_ORIGIN = re.compile(r"https?://[^/\s]+")
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _MAX_TOKEN_FILE = 4096  # bytes
 
@@ -38,8 +39,6 @@ class Settings:
     is_token_user_supplied: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port < 65536:
-            raise InputError(f"port must be 0 to 65535, got {self.port}")
         try:
             is_loopback = self.is_loopback
         except ValueError as error:
@@ -47,37 +46,52 @@ class Settings:
                 f"the address to listen on must be an IP address, such as 127.0.0.1 or ::1, got "
                 f"{self.host!r}; give host names with --allow-host"
             ) from error
-        if not _TOKEN.fullmatch(self.token):
-            raise InputError(
+        for is_wrong, text in (
+            (not 0 <= self.port < 65536, f"port must be 0 to 65535, got {self.port}"),
+            (
+                not _TOKEN.fullmatch(self.token),
                 "token must have 22 to 128 letters, digits, - or _; make one with "
-                "python -c 'import secrets; print(secrets.token_urlsafe(32))'"
-            )
-        if (self.certificate is None) != (self.key is None):
-            raise InputError("TLS needs both --certificate and --key")
-        for path in (self.certificate, self.key):
-            if path is not None and not path.is_file():
-                raise InputError(f"{path}: no such file; --certificate and --key must be PEM files")
-        if not is_loopback and not (self.certificate and self.is_token_user_supplied):
-            raise InputError(
+                "python -c 'import secrets; print(secrets.token_urlsafe(32))'",
+            ),
+            (
+                (self.certificate is None) != (self.key is None),
+                "TLS needs both --certificate and --key",
+            ),
+            *(
+                (
+                    path is not None and not path.is_file(),
+                    f"{path}: no such file; --certificate and --key must be PEM files",
+                )
+                for path in (self.certificate, self.key)
+            ),
+            (
+                not is_loopback and not (self.certificate and self.is_token_user_supplied),
                 f"listening on {self.host}, outside the loopback, needs TLS and your own token: "
-                "give --certificate, --key and --token-file, or listen on 127.0.0.1 behind a proxy"
-            )
-        if not is_loopback and not self.extra_hosts:
-            raise InputError(
+                "give --certificate, --key and --token-file, or listen on 127.0.0.1 behind a proxy",
+            ),
+            (
+                not is_loopback and not self.extra_hosts,
                 f"listening on {self.host}, outside the loopback, needs --allow-host with the name "
-                "or address that browsers use"
-            )
-        for name in self.extra_hosts:
-            if not _HOST_NAME.fullmatch(name):
-                raise InputError(
+                "or address that browsers use",
+            ),
+            *(
+                (
+                    not _HOST_NAME.fullmatch(name),
                     "--allow-host must be a host name without port and without *, such as "
-                    f"panel.local, 192.0.2.7 or [2001:db8::7], got {name!r}"
+                    f"panel.local, 192.0.2.7 or [2001:db8::7], got {name!r}",
                 )
-        for origin in self.origins:
-            if not re.fullmatch(r"https?://[^/\s]+", origin):
-                raise InputError(
-                    f"--allow-origin must look like https://panel.example:8443, got {origin!r}"
+                for name in self.extra_hosts
+            ),
+            *(
+                (
+                    not _ORIGIN.fullmatch(origin),
+                    f"--allow-origin must look like https://panel.example:8443, got {origin!r}",
                 )
+                for origin in self.origins
+            ),
+        ):
+            if is_wrong:
+                raise InputError(text)
 
     @property
     def is_loopback(self) -> bool:
@@ -106,30 +120,29 @@ class Settings:
 def read_token(path: Path) -> str:
     """Read the token from a file that only its owner may read; raises InputError."""
     try:
-        # O_NONBLOCK: do not block on a named pipe.
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as f:
-            status = os.fstat(f.fileno())
-            content = f.read(_MAX_TOKEN_FILE) if stat.S_ISREG(status.st_mode) else b""
+        with open(path, "rb", opener=regular_file) as file:
+            status, content = os.fstat(file.fileno()), file.read(_MAX_TOKEN_FILE)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); --token-file must be a file with the "
             "token that only you may read"
         ) from error
-    if not stat.S_ISREG(status.st_mode) or not content.isascii():
-        raise InputError(f"{path}: not a text file; --token-file must be a file with the token")
-    if status.st_mode & 0o077:
-        raise InputError(f"{path}: readable by other users; restrict it with chmod 600 {path}")
-    if status.st_uid not in (0, os.geteuid()):
-        raise InputError(f"{path}: belongs to another user; give a file of your own")
+    for is_wrong, text in (
+        (not content.isascii(), "not a text file; --token-file must be a file with the token"),
+        (status.st_mode & 0o077, f"readable by other users; restrict it with chmod 600 {path}"),
+        (
+            status.st_uid not in (0, os.geteuid()),
+            "belongs to another user; give a file of your own",
+        ),
+    ):
+        if is_wrong:
+            raise InputError(f"{path}: {text}")
     return content.decode().strip()
-
-
-_LIBRARIES = ("aiohttp", "prometheus_client")
 
 
 def require_gateway() -> None:
     """Raise InputError if a library of the gateway is missing."""
-    for name in _LIBRARIES:
+    for name in ("aiohttp", "prometheus_client"):
         if find_spec(name) is None:
             raise InputError(
                 f"the gateway needs {name}, which is not installed; "

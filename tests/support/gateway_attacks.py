@@ -157,6 +157,11 @@ class Attacker:
             body += [b"10000\r\n" + b" " * 65536 + b"\r\n"] * 1526
         return await self._send_all([head.encode(), *body])
 
+    async def small_chunks(self, _: int) -> str:
+        """A chunked body of single bytes without end, without the token."""
+        head = b"POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+        return await self._send_all([head, *[b"1\r\n \r\n" * 40_000] * 400])
+
     async def unread_pages(self, _: int) -> str:
         """Two hundred requests for the page, whose responses are not read."""
         _, writer = await self._open()
@@ -271,6 +276,7 @@ ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
     "400 connections idle after a request": lambda a: a.many(400, a.idle),
     "12 heads of 100 KB, or endless": lambda a: a.many(12, a.large_head),
     "8 bodies of 100 MB, sized or chunked": lambda a: a.many(8, a.large_body),
+    "32 bodies of chunks of one byte": lambda a: a.many(32, a.small_chunks),
     "200 connections, 200 pages each unread": lambda a: a.many(200, a.unread_pages),
     "8 WebSockets, empty fragments": lambda a: a.many(
         8, a.frames(frame(b"", first=0x00) * 5000, first=frame(b"", first=0x01))

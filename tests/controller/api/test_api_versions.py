@@ -62,7 +62,8 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(
             assert await asyncio.to_thread(use, bench.socket) == [READY, "state"]
             field = DrawnField(bench.socket)
             drawing = asyncio.create_task(field.run())
-            empty = await field.newer_than(None)
+            frames = field.frames()
+            empty = await anext(frames)
             await era.subscribe("pattern")
             async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
                 async for event in era.events():
@@ -73,7 +74,7 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(
                         break
                 drawn = empty
                 while len(drawn) == len(empty):
-                    drawn = await field.newer_than(drawn)
+                    drawn = await anext(frames)
         drawing.cancel()
         await asyncio.wait({drawing})
 

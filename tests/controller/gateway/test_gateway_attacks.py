@@ -167,7 +167,6 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     "escape codes in a method": ({"target": "/api/v1/%1b%5b2J"}, {400}),
     "line feed in a method": ({"target": "/api/v1/arm%0aERROR:%20lost"}, {400}),
     "GET": (get("/api/v1/arm"), {405}),
-    "OPTIONS": (get("/api/v1/arm", "OPTIONS"), {405}),
 }
 
 
@@ -199,13 +198,31 @@ GRANTED += ARM
         pytest.param(
             b"POST /api/v1/arm HTTP/1.0\r\nContent-Length: 0\r\n\r\n", {421}, id="no host"
         ),
-        pytest.param(CHUNKED + (b"10000\r\n" + b" " * 65536 + b"\r\n") * 8, {413}, id="chunks"),
+        pytest.param(CHUNKED + (b"10000\r\n" + b" " * 65536 + b"\r\n") * 8, {411}, id="chunks"),
+        pytest.param(
+            CHUNKED.replace(b"chunked", b"gzip, chunked") + b"0\r\n\r\n", {411}, id="two encodings"
+        ),
+        pytest.param(GRANTED.replace(b"HTTP/1.1", b"HTTP/2.0"), {400}, id="HTTP/2.0"),
+        pytest.param(GRANTED.replace(b"HTTP/1.1", b"HTTP/0.9"), {400}, id="HTTP/0.9"),
         pytest.param(bytes(range(256)) * 40 + b"\r\n\r\n", {400}, id="noise"),
     ],
 )
 def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: set[int]) -> None:
-    """Without Host, a chunked body without end, no HTTP, and heads that a proxy may misread."""
-    assert raw(gateway, filled(data, gateway)).status in statuses
+    """Without Host, bodies without a length, other versions of HTTP, and what is none."""
+    response = raw(gateway, filled(data, gateway))
+    assert response.status in statuses
+    assert response.headers.startswith("HTTP/1.")
+
+
+@pytest.mark.parametrize("body", [b" " * 5_000_000, b"1\r\n \r\n" * 500_000])
+def test_refusal_is_read_after_the_whole_body_is_sent(gateway: GatewayProcess, body: bytes) -> None:
+    """By a client that reads only then: sized or in chunks, the body is discarded meanwhile."""
+    head = filled(CHUNKED, gateway)
+    if body.startswith(b" "):
+        head = head.replace(b"Transfer-Encoding: chunked", b"Content-Length: 5000001")
+    with gateway.connect() as connection:
+        connection.sendall(head + body)
+        assert connection.recv(1 << 16)[9:12] in (b"411", b"413")
 
 
 LENGTH = b"Content-Length: %d" % len(ARM)
@@ -260,6 +277,7 @@ def test_body_is_asked_for_only_with_the_token(gateway: GatewayProcess) -> None:
         (head.replace(b"application/json", b"text/plain"), b"415"),
         (head.replace(b"v1/arm", b"v1/nosuch"), b"404"),
         (head.replace(b"/arm", b"/arm/arm"), b"4"),
+        (head.replace(b"POST /api/v1/arm", b"GET /icon.svg"), b"200"),
     ):
         with gateway.connect() as connection:
             connection.sendall(sent + b"\r\nExpect: 100-continue\r\n\r\n")
@@ -295,6 +313,14 @@ def test_websocket_is_refused(gateway: GatewayProcess, changes: dict[str, Any]) 
     assert raw(gateway, upgrade(gateway, **changes)).status == 403
 
 
+@pytest.mark.parametrize("changed", [(b"HTTP/1.1", b"HTTP/1.0"), (b"GET", b"HEAD")])
+def test_websocket_needs_a_get_of_http_1_1(
+    gateway: GatewayProcess, changed: tuple[bytes, bytes]
+) -> None:
+    """RFC 6455 4.1."""
+    assert raw(gateway, upgrade(gateway).replace(*changed)).status == 403
+
+
 Misuse: TypeAlias = Callable[[RawWebSocket], None]
 
 REQUEST = b'{"jsonrpc": "2.0", "id": 1, "method": "arm", "params": ' + ARM + b"}"
@@ -320,6 +346,11 @@ MISUSES: dict[str, tuple[Misuse, set[int]]] = {
     "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), FLOOD),
     "not masked": (lambda ws: ws.connection.sendall(b"\x81\x02{}"), {1002}),
     "invalid UTF-8": (lambda ws: ws.send(b"\xff\xfe"), {1007}),
+    "close code for endpoints alone": (
+        lambda ws: ws.send((1006).to_bytes(2, "big"), first=0x88),
+        {1002},
+    ),
+    "close code that is not defined": (lambda ws: ws.send(b"\xff\xff", first=0x88), {1002}),
     "two lines": (lambda ws: ws.send(REQUEST + b"\n" + REQUEST), {1003}),
 }
 

@@ -172,15 +172,17 @@ async def test_field_is_drawn_after_what_cannot_be_drawn(
     )
     field = DrawnField(daemon.socket)
     running = asyncio.create_task(field.run())
-    frame = await field.newer_than(None)
+    frames = field.frames()
+    frame = await anext(frames)
+    waiting = asyncio.ensure_future(anext(frames))
     async with asyncio.timeout(PATIENCE):
         for event, frequencies in ((pattern, 1), (UnknownPattern(), 0), (pattern, 1)):
             while struct.unpack_from("<H", frame, 4) != (frequencies,):
                 daemon.publish("pattern", event)
-                waiting = asyncio.create_task(field.newer_than(frame))
                 await asyncio.wait({waiting}, timeout=0.1)
-                frame = waiting.result() if waiting.done() else frame
-                waiting.cancel()
+                if waiting.done():
+                    frame, waiting = waiting.result(), asyncio.ensure_future(anext(frames))
+    waiting.cancel()
     running.cancel()
     await asyncio.wait({running})
     assert caplog.text.count("field of the plate not drawn") == 1

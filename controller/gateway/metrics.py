@@ -22,6 +22,7 @@ from controller.api.schema import (
     LearningSummary,
 )
 from drivers.host.reports import ReportKind
+from drivers.protocol.table import READINGS
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -176,7 +177,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
             ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
             ("high_voltage", "Whether high voltage is on."),
-            ("temperature_celsius", "Temperature."),
+            *((each.metric, f"{each.label.capitalize()} {each.meaning}.") for each in READINGS),
             ("reply_age_seconds", "Time since the last reply."),
             ("round_trip_seconds", "From the last request to its reply."),
         )
@@ -198,7 +199,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
             "lost": float(amplifier.lost),
             "fault": None if amplifier.fault is None else float(amplifier.fault != "NONE"),
             "high_voltage": amplifier.high_voltage,
-            "temperature_celsius": amplifier.temperature_c,
+            **{each.metric: getattr(amplifier, each.key) for each in READINGS},
             "reply_age_seconds": amplifier.reply_age_s,
             "round_trip_seconds": None if round_trip is None else round_trip / 1e3,
         }

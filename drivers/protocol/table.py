@@ -148,6 +148,7 @@ def _numbers(*names: str) -> tuple[Number, ...]:
 
 def _reading(
     name: str,
+    meaning: str,
     low: int,
     high: int,
     per_unit: int,
@@ -157,10 +158,11 @@ def _reading(
 ) -> Number:
     """Return a field of Status that is a reading, which declares its quantity.
 
-    `era amp status` and the API have it under its name and unit; views: what else shows it.
+    meaning: what it is of, behind its name. `era amp status`, the API and the metrics have it under
+    its name and unit, with the decimals of a step; views: what else shows it.
     """
     QUANTITIES[name] = _word(name, low, high, per_unit, unit)
-    return Number(name, QUANTITIES[name], is_added, frozenset(views))
+    return Number(name, QUANTITIES[name], is_added, meaning, views)
 
 
 _TONES = Record(*_numbers("frequency", "level", "phase"))
@@ -178,21 +180,16 @@ LAYER = Record(
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    _reading("temperature", -1000, 2000, 10, "°C", "status", "page"),
-    _reading("high_voltage", 0, 65535, 1, "V", "page"),
+    _reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
+    _reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
     *_numbers("token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
     # Later readings: _reading(..., "status", "page", is_added=True), the views where it is shown.
 )
-READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.views is not None]
+READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.meaning]
 """Fields of Status that are values in a unit for people."""
-
-
-def readings_in(view: View) -> list[Number]:
-    """Return the readings that a view shows."""
-    return [each for each in READINGS if each.views is not None and view in each.views]
 
 
 _CAPABILITIES = Record(

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 from drivers.judge.asking.client import Unusable, require
+from drivers.protocol.capabilities import capability_ranges
 from drivers.protocol.records import Field, Number, Record, Values
 from drivers.protocol.records import Rows as RowsOf
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -88,12 +89,8 @@ def _ranges(can: Values) -> Iterator[_Range]:
             if isinstance(field, Number) and row[field.name] is not None:
                 name = field.name if record is _REPLY else "limits"
                 yield name, field.quantity.minimum, row[field.name], field.quantity.maximum
-    for name in ("frequency_step", "level_step", "phase_step", "level_max"):
-        yield name, 1, can[name], _WORD
-    yield "voices", can["layers"], can["voices"], _WORD
+    yield from capability_ranges(can)
     yield "features", 0, can["features"], (1 << len(FEATURES)) - 1
-    for name in ("frequency", "watchdog", "envelope_step"):
-        yield f"{name}_max", can[f"{name}_min"], can[f"{name}_max"], _WORD
     for one in can["limits"]:
         low, high = one["frequency_min"], one["frequency_max"]
         yield "limits", can["frequency_min"], low, high

@@ -15,7 +15,6 @@ from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.stop import Stop
 from drivers.protocol.achieved import achieved_layer, achieved_problem
-from drivers.protocol.capabilities import capability_ranges
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
@@ -23,6 +22,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     STATES,
     VERSION,
+    capability_ranges,
     has_feature,
 )
 from drivers.protocol.timing import REPLY_TIMEOUT, STOP_RAMP

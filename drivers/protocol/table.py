@@ -5,11 +5,12 @@ states, faults and refusals, and the times of the contract, stand here too. What
 is written in docs/decisions/0061-protocol-3.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from drivers.protocol.records import (
+    WORD,
     Bits,
     Number,
     Numbers,
@@ -320,6 +321,15 @@ def nak_of(refusal: Refusal, number: int) -> list[int]:
     """Return the words of the Nak to a request with a message's number."""
     channel = NO_CHANNEL if refusal.channel is None else refusal.channel
     return NAK_RECORD.pack({"request": number, "code": REFUSALS[refusal.code], "channel": channel})
+
+
+def capability_ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
+    """Yield name, least, value and most of capabilities, beside the ranges of their quantities."""
+    for name in ("frequency_step", "level_step", "phase_step", "level_max"):
+        yield name, 1, can[name], WORD - 1
+    yield "voices", can["layers"], can["voices"], WORD - 1
+    for name in ("frequency", "watchdog", "envelope_step"):
+        yield f"{name}_max", can[f"{name}_min"], can[f"{name}_max"], WORD - 1
 
 
 def has_feature(capabilities: Values, name: str) -> bool:

@@ -170,7 +170,6 @@ class Amplifier:
         """Return the values of the status at a time [s] up to which it has been ticked."""
         levels, is_on = self._levels(now)
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
-        decayed = math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE))
         # A sum that lasts is limited again and again.
         self._is_limited |= any(self.playback.level(each, now) > LIMITED for each in self._channels)
         flags = {
@@ -181,15 +180,19 @@ class Amplifier:
         self._is_limited = False
         tokens = self.playback.tokens
         layers = self.capabilities["layers"]
-        rest = {
-            **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
-            "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
-            **{"latch": self.latch, "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0))},
-            **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
-            "levels": [_Q["level"].to_wire(level) for level in levels],
-            "tokens": [tokens.get(layer, 0) for layer in range(layers)],
-        }
-        return with_readings(rest, temperature=self._heat.at(now), supply=1.0 if is_on else decayed)
+        return with_readings(
+            {
+                **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
+                "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
+                "latch": self.latch,
+                "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
+                **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
+                "levels": [_Q["level"].to_wire(level) for level in levels],
+                "tokens": [tokens.get(layer, 0) for layer in range(layers)],
+            },
+            temperature=self._heat.at(now),
+            supply=1.0 if is_on else math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE)),
+        )
 
     def summary(self, now: float) -> AmplifierSummary:
         """What it does at a time [s] up to which it has been ticked; unlike a status, no report."""

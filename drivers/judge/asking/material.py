@@ -10,11 +10,16 @@ from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 from drivers.judge.asking.client import Unusable, require
-from drivers.protocol.capabilities import capability_ranges
 from drivers.protocol.records import Field, Number, Record, Values
 from drivers.protocol.records import Rows as RowsOf
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.protocol.table import FEATURES, MESSAGES, QUANTITIES, has_feature
+from drivers.protocol.table import (
+    FEATURES,
+    MESSAGES,
+    QUANTITIES,
+    capability_ranges,
+    has_feature,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,6 @@ stage = partial(play, now=0)
 
 
 _WORD = 0xFFFF
-_Range: TypeAlias = tuple[str, int, int, int]
 
 
 def _unlimited(field: Field) -> Field:
@@ -81,7 +85,7 @@ STATED = Record(*map(_unlimited, _REPLY.fields))
 """The reply to GetCaps; a number may be any word, of which those that are wrong are found."""
 
 
-def _ranges(can: Values) -> Iterator[_Range]:
+def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
     """Yield each number with its name, between the least and the most that it may be."""
     rows = [(_REPLY, can), *((_LIMITS, one) for one in can["limits"])]
     for record, row in rows:

@@ -1,4 +1,4 @@
-"""The host's side of Modbus: bytes written by hand, and responses that belong to no request."""
+"""The host's side of Modbus: how much is read, and responses that belong to no request."""
 
 import asyncio
 
@@ -13,10 +13,6 @@ from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, unaltered
-
-# Of GetFaults to unit 1, with tag 1: write, response, read of all registers. The CRCs are those of
-# minimalmodbus.
-FAULTS = ("01 10 0A00 0001 02 0001 CD90", "01 10 0A00 0001 0211", "01 04 0A80 007A 73D9")
 
 
 class Peer:
@@ -41,23 +37,6 @@ def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply |
     (arrival,) = wire.received(peer.reply(more.data))
     assert isinstance(arrival, Reply | Nak | Broken)
     return arrival
-
-
-def test_request_without_words_has_the_bytes_written_by_hand() -> None:
-    """Over TCP it has two transactions of one tag, and no CRC."""
-    write, echo, read = map(bytes.fromhex, FAULTS)
-    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
-    assert wire.request(1, "GetFaults", {}) == write
-    assert peer.reply(write) == echo
-    assert wire.received(echo) == [More(read)]
-
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    over_tcp = [
-        number.to_bytes(2) + bytes(2) + (len(frame) - 2).to_bytes(2) + frame[:-2]
-        for number, frame in ((1, write), (1, echo), (2, read))
-    ]
-    assert wire.request(1, "GetFaults", {}) == over_tcp[0]
-    assert wire.received(over_tcp[1]) == [More(over_tcp[2])]
 
 
 def test_as_many_registers_are_read_as_the_reply_can_have() -> None:

@@ -53,8 +53,9 @@ class HelloResult(Message):
     table: TableSummary
     rig_text: str = Field(description="the rig file, from which vibration fields can be computed")
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
-    readings: dict[str, tuple[str, str]] = Field(
-        {}, description="of amplifiers, for a page: name and unit, by the key in their status"
+    readings: dict[str, tuple[str, str, Count]] = Field(
+        {},
+        description="of amplifiers, for a page: name, unit, decimals, by the key in their status",
     )
 
 

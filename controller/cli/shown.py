@@ -7,7 +7,7 @@ from controller.api.client_protocol import Notification
 from controller.api.methods import StatusResult
 from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
-from drivers.protocol.table import readings_in
+from drivers.protocol.table import READINGS
 from model.counting import counted
 
 
@@ -127,8 +127,12 @@ def _amplifier(amplifier: AmplifierStatus) -> str:
         ("{}", amplifier.silence and amplifier.silence.words),
         ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
         *(
-            (f"{each.label} {{:g}} {each.quantity.unit}", getattr(amplifier, each.key))
-            for each in readings_in("status")
+            (
+                f"{each.label} {{:.{each.decimals}f}} {each.quantity.unit}".rstrip(),
+                getattr(amplifier, each.key),
+            )
+            for each in READINGS
+            if "status" in each.views
         ),
         ("last reply {:.2f} s ago", amplifier.reply_age_s),
         ("no reply yet", amplifier.reply_age_s is None),

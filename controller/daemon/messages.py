@@ -43,7 +43,6 @@ from drivers.protocol.table import (
     STATES,
     has_flag,
     name_of,
-    readings_in,
 )
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -239,7 +238,9 @@ def hello_result(
         rig_text=config.rig_text,
         layout=layout,
         readings={
-            each.key: (each.label.capitalize(), each.quantity.unit) for each in readings_in("page")
+            each.key: (each.label.capitalize(), each.quantity.unit, each.decimals)
+            for each in READINGS
+            if "page" in each.views
         },
     )
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import accumulate
+from operator import attrgetter
 from typing import Any, TypeAlias, get_args
 
 from prometheus_client import generate_latest
@@ -22,6 +23,7 @@ from controller.api.schema import (
     LearningState,
 )
 from drivers.host.reports import ReportKind
+from drivers.protocol.table import READINGS
 
 _Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]
 """Name, meaning, values by what the labels are, and labels of a metric."""
@@ -35,7 +37,10 @@ _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | Non
         lambda a: None if a.fault is None else a.fault != "NONE",
     ),
     ("high_voltage", "Whether high voltage is on.", lambda a: a.high_voltage),
-    ("temperature_celsius", "Temperature.", lambda a: a.temperature_c),
+    *(
+        (each.metric, f"{each.label.capitalize()} {each.meaning}.", attrgetter(each.key))
+        for each in READINGS
+    ),
     ("reply_age_seconds", "Time since the last reply.", lambda a: a.reply_age_s),
     (
         "round_trip_seconds",

@@ -37,7 +37,7 @@ _HEAD = """\
 // Protocol 3 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
 // row of 16-bit words (docs/decisions/0061-protocol-3.md). REQUEST_FIELD is the place of a field in
 // the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
-// quantities are those of the wire, 0 to 65535 where nothing is said. Replies are in records.h.
+// quantities are those of the wire. Replies are in records.h.
 
 #ifndef PROTOCOL_H
 #define PROTOCOL_H
@@ -47,6 +47,13 @@ _HEAD = """\
 
 #define FIELD_OF(bits, field) ((bits) >> field##_SHIFT & field##_MASK)
 """
+_RANGES = (
+    *("frequency_PER_UNIT", "WIRE_level_MAX", "level_PER_UNIT"),
+    *("WIRE_phase_MIN", "WIRE_phase_MAX", "phase_PER_UNIT", "WIRE_ramp_MAX", "WIRE_valid_for_MAX"),
+    *("WIRE_watchdog_MIN", "WIRE_watchdog_MAX", "WIRE_knots_MAX"),
+    *("WIRE_envelope_step_MIN", "WIRE_envelope_step_MAX"),
+)
+"""What the firmware uses of quantities; requests are checked by their table."""
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}  # of words out of range, by quantity
 _BREAK = "\\\n"
 _TABLE = """\
@@ -88,19 +95,21 @@ def _messages() -> Mapping[str, int]:
 
 def _constants() -> Mapping[str, int]:
     """Return the numbers of the contract, with ranges of quantities and their steps per unit."""
-    constants = {
+    ranges = {
+        name: number
+        for each in QUANTITIES.values()
+        for name, number in (
+            (f"WIRE_{each.name}_MIN", each.minimum),
+            (f"WIRE_{each.name}_MAX", each.maximum),
+            (f"{each.name}_PER_UNIT", each.per_unit),
+        )
+    }
+    return {
         **{"PROTOCOL_VERSION": VERSION, "WORDS_MAX": MAX_WORDS, "NO_CHANNEL": NO_CHANNEL},
         "STAGED_LIFE_MS": round(STAGED_LIFE * 1000),
         "SHORTENED_FADE_MS": round(SHORTENED_FADE * 1000),
+        **{name: ranges[name] for name in _RANGES},
     }
-    for each in QUANTITIES.values():
-        if each.minimum:
-            constants[f"WIRE_{each.name}_MIN"] = each.minimum
-        if each.maximum not in (0xFFFF, 0xFFFFFFFF):
-            constants[f"WIRE_{each.name}_MAX"] = each.maximum
-        if each.per_unit != 1:
-            constants[f"{each.name}_PER_UNIT"] = each.per_unit
-    return constants
 
 
 def _enum(name: str, prefix: str, values: Mapping[str, int]) -> str:

@@ -5,8 +5,9 @@ their names, and the table says in which words they go.
 """
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
+from typing import TypeGuard
 
 from drivers.protocol.records import Bits, Field, Number, Numbers, Record, Rows
 from drivers.protocol.table import COMMAND, EVENT_RECORD, MESSAGES, NAK_RECORD
@@ -16,7 +17,8 @@ _HEAD = """\
 //
 // What an amplifier sends, made by docs/generators/firmware_records.py: do not edit it. Each record
 // of protocol 3 is a struct, and a function that appends its words; RECORD_WORDS is their number
-// with so many of what varies. A field that is not filled in is sent as 0.
+// with so many of what varies. A field that is not filled in is sent as 0. Readings, which a board
+// takes, are a struct of their own.
 
 #ifndef RECORDS_H
 #define RECORDS_H
@@ -47,7 +49,11 @@ def _record(name: str, record: Record) -> Iterator[str]:
     for field in record.fields:
         if isinstance(field, Rows):
             yield from _record(_row(field), field.record)
-    yield f"struct wire_{name} {{\n{''.join(_members(record))}}};\n"
+    members = [*_members(each for each in record.fields if not _is_reading(each))]
+    if readings := "".join(map(_reading, filter(_is_reading, record.fields))):
+        yield f"struct readings {{\n{readings}}};\n\n"
+        members.append("    struct readings readings;\n")
+    yield f"struct wire_{name} {{\n{''.join(members)}}};\n"
     if any(isinstance(field, Numbers | Rows) for field in record.fields):
         counts, number = _number_of_words(record)
         yield f"#define {name.upper()}_WORDS({counts}) ({number})\n"
@@ -62,9 +68,20 @@ def _row(field: Rows) -> str:
     return "command" if field.record is COMMAND else field.name.removesuffix("s")
 
 
-def _members(record: Record) -> Iterator[str]:
+def _is_reading(field: Field) -> TypeGuard[Number]:
+    return isinstance(field, Number) and bool(field.meaning)
+
+
+def _reading(field: Number) -> str:
+    """Return the line of a reading, with its unit and meaning."""
+    step = f"{field.quantity.step:g} {field.quantity.unit}".strip()
+    meaning = field.meaning + "; 0: not measured" * field.is_added
+    return f"    {_TYPES[field.quantity.wire]} {field.name}; // {step}, {meaning}\n"
+
+
+def _members(fields: Iterable[Field]) -> Iterator[str]:
     """Return the lines of the members of a struct, those of one type together."""
-    typed = [member for field in record.fields for member in _typed(field)]
+    typed = [member for field in fields for member in _typed(field)]
     for kind, members in groupby(typed, key=lambda member: member[0]):
         names = [name for _, name in members]
         if kind.endswith("*"):
@@ -125,14 +142,15 @@ def _values(field: Field) -> Iterator[str]:
         shifted = [f"from->{name}{f'~<<~{by}' if by else ''}" for (name, _), by in parts]
         yield f"(uint16_t)({' | '.join(shifted)})"
     elif isinstance(field, Number):
+        name = f"from->{'readings.' * _is_reading(field)}{field.name}"
         match field.quantity.wire:
             case "u32":
-                yield f"(uint16_t)(from->{field.name} >> 16)"
-                yield f"(uint16_t)from->{field.name}"
+                yield f"(uint16_t)({name} >> 16)"
+                yield f"(uint16_t){name}"
             case "i16":
-                yield f"(uint16_t)from->{field.name}"
+                yield f"(uint16_t){name}"
             case _:
-                yield f"from->{field.name}"
+                yield name
 
 
 def _wrapped(text: str) -> str:

@@ -297,7 +297,7 @@ def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str
         match field:
             case Number(name=name, quantity=quantity):
                 size = 2 if quantity.wire == "u32" else 1
-                number = f"{quantity.from_wire(values[name]):g} {quantity.unit}".strip()
+                number = f"{quantity.from_wire(values[name]):.10g} {quantity.unit}".strip()
                 is_token = quantity.name in ("session", "token", "played_token")
                 text = f"{name} {f'{values[name]:04X}' if is_token else number}"
             case Bits(parts=parts):

@@ -2,8 +2,19 @@
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import get_args
 
-from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
+from drivers.protocol.records import (
+    Bits,
+    Number,
+    Numbers,
+    Real,
+    Record,
+    Rest,
+    Rows,
+    Text,
+    View,
+)
 from drivers.protocol.table import (
     COMMAND,
     ENVELOPE,
@@ -19,6 +30,7 @@ from drivers.protocol.table import (
     NAK,
     NAK_RECORD,
     QUANTITIES,
+    READINGS,
     REFUSALS,
     STATES,
     STATUS,
@@ -109,6 +121,19 @@ def records() -> str:
     rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
     last = "sensor of a Reading", layout(sensor_reading(1))
     return _table(("record", "words"), iter([*rows, last]))
+
+
+def readings() -> str:
+    """Return the readings of Status, and where they are shown."""
+    rows = (
+        (
+            *(each.name, f"`{each.key}`", f"`era_amplifier_{each.metric}`"),
+            *("yes" if view in each.views else "" for view in get_args(View)),
+            each.meaning + "; null: not stated" * each.is_added,
+        )
+        for each in READINGS
+    )
+    return _table(("reading", "key", "metric", "`era status`", "dashboard", ""), rows)
 
 
 def layout(record: Record) -> str:
@@ -202,6 +227,7 @@ def objects() -> str:
 TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "protocol": {
         **{"quantities": quantities, "messages": messages, "records": records},
+        "readings": readings,
         "states": lambda: f"{_numbers(STATES, 'state')}\n\n{transitions()}",
         "faults": lambda: _list("Faults and their numbers", FAULTS),
         "codes": lambda: _numbers(REFUSALS, "code"),

@@ -23,6 +23,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     STATES,
     VERSION,
+    capability_ranges,
     has_feature,
 )
 from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
@@ -39,7 +40,6 @@ SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
-_POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 _WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
 
@@ -361,15 +361,9 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
     is_output: what the rig says of full level: the output of a linear amplifier, else a motion;
     None where there is no rig.
     """
-    for each in _POSITIVE:
-        if not can[each] > 0:
-            raise WrongAmplifier(f"amplifier {name}: {each} must be above 0, got {can[each]}")
-    for each in ("watchdog", "envelope_step", "frequency"):
-        low, high = can[f"{each}_min"], can[f"{each}_max"]
-        if low > high:
-            raise WrongAmplifier(
-                f"amplifier {name}: {each}_min must be at most {each}_max, got {low} and {high}"
-            )
+    for each, low, stated, high in capability_ranges(can):
+        if not low <= stated <= high:
+            raise WrongAmplifier(f"amplifier {name}: {each} must be {low} to {high}, got {stated}")
     has_output = has_feature(can, "output")
     if is_output is not None and has_output is not is_output:
         raise WrongAmplifier(

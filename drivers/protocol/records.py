@@ -24,11 +24,14 @@ TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
-_KEY_ENDS: Mapping[str, str] = {
-    **{"Hz": "_hz", "s": "_s", "degrees": "_deg", "m": "_m", "V": "_v", "A": "_a", "°C": "_c"},
-    "full levels/s": "_per_s",
+UNITS: Mapping[str, tuple[str, str]] = {
+    **{"": ("", ""), "of full level": ("", ""), "full levels/s": ("_per_s", "_per_second")},
+    **{"Hz": ("_hz", "_hertz"), "s": ("_s", "_seconds"), "degrees": ("_deg", "_degrees")},
+    **{"m": ("_m", "_meters"), "V": ("_v", "_volts"), "°C": ("_c", "_celsius")},
+    **{"A": ("_a", "_amperes"), "mA": ("_ma", "_milliamperes"), "W": ("_w", "_watts")},
+    **{"%": ("_percent", "_percent"), "rpm": ("_rpm", "_rpm")},
 }
-"""Of the keys of values in a unit."""
+"""Of quantities, with the ends of the keys and of the metrics of values in them."""
 
 Values = dict[str, Any]
 View = Literal["status", "page"]
@@ -49,6 +52,13 @@ class WireQuantity:
     minimum: int
     maximum: int
     wraps: bool = False
+
+    def __post_init__(self) -> None:
+        if self.unit not in UNITS:
+            raise ValueError(
+                f"unit of {self.name} must be one of {', '.join(UNITS)[2:]}, got {self.unit}; add "
+                "it there with its ends of keys"
+            )
 
     @cached_property
     def step(self) -> float:
@@ -114,13 +124,15 @@ class Number:
 
     is_added: later than the first edition of its record, at whose end it stands. Amplifiers need
     not state it: their reply ends before it, or has 0 there as the registers of Modbus do.
-    views: what shows it beside `era amp status` and the API; None if it is no reading.
+    meaning: of a reading, which completes its label; views: what shows it beside `era amp status`,
+    the API and the metrics.
     """
 
     name: str
     quantity: WireQuantity
     is_added: bool = False
-    views: frozenset[View] | None = None
+    meaning: str = ""
+    views: tuple[View, ...] = ()
 
     def __post_init__(self) -> None:
         if self.is_added and self.quantity.minimum < 1:
@@ -134,12 +146,22 @@ class Number:
     @property
     def key(self) -> str:
         """Its name in JSON, which ends in the unit."""
-        return f"{self.name}{_KEY_ENDS.get(self.quantity.unit, '')}"
+        return self.name + UNITS[self.quantity.unit][0]
+
+    @property
+    def metric(self) -> str:
+        """Its name among metrics, which ends in the unit."""
+        return self.name + UNITS[self.quantity.unit][1]
 
     @property
     def label(self) -> str:
         """Its name for people."""
         return self.name.replace("_", " ")
+
+    @property
+    def decimals(self) -> int:
+        """How many decimals people see: those of a step."""
+        return math.ceil(math.log10(self.quantity.per_unit))
 
     def in_unit(self, values: Values) -> float | None:
         """Return its value in the unit, an int without one; None where it is not stated."""

@@ -5,11 +5,12 @@ states, faults and refusals, and the times of the contract, stand here too. What
 is written in docs/decisions/0061-protocol-3.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from drivers.protocol.records import (
+    WORD,
     Bits,
     Number,
     Numbers,
@@ -148,6 +149,7 @@ def _numbers(*names: str) -> tuple[Number, ...]:
 
 def _reading(
     name: str,
+    meaning: str,
     low: int,
     high: int,
     per_unit: int,
@@ -157,10 +159,11 @@ def _reading(
 ) -> Number:
     """Return a field of Status that is a reading, which declares its quantity.
 
-    `era amp status` and the API have it under its name and unit; views: what else shows it.
+    meaning: what it is of, behind its name. `era amp status`, the API and the metrics have it under
+    its name and unit, with the decimals of a step; views: what else shows it.
     """
     QUANTITIES[name] = _word(name, low, high, per_unit, unit)
-    return Number(name, QUANTITIES[name], is_added, frozenset(views))
+    return Number(name, QUANTITIES[name], is_added, meaning, views)
 
 
 _TONES = Record(*_numbers("frequency", "level", "phase"))
@@ -178,21 +181,16 @@ LAYER = Record(
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    _reading("temperature", -1000, 2000, 10, "°C", "status", "page"),
-    _reading("high_voltage", 0, 65535, 1, "V", "page"),
+    _reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
+    _reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
     *_numbers("token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
     # Later readings: _reading(..., "status", "page", is_added=True), the views where it is shown.
 )
-READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.views is not None]
+READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.meaning]
 """Fields of Status that are values in a unit for people."""
-
-
-def readings_in(view: View) -> list[Number]:
-    """Return the readings that a view shows."""
-    return [each for each in READINGS if each.views is not None and view in each.views]
 
 
 _CAPABILITIES = Record(
@@ -323,6 +321,15 @@ def nak_of(refusal: Refusal, number: int) -> list[int]:
     """Return the words of the Nak to a request with a message's number."""
     channel = NO_CHANNEL if refusal.channel is None else refusal.channel
     return NAK_RECORD.pack({"request": number, "code": REFUSALS[refusal.code], "channel": channel})
+
+
+def capability_ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
+    """Yield name, least, value and most of capabilities, beside the ranges of their quantities."""
+    for name in ("frequency_step", "level_step", "phase_step", "level_max"):
+        yield name, 1, can[name], WORD - 1
+    yield "voices", can["layers"], can["voices"], WORD - 1
+    for name in ("frequency", "watchdog", "envelope_step"):
+        yield f"{name}_max", can[f"{name}_min"], can[f"{name}_max"], WORD - 1
 
 
 def has_feature(capabilities: Values, name: str) -> bool:

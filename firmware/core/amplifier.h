@@ -32,10 +32,9 @@ struct verdict {
     uint8_t channel;
 };
 
-// What the board measures: temperature, voltage, and the cause of a fault while there is one.
+// What the board measures, and the cause of a fault while there is one.
 struct measured {
-    int16_t temperature;
-    uint16_t voltage;
+    struct readings readings;
     bool is_interlock_open;
     enum fault cause;
     uint8_t channel; // of the cause

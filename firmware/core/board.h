@@ -7,6 +7,7 @@
 #define BOARD_H
 
 #include "config.h"
+#include "records.h"
 
 enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 
@@ -34,8 +35,7 @@ uint32_t board_silence(enum line line);
 // High voltage, and what is measured.
 
 void board_high_voltage(bool on);
-int16_t board_temperature(void); // 0.1 degrees Celsius
-uint16_t board_voltage(void);    // V, of the high-voltage supply; 0: not measured
+struct readings board_readings(void); // in the units that records.h says
 bool board_interlock_open(void);
 // The cause of another fault while there is one, and its channel (NO_CHANNEL: none).
 enum fault board_fault(uint8_t *channel);

@@ -56,8 +56,7 @@ void loop_init(void)
 static void measure(void)
 {
     struct measured measured = {
-        .temperature = board_temperature(),
-        .voltage = board_voltage(),
+        .readings = board_readings(),
         .is_interlock_open = board_interlock_open(),
     };
     measured.cause = board_fault(&measured.channel);

@@ -2,7 +2,8 @@
 //
 // What an amplifier sends, made by docs/generators/firmware_records.py: do not edit it. Each record
 // of protocol 3 is a struct, and a function that appends its words; RECORD_WORDS is their number
-// with so many of what varies. A field that is not filled in is sent as 0.
+// with so many of what varies. A field that is not filled in is sent as 0. Readings, which a board
+// takes, are a struct of their own.
 
 #ifndef RECORDS_H
 #define RECORDS_H
@@ -34,19 +35,23 @@ static inline void put_capabilities(struct words *words, const struct wire_capab
         put_limit(words, &from->limits[i]);
 }
 
+struct readings {
+    int16_t temperature; // 0.1 °C, of the amplifier
+    uint16_t high_voltage; // 1 V, of the supply; 0: not measured
+};
+
 struct wire_status {
-    uint16_t state, fault, flags, latch, watchdog_left;
-    int16_t temperature;
-    uint16_t high_voltage, token;
+    uint16_t state, fault, flags, latch, watchdog_left, token;
     uint8_t channels, layers;
     const uint16_t *levels;
     const uint16_t *tokens;
+    struct readings readings;
 };
 #define STATUS_WORDS(channels, layers) (9 + (channels) + (layers))
 static inline void put_status(struct words *words, const struct wire_status *from)
 {
     PUT(words, from->state, from->fault, from->flags, from->latch, from->watchdog_left,
-        (uint16_t)from->temperature, from->high_voltage, from->token,
+        (uint16_t)from->readings.temperature, from->readings.high_voltage, from->token,
         (uint16_t)(from->channels << 8 | from->layers));
     put_all(words, from->levels, from->channels);
     put_all(words, from->tokens, from->layers);

@@ -30,7 +30,6 @@ from sim.amplifier.readings import (
     DERATED,
     FAULT_ABOVE,
     GOOD_BELOW,
-    HIGH_VOLTAGE,
     LIMITED,
     AmplifierSummary,
     FaultRecord,
@@ -40,6 +39,7 @@ from sim.amplifier.readings import (
     exceeds_full,
     fault_list,
     measured,
+    with_readings,
 )
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
@@ -170,7 +170,6 @@ class Amplifier:
         """Return the values of the status at a time [s] up to which it has been ticked."""
         levels, is_on = self._levels(now)
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
-        decayed = math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE))
         # A sum that lasts is limited again and again.
         self._is_limited |= any(self.playback.level(each, now) > LIMITED for each in self._channels)
         flags = {
@@ -181,16 +180,19 @@ class Amplifier:
         self._is_limited = False
         tokens = self.playback.tokens
         layers = self.capabilities["layers"]
-        return {
-            **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
-            "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
-            **{"latch": self.latch, "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0))},
-            "temperature": _Q["temperature"].to_wire(self._heat.at(now)),
-            "high_voltage": round(HIGH_VOLTAGE if is_on else HIGH_VOLTAGE * decayed),
-            **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
-            "levels": [_Q["level"].to_wire(level) for level in levels],
-            "tokens": [tokens.get(layer, 0) for layer in range(layers)],
-        }
+        return with_readings(
+            {
+                **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
+                "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
+                "latch": self.latch,
+                "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
+                **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
+                "levels": [_Q["level"].to_wire(level) for level in levels],
+                "tokens": [tokens.get(layer, 0) for layer in range(layers)],
+            },
+            temperature=self._heat.at(now),
+            supply=1.0 if is_on else math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE)),
+        )
 
     def summary(self, now: float) -> AmplifierSummary:
         """What it does at a time [s] up to which it has been ticked; unlike a status, no report."""

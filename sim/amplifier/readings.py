@@ -84,6 +84,16 @@ _FRACTIONS = 16  # of a fade at which its sum with others is looked at
 _Q = QUANTITIES
 LIMITED = 1 + _Q["level"].step
 
+
+def with_readings(status: Values, *, temperature: float, supply: float) -> Values:
+    """Return a status with its readings, which may follow from the rest of it.
+
+    temperature [°C]; supply: share of its voltage that the supply has.
+    """
+    in_units = {"temperature": temperature, "high_voltage": HIGH_VOLTAGE * supply}
+    return status | {name: _Q[name].to_wire(value) for name, value in in_units.items()}
+
+
 FaultRecord = tuple[str, int | None, float]
 """Name, channel if there is one, and time [s] of a fault."""
 

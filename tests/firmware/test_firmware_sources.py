@@ -1,5 +1,6 @@
 """The C sources: structs by the names of their fields, and no circle of files."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -25,6 +26,16 @@ def problems(root: Path) -> list[str]:
 def test_sources_pass() -> None:
     """Those of firmware, example and kernels."""
     assert problems(ROOT) == []
+
+
+def test_ranges_of_the_header_are_used() -> None:
+    """Of a quantity that only a board or a host needs there is none."""
+    paths = [each for each in (ROOT / "firmware").rglob("*.[ch]") if each.name != "protocol.h"]
+    used = "".join(each.read_text("utf-8") for each in paths)
+    header = (ROOT / "firmware" / "core" / "protocol.h").read_text("utf-8")
+    ranges = re.findall(r"\b(?:WIRE_\w+|\w+_PER_UNIT)\b", header)
+    assert len(ranges) > 10
+    assert [each for each in ranges if not re.search(rf"\b{each}\b", used)] == []
 
 
 @pytest.mark.parametrize(

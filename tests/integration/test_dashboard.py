@@ -670,23 +670,27 @@ async def test_repeated_event_takes_one_line(page: Page) -> None:
 
 
 async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
-    """One that was closed with it has no red frame; its levels are unknown, too."""
+    """One that was closed with it has no red frame; its levels are unknown, too.
+
+    Of readings those are shown that are known, with their decimals and unit.
+    """
     shown = await page.evaluate(
         "import('./side.js').then(({ showAmplifiers }) => {"
-        " const unknown = { state: null, fault: null, levels: [], temperature_c: null,"
-        "  high_voltage: null, high_voltage_v: null, reply_age_s: 1 };"
+        " const unknown = { state: null, fault: null, levels: [], high_voltage: null,"
+        "  reply_age_s: 1 };"
         " const tiles = document.createElement('div');"
         " showAmplifiers(tiles, ["
-        "  { ...unknown, name: 'left', lost: true, closed_with_lost: false },"
-        "  { ...unknown, name: 'right', lost: false, closed_with_lost: true }], []);"
+        "  { ...unknown, name: 'left', lost: true, closed_with_lost: false, fan: 72.04 },"
+        "  { ...unknown, name: 'right', lost: false, closed_with_lost: true, fan: null }],"
+        "  [], { fan: ['Fan', 'rpm', 1] });"
         " return [...tiles.children].map((tile) => [tile.className,"
-        "  ...[...tile.querySelectorAll('h3 span, p')].map((each) => each.textContent)]);"
+        "  ...[...tile.querySelectorAll('h3 span, p, dd')].map((each) => each.textContent)]);"
         "})"
     )
-    unknown = "channels: unknown"
+    unknown = ("channels: unknown", "unknown")
     assert shown == [
-        ["tile bad", "left", "no link", unknown],
-        ["tile", "right", "closed with the lost one", unknown],
+        ["tile bad", "left", "no link", *unknown, "72.0 rpm", "1000 ms ago"],
+        ["tile", "right", "closed with the lost one", *unknown, "1000 ms ago"],
     ]
 
 

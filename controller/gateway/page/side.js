@@ -49,8 +49,8 @@ function tile(amplifier, eras, readings) {
   const list = element("dl");
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
   add("Energised", high_voltage === null ? "unknown" : high_voltage ? "yes" : "no");
-  for (const [key, [label, unit]] of Object.entries(readings)) {
-    if (typeof amplifier[key] === "number") add(label, `${threeDigits(amplifier[key])} ${unit}`);
+  for (const [key, [label, unit, decimals]] of Object.entries(readings)) {
+    if (typeof amplifier[key] === "number") add(label, `${fixed(amplifier[key], decimals)} ${unit}`);
   }
   add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
   if (silence) add("Silence", silenceText(silence));

@@ -13,7 +13,13 @@ from drivers.judge.asking.client import Unusable, require
 from drivers.protocol.records import Field, Number, Record, Values
 from drivers.protocol.records import Rows as RowsOf
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.protocol.table import FEATURES, MESSAGES, QUANTITIES, has_feature
+from drivers.protocol.table import (
+    FEATURES,
+    MESSAGES,
+    QUANTITIES,
+    capability_ranges,
+    has_feature,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +67,6 @@ stage = partial(play, now=0)
 
 
 _WORD = 0xFFFF
-_Range: TypeAlias = tuple[str, int, int, int]
 
 
 def _unlimited(field: Field) -> Field:
@@ -80,7 +85,7 @@ STATED = Record(*map(_unlimited, _REPLY.fields))
 """The reply to GetCaps; a number may be any word, of which those that are wrong are found."""
 
 
-def _ranges(can: Values) -> Iterator[_Range]:
+def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
     """Yield each number with its name, between the least and the most that it may be."""
     rows = [(_REPLY, can), *((_LIMITS, one) for one in can["limits"])]
     for record, row in rows:
@@ -88,12 +93,8 @@ def _ranges(can: Values) -> Iterator[_Range]:
             if isinstance(field, Number) and row[field.name] is not None:
                 name = field.name if record is _REPLY else "limits"
                 yield name, field.quantity.minimum, row[field.name], field.quantity.maximum
-    for name in ("frequency_step", "level_step", "phase_step", "level_max"):
-        yield name, 1, can[name], _WORD
-    yield "voices", can["layers"], can["voices"], _WORD
+    yield from capability_ranges(can)
     yield "features", 0, can["features"], (1 << len(FEATURES)) - 1
-    for name in ("frequency", "watchdog", "envelope_step"):
-        yield f"{name}_max", can[f"{name}_min"], can[f"{name}_max"], _WORD
     for one in can["limits"]:
         low, high = one["frequency_min"], one["frequency_max"]
         yield "limits", can["frequency_min"], low, high

@@ -11,14 +11,9 @@ void board_high_voltage(bool on)
     is_high_voltage = on;
 }
 
-int16_t board_temperature(void)
+struct readings board_readings(void)
 {
-    return 250;
-}
-
-uint16_t board_voltage(void)
-{
-    return is_high_voltage ? 1800 : 0;
+    return (struct readings){.temperature = 250, .high_voltage = is_high_voltage ? 1800 : 0};
 }
 
 enum fault board_fault(uint8_t *channel)

@@ -66,6 +66,14 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
 
 
 @in_virtual_time
+async def test_readings_are_shown_with_their_unit_to_their_step(tmp_path: Path) -> None:
+    """A temperature in steps of 0.1 °C, by `era status` and by a page."""
+    async with ready_daemon(tmp_path) as (_, era):
+        assert (await era.hello("test")).readings["temperature_c"] == ("Temperature", "°C", 1)
+        assert "temperature 25.0 °C" in show_status(await era.status())
+
+
+@in_virtual_time
 async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Path) -> None:
     """Of two amplifiers: while one is lost, during all attempts; and once both are."""
     present, lost, closed = (False, False), (True, False), (False, True)

@@ -53,6 +53,7 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
     assert read["era_link_frames_out_total", "main"] == status.amplifiers[0].statistics.frames_out
     assert read["era_amplifier_temperature_celsius", "main"] == pytest.approx(25)
     assert read["era_amplifier_high_voltage", "main"] == 0
+    assert read["era_amplifier_high_voltage_volts", "main"] == 0
     round_trip = status.amplifiers[0].statistics.round_trip_ms
     assert round_trip is not None
     assert read["era_amplifier_round_trip_seconds", "main"] == pytest.approx(round_trip / 1000)

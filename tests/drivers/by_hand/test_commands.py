@@ -16,7 +16,7 @@ from drivers.by_hand.cli import app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
 from drivers.playing.contents import Tone
-from drivers.protocol.table import STATUS
+from drivers.protocol.table import READINGS, STATUS_FLAGS
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -83,9 +83,8 @@ def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
 
 URL = f"sim://{example_rig_path()}?exact"
 COMMON = {
-    *("url", "state", "fault", "interlock_open", "limited", "token", "high_voltage"),
-    *("high_voltage_v", "temperature_c", "watchdog_left_s", "levels", "layer_tokens", "reports"),
-    *(each.key for each in STATUS.added),
+    *("url", "state", "fault", "token", "watchdog_left_s", "levels", "layer_tokens", "reports"),
+    *(*STATUS_FLAGS, *(each.key for each in READINGS)),
 }
 
 

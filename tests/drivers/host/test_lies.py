@@ -39,7 +39,7 @@ CAPABILITIES = {
     **{"watchdog_max": ("watchdog_max", 65535), "level_max": ("level_max", 65535)},
     **{"frequency_min is above": ("frequency_min", 65535), "level 0": ("level_step", 10001)},
     **{"watchdog_min": ("watchdog_min", 2001), "envelope_step_max": ("envelope_step_max", 5)},
-    "limits": ("limits", 30000),
+    **{"limits": ("limits", 30000), "no level": ("level_max", 0)},
 }
 
 

@@ -4,8 +4,15 @@ import random
 
 import pytest
 
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import BY_NUMBER, IDENTITY, MAX_WORDS, MESSAGES, sensor_reading
+from drivers.protocol.records import Number, Refusal, Values, WireQuantity
+from drivers.protocol.table import (
+    BY_NUMBER,
+    IDENTITY,
+    MAX_WORDS,
+    MESSAGES,
+    QUANTITIES,
+    sensor_reading,
+)
 from drivers.protocol.table import STATUS as STATUS_RECORD
 
 STATUS: Values = {
@@ -38,6 +45,15 @@ def test_long_numbers_and_texts_have_the_high_part_first() -> None:
     words = [8, 3, 0x412D, 0x3100, 0, 2, 0xC3A9, 0]
     assert IDENTITY.pack(texts) == words
     assert IDENTITY.unpack(words, is_strict=True) == texts
+
+
+def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> None:
+    """Of 0.05 rpm two; a unit without a name for keys and metrics is refused."""
+    speed = Number("fan_speed", WireQuantity("fan_speed", "u16", 20, "rpm", 1, 65535))
+    assert (speed.key, speed.metric, speed.label) == (*("fan_speed_rpm",) * 2, "fan speed")
+    assert (speed.decimals, Number("count", QUANTITIES["count"]).decimals) == (2, 0)
+    with pytest.raises(ValueError, match=r"unit of fan_speed .* rpm, got /min"):
+        WireQuantity("fan_speed", "u16", 20, "/min", 1, 65535)
 
 
 @pytest.mark.parametrize(

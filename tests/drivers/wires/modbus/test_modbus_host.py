@@ -1,11 +1,10 @@
-"""The host's side of Modbus: bytes written by hand, and responses that belong to no request."""
+"""The host's side of Modbus: how much is read, and responses that belong to no request."""
 
 import asyncio
 
 import pytest
 
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.protocol.table import MESSAGES, STATUS
 from drivers.wires.modbus.frames import HEAD
 from drivers.wires.modbus.host import ModbusWire
@@ -14,34 +13,6 @@ from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, unaltered
-
-LAYER = LayerSet(0, 20, 500, (Command(3, 2200, 2000, -9000),))
-SET: Values = {
-    **{"session": 9, "token": 7, "index": 0, "parts": 1, "now": 1},
-    "stream": pack_layers([LAYER]),
-}
-# Unit 1; tag 1. The CRCs are those of minimalmodbus.
-ARM = ("Arm", {"session": 9, "watchdog": 250})
-BYTES = {
-    "status": (
-        ("GetStatus", {}),
-        "01 10 0900 0001 02 0001 FE90",
-        "01 10 0900 0001 0255",
-        "01 04 0980 002B B261",
-    ),
-    "arm": (
-        ARM,
-        "01 10 0300 0003 06 0001 0009 00FA 8445",
-        "01 10 0300 0003 804C",
-        "01 04 0380 002B B1B9",
-    ),
-    "set": (  # session, token, part; head, ramp, valid_for; channel 3, 110 Hz, 0.2, -90 degrees
-        ("Set", SET),
-        "01 10 0500 000B 16 0001 0009 0007 0003 0001 0014 01F4 0030 0898 07D0 DCD8 3229",
-        "01 10 0500 000B 8102",
-        "01 04 0580 0005 312D",
-    ),
-}
 
 
 class Peer:
@@ -66,26 +37,6 @@ def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply |
     (arrival,) = wire.received(peer.reply(more.data))
     assert isinstance(arrival, Reply | Nak | Broken)
     return arrival
-
-
-@pytest.mark.parametrize("case", BYTES)
-def test_request_has_the_bytes_written_by_hand(case: str) -> None:
-    """Write, its response, read; over TCP with 2 transactions of one tag, and no CRC."""
-    (name, values), *frames = BYTES[case]
-    write, echo, read = map(bytes.fromhex, frames)
-    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
-    assert wire.request(1, name, values) == write
-    if name != "Set":
-        assert peer.reply(write) == echo
-    assert wire.received(echo) == [More(read)]
-
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    over_tcp = [
-        number.to_bytes(2) + bytes(2) + (len(frame) - 2).to_bytes(2) + frame[:-2]
-        for number, frame in ((1, write), (1, echo), (2, read))
-    ]
-    assert wire.request(1, name, values) == over_tcp[0]
-    assert wire.received(over_tcp[1]) == [More(over_tcp[2])]
 
 
 def test_as_many_registers_are_read_as_the_reply_can_have() -> None:

@@ -55,7 +55,8 @@ class PluginRegistry(Generic[_T]):
         within: the whole text that the name is a part of.
         """
         points = _installed(self.group).get(name, ())
-        packages = [*([_OURS] if name in self.own else []), *map(_package, points)]
+        ours = [_OURS] if name in self.own else []
+        packages = dict.fromkeys([*ours, *map(_package, points)])
         if not packages:
             raise self.error(
                 f"{_quoted(within)}unknown {self.what} {name[:40] + self.ending!r}; "

@@ -15,15 +15,14 @@ from registry.plugins import PluginRegistry
 BUILT_IN: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, Ramp, Texture)
 """The kinds of the project itself."""
 
-_GROUP = "era_haptics.effects"
 _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     "kind of effect",
-    _GROUP,
+    "era_haptics.effects",
     Effect,
     error=InputError,
     own={each.kind: each for each in BUILT_IN},
     called=attrgetter("kind"),
-    hint=f"; one of a package needs the package installed, with an entry point in {_GROUP}",
+    hint="; one of a package needs it installed, with an entry point in era_haptics.effects",
 )
 
 

@@ -517,7 +517,7 @@ def test_every_effect_of_the_project_is_registered() -> None:
     members = [vars(import_module(f"controller.effects.{each.stem}")) for each in modules]
     kinds = {each for every in members for each in every.values() if inspect.isclass(each)}
     effects = {each for each in kinds if issubclass(each, Effect) and not inspect.isabstract(each)}
-    assert effects == set(BUILT_IN)
+    assert effects == set(BUILT_IN), "add it to BUILT_IN in controller/effects/kinds.py"
     assert sorted(names := [each.kind for each in BUILT_IN]) == names
 
 

@@ -156,13 +156,12 @@ def _check_use(
     if name is None:
         return
     if name not in effects:
-        define = (
-            f"; or define it, as `{name}: {{}}` under effects" if name in effect_kinds() else ""
-        )
         validation.add(
             path,
             f"unknown effect {name!r}; {did_you_mean(name, effects)}"
-            f"choose one of {', '.join(effects)}{define}",
+            f"choose one of {', '.join(effects)}"
+            + f"; or define it, as `{name}: {{}}` under effects"
+            * (name in effect_kinds()),
         )
         return
     effect = effects[name]

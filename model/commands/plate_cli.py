@@ -308,10 +308,12 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
             for key, wavelength in summary["bending_wavelength_m"].items()
         ),
+        *(
+            f"    carries {1e3 * mass['mass_kg']:g} g at ({mass['at_m'][0]:g}, "
+            f"{mass['at_m'][1]:g}) m"
+            for mass in summary["point_masses"]
+        ),
     ]
-    for mass in summary["point_masses"]:
-        x, y = mass["at_m"]
-        rows.append(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
     print_report(rows, summary, as_json=as_json)
 
 
@@ -334,8 +336,10 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
         **{f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()},
     }
     for name, rigidity in rows.items():
-        ratio = math.sqrt(rigidity / bonded)
-        yield f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}"
+        yield (
+            f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x "
+            f"{math.sqrt(rigidity / bonded):.3f}"
+        )
     yield "homogeneous plate like it at the highest frequency"
 
 

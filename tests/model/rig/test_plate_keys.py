@@ -28,7 +28,13 @@ def rig_with(key: str, mesh: str, stiffness: float = 17e3, more: float = 0.02) -
         "plate": {**PLATE, "material": GLASS, key: start + more * min(1.0, PLAIN[key].at_most)},
         "mesh": mesh,
         "eras": {
-            name: {"at": at, "stiffness": stiffness, "amplifier": "main", "channel": number}
+            name: {
+                "at": at,
+                "stiffness": stiffness,
+                "bolt_mass": 0.01,
+                "amplifier": "main",
+                "channel": number,
+            }
             for number, (name, at) in enumerate(CORNERS.items())
         },
         "amplifiers": {"main": {"url": "sim://"}},

@@ -47,15 +47,15 @@ class PluginRegistry(Generic[_T]):
 
     def names(self) -> tuple[str, ...]:
         """All names, our own first; no plug-in is loaded."""
-        return (*self.own, *sorted(_installed(self.group).keys() - self.own.keys()))
+        return (*self.own, *sorted(plugins_of(self.group).keys() - self.own.keys()))
 
     def find(self, name: str, *, within: str = "") -> _T:
         """Look up a name; raises `error` for an unknown or ambiguous one, or a broken plug-in.
 
         within: the whole text that the name is a part of.
         """
-        points = _installed(self.group).get(name, ())
-        packages = [*([_OURS] if name in self.own else []), *map(_package, points)]
+        points = plugins_of(self.group).get(name, ())
+        packages = dict.fromkeys([_OURS] * (name in self.own) + [*map(_package, points)])
         if not packages:
             raise self.error(
                 f"{_quoted(within)}unknown {self.what} {name[:40] + self.ending!r}; "
@@ -83,7 +83,7 @@ class PluginRegistry(Generic[_T]):
         maker = self.find(name, within=url)
         if name in self.own:
             return maker(url)
-        (point,) = _installed(self.group)[name]
+        (point,) = plugins_of(self.group)[name]
         with self._attributed(point, url, but=(self.error,)):
             return maker(url)
 
@@ -165,8 +165,8 @@ def _quoted(within: str) -> str:
     return f"{within!r}: " if within else ""
 
 
-def _installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
-    """The entry points of a group by name, on the current path: a notebook may add to it."""
+def plugins_of(group: str) -> dict[str, tuple[EntryPoint, ...]]:
+    """Return the entry points of a group by name, on the current path: a notebook may add to it."""
     return _found(group, tuple(sys.path))
 
 

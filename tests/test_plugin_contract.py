@@ -12,7 +12,8 @@ import pytest
 
 from controller.cli.main import run
 from controller.effects.buzz import Buzz
-from controller.effects.effect import Effect, effect_kind, effect_kinds
+from controller.effects.effect import Effect
+from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.contacts import Contact, ContactKey
@@ -289,6 +290,13 @@ def test_plugin_on_the_path_twice_is_one(kind: Kind, install: Install) -> None:
     module = install("good", kind, "fine", kind.works)
     install("left", kind, "fine", kind.works, module=module)
     assert is_made_by(kind.look_up("fine"), sys.modules[module].THING)
+
+
+def test_installation_of_an_older_version_of_ours_is_no_other_package(install: Install) -> None:
+    """Whose entry points name what is now the project's own without one."""
+    (effects,) = (kind for kind in KINDS if kind.group == "effects")
+    install("era-haptics", effects, *effects.own[:1], effects.works)
+    assert effects.look_up(effects.own[0]) is effects.own[1]
 
 
 @of_every_kind

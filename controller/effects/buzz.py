@@ -21,6 +21,7 @@ class Buzz(Effect):
 
     kind: ClassVar[str] = "buzz"
     is_for_motion: ClassVar[bool] = False
+    needs_entry: ClassVar[bool] = False
 
     duration: (
         Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None

@@ -14,6 +14,7 @@ class Click(Effect):
 
     kind: ClassVar[str] = "click"
     is_for_motion: ClassVar[bool] = False
+    needs_entry: ClassVar[bool] = False
 
     duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.5)] = 0.040
     """The plate needs 20 ms to follow."""

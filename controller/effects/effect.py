@@ -1,11 +1,11 @@
-"""Effects: their parameters in a layout, their course at one finger, and their kinds by name."""
+"""Effects: their parameters in a layout, and their course at one finger."""
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
+from model.table.request import MAX_MODULATION, MIN_MODULATION
 from pydantic import BeforeValidator
 
 from controller.effects.band import Band, TunedSection
@@ -15,9 +15,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.answer.request import MAX_MODULATION, MIN_MODULATION
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
-from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
-from registry.plugins import PluginRegistry
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
@@ -133,12 +131,15 @@ class Effect(TunedSection, ABC):
     """Parameters of an effect; each kind of effect is a subclass.
 
     kind: its name in layouts; is_for_motion: whether it follows a moving finger and belongs under
-    `on_move`, or runs by itself; needs_region: whether it is felt in regions only.
+    `on_move`, or runs by itself; needs_region: whether it is felt in regions only; needs_entry:
+    whether a layout defines it before it is used. Those of the project that need none exist in
+    every layout.
     """
 
     kind: ClassVar[str]
     is_for_motion: ClassVar[bool]
     needs_region: ClassVar[bool] = False
+    needs_entry: ClassVar[bool] = True
 
     level: Level = STRONG_DB_SL
 
@@ -165,22 +166,3 @@ class Effect(TunedSection, ABC):
     def max_db_sl(self, level_db_sl: float | None) -> float:
         """Return the highest level [dB SL] in a run at a level; infinite for None."""
         return math.inf if level_db_sl is None else level_db_sl
-
-
-_KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
-    "kind of effect",
-    "era_haptics.effects",
-    Effect,
-    error=InputError,
-    called=attrgetter("kind"),
-)
-
-
-def effect_kinds() -> tuple[str, ...]:
-    """Return the names of all installed kinds without loading any."""
-    return _KINDS.names()
-
-
-def effect_kind(name: str) -> type[Effect]:
-    """Return the kind of a name; raises InputError if it is unknown or its plug-in fails."""
-    return _KINDS.find(name)

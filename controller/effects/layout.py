@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from controller.effects.band import Band, band_problem
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
 from controller.effects.effect import Effect
+from controller.effects.kinds import BUILT_IN
 from controller.effects.region import Region
 from model.arrays import FloatArray
 from model.finger.perception import STRONG_DB_SL
@@ -22,7 +21,7 @@ ELSEWHERE = "elsewhere"
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
     """Return the effects that every layout has without defining them, at a level."""
-    return {BUZZ: Buzz(level=level_db_sl), "click": Click(level=level_db_sl)}
+    return {each.kind: each(level=level_db_sl) for each in BUILT_IN if not each.needs_entry}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from controller.effects.band import TunedSection
-from controller.effects.effect import Effect, Level, effect_kind, effect_kinds
+from controller.effects.effect import Effect, Level
+from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region
 from model.config.document import Document, KeyPath, read_document
@@ -158,7 +159,9 @@ def _check_use(
         validation.add(
             path,
             f"unknown effect {name!r}; {did_you_mean(name, effects)}"
-            f"choose one of {', '.join(effects)}",
+            f"choose one of {', '.join(effects)}"
+            + f"; or define it, as `{name}: {{}}` under effects"
+            * (name in effect_kinds()),
         )
         return
     effect = effects[name]
@@ -198,9 +201,11 @@ def _region(name: str, section: RegionSection) -> Region:
 def _checked(document: Document) -> CheckedFile:
     """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
     layout = layout_of(document, None)
+    unused = default_effects().keys() - {name for _, _, name in layout.uses()}
     return CheckedFile(
         f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
-        f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
+        f"effects {', '.join(name for name in layout.effects if name not in unused) or 'none'}; "
+        f"elsewhere {layout.elsewhere or 'nothing'}. "
         "Check the daemon's file that names it to see whether it fits the plate",
     )
 

@@ -32,6 +32,7 @@ from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.config.document import read_document
 from model.errors import InputError
 from model.rig.sections import RigSection
+from registry.plugins import plugins_of
 from registry.regular_file import regular_file
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
@@ -125,10 +126,10 @@ def versions() -> dict[str, Any]:
 
 def _entry_points(group: str) -> dict[str, str]:
     """All entry points of a group by name, with their packages."""
-    found: dict[str, list[str]] = {}
-    for point in sorted(entry_points(group=group)):
-        found.setdefault(point.name, []).append(f"{point.value} ({_package(point.dist)})")
-    return {name: ", ".join(points) for name, points in found.items()}
+    return {
+        name: ", ".join(sorted(f"{point.value} ({_package(point.dist)})" for point in points))
+        for name, points in sorted(plugins_of(group).items())
+    }
 
 
 def _package(dist: Any) -> str:

@@ -4,33 +4,29 @@ A kind's row is the first paragraph of its docstring.
 """
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
-from controller.effects.effect import Effect, effect_kind, effect_kinds
+from controller.effects.effect import Effect
+from controller.effects.kinds import BUILT_IN
 from key_tables import HEAD, in_cell, rows_of
 
 
 def kinds() -> str:
     """A row for each kind that is built in."""
     rows = [
-        f"| `{each.kind}` | {_finger(each)} | {in_cell(inspect.getdoc(each) or '')} |"
-        for each in _built_in()
+        f"| `{each.kind}` | {_finger(each)} | {'yes' if each.needs_entry else ''} | "
+        f"{in_cell(inspect.getdoc(each) or '')} |"
+        for each in BUILT_IN
     ]
-    return "\n".join(["| kind | for | what is felt |", "|---|---|---|", *rows])
+    return "\n".join(["| kind | for | needs an entry | what is felt |", "|---|---|---|---|", *rows])
 
 
 def keys() -> str:
     """A row for each key that a kind has by itself."""
-    return "\n".join([HEAD, *(row for each in _built_in() for row in rows_of(each, above=Effect))])
+    return "\n".join([HEAD, *(row for each in BUILT_IN for row in rows_of(each, above=Effect))])
 
 
 PARTS: Mapping[str, Callable[[], str]] = {"kinds": kinds, "keys": keys}
-
-
-def _built_in() -> Iterator[type[Effect]]:
-    """The kinds of the project itself: others may be installed."""
-    every = (effect_kind(name) for name in effect_kinds())
-    return (each for each in every if each.__module__.startswith("controller."))
 
 
 def _finger(kind: type[Effect]) -> str:

@@ -18,7 +18,6 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
 from model.config.sections import Quantity, Section
-from model.config.units import COMMON_FACTORS
 
 HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
 
@@ -119,7 +118,7 @@ def _default(field: FieldInfo, quantity: Quantity | None) -> str:
         return f"`[{', '.join(f'{each:g}' for each in value)}]`"
     if quantity is None:
         return f"`{str(value).lower()}`"
-    units = COMMON_FACTORS[quantity.dimension.unit] if quantity.dimension.unit else {}
+    units = quantity.dimension.factors if quantity.dimension.unit else {}
     forms = [f"{value:.7g}", *(f"{value / float(by):.7g} {unit}" for unit, by in units.items())]
     return min(forms, key=lambda form: (len(form.split()[0]), len(form)))
 

@@ -1,6 +1,7 @@
 """Interfaces for effects: entry points `era_haptics.effects`."""
 
-from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation, effect_kind
+from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
+from controller.effects.kinds import effect_kind
 from controller.effects.region import Region
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact, ContactKey

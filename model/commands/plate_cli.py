@@ -258,7 +258,7 @@ def materials(as_json: JsonOption = False) -> None:
             known[name] = known_material(name)
         except InputError as error:  # that of one plug-in does not hide the others
             problems.append(str(error))
-    entries = [
+    entries: list[dict[str, Any]] = [
         {
             "name": name,
             "E_pa": one.material.E,
@@ -270,17 +270,14 @@ def materials(as_json: JsonOption = False) -> None:
         }
         for name, one in known.items()
     ]
-    rows = []
-    for name, one in known.items():
-        numbers = one.material
-        rows += [
-            f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}",
-            f"    source  {one.source}",
-            f"    variation  {one.variation}",
-            f"    loss factor of the bare material, about  {one.loss_factor}",
-        ]
-    rows.append("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
-    print_report(rows, {"materials": entries, "problems": problems}, as_json=as_json)
+    rows = [
+        f"{each['name']}: E {each['E_pa'] / 1e9:g} GPa, rho {each['rho_kg_m3']:g} kg/m³, "
+        f"nu {each['nu']:g}\n    source  {each['source']}\n    variation  {each['variation']}\n"
+        f"    loss factor of the bare material, about  {each['loss_factor']}"
+        for each in entries
+    ]
+    other = "Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}"
+    print_report([*rows, other], {"materials": entries, "problems": problems}, as_json=as_json)
     for problem in () if as_json else problems:
         print(f"era: warning: {problem}", file=sys.stderr)
 
@@ -289,7 +286,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """Show material and rigidity of a rig's plate."""
     from model.quantities import in_display_unit
     from model.rig.file import load_rig
-    from model.rig.plate_summary import plate_summary
+    from model.rig.plate_summary import FURTHER, plate_summary
 
     summary = plate_summary(load_rig(rig_file))
     bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
@@ -301,15 +298,22 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
         f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}",
         f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m",
         f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)",
+        *(
+            f"    {name.replace('_', ' ')}  {in_display_unit(value, each.unit)}"
+            for name, each in FURTHER.items()
+            if (value := summary["further"][each.key(name)])
+        ),
         *_air_rows(summary["air_gap"]),
         *(
             f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
             for key, wavelength in summary["bending_wavelength_m"].items()
         ),
+        *(
+            f"    carries {1e3 * mass['mass_kg']:g} g at ({mass['at_m'][0]:g}, "
+            f"{mass['at_m'][1]:g}) m"
+            for mass in summary["point_masses"]
+        ),
     ]
-    for mass in summary["point_masses"]:
-        x, y = mass["at_m"]
-        rows.append(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
     print_report(rows, summary, as_json=as_json)
 
 
@@ -325,24 +329,29 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
             f"E {layer['E_pa'] / 1e9:g} GPa, rho {layer['rho_kg_m3']:g} kg/m³, nu {layer['nu']:g}"
         )
     bonded = laminate["rigidity_perfectly_bonded_n_m"]
-    rows = {"perfectly bonded": bonded, "freely sliding": laminate["rigidity_freely_sliding_n_m"]}
-    for key, rigidity in laminate.get("rigidity_by_frequency_n_m", {}).items():
-        rows[f"in free waves of {_frequency(key)}"] = rigidity
+    in_waves = laminate.get("rigidity_by_frequency_n_m", {})
+    rows = {
+        "perfectly bonded": bonded,
+        "freely sliding": laminate["rigidity_freely_sliding_n_m"],
+        **{f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()},
+    }
     for name, rigidity in rows.items():
-        ratio = math.sqrt(rigidity / bonded)
-        yield f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}"
+        yield (
+            f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x "
+            f"{math.sqrt(rigidity / bonded):.3f}"
+        )
     yield "homogeneous plate like it at the highest frequency"
 
 
-def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
-    """Yield the air gap behind a plate."""
+def _air_rows(air: dict[str, Any] | None) -> list[str]:
+    """The air gap behind a plate."""
     if air is None:
-        yield "    no air: a plate in a vacuum, unless air_gap is given"
-        return
-    edges = "sealed" if air["closed"] else "open"
-    yield f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}"
-    if air["closed"]:
-        yield f"        stiffness against even motion  {air['stiffness_n_m3'] / 1e6:.4g} MN/m³"
+        return ["    no air: a plate in a vacuum, unless air_gap is given"]
+    gap = f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges"
+    if not air["closed"]:
+        return [f"{gap} open"]
+    stiffness = f"{air['stiffness_n_m3'] / 1e6:.4g} MN/m³"
+    return [f"{gap} sealed", f"        stiffness against even motion  {stiffness}"]
 
 
 def _frequency(key: str) -> str:

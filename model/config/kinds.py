@@ -60,9 +60,9 @@ _KINDS = {
 def kind_called(name: str) -> ConfigKind:
     """Return the kind of a name; raises InputError for an unknown one."""
     if name not in _KINDS:
-        suggested = did_you_mean(name, _KINDS)
         raise InputError(
-            f"unknown kind of configuration {name[:40]!r}; {suggested}known are {', '.join(_KINDS)}"
+            f"unknown kind of configuration {name[:40]!r}; {did_you_mean(name, _KINDS)}"
+            f"known are {', '.join(_KINDS)}"
         )
     kind: ConfigKind = resolve_name(_KINDS[name])
     return kind

@@ -2,7 +2,8 @@
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING
@@ -15,42 +16,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Dimension:
-    """A kind of value: its name with article, its SI unit, and an example to write."""
+    """A kind of value: its name with article, its SI unit, and an example to write.
+
+    factors: of common units, as pint has them: loading pint doubles a command's start. Any other
+    unit of the dimension is found by pint.
+    """
 
     name: str
     unit: str
     example: str
+    factors: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    def key(self, name: str) -> str:
+        """The name of such a value with its unit, as in JSON: `stiffness_n_m`."""
+        unit = self.unit.lower().replace(" ", "").replace("/", "_").replace("^", "")
+        return f"{name}_{unit}".removesuffix("_")
 
 
-LENGTH = Dimension("a length", "m", "1.5 mm")
-MODULUS = Dimension("a modulus", "Pa", "70 GPa")
-DENSITY = Dimension("a density", "kg/m^3", "2700 kg/m^3")
-STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m")
-DAMPING = Dimension("a damping", "N s/m", "2 N s/m")
-MASS = Dimension("a mass", "kg", "5 g")
-FREQUENCY = Dimension("a frequency", "Hz", "250 Hz")
-TIME = Dimension("a time", "s", "50 ms")
-SPEED = Dimension("a speed", "m/s", "5 cm/s")
-ANGLE = Dimension("an angle", "rad", "15 deg")
-RATE = Dimension("a rate", "1/s", "50 Hz")
-SLEW = Dimension("a rise of the level", "1/s", "2 %/ms")
-RATIO = Dimension("a plain number", "", "0.05 or 5 %")
-
-COMMON_FACTORS = {
-    LENGTH.unit: {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
-    MODULUS.unit: {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"},
-    DENSITY.unit: {"kg/m^3": "1"},
-    STIFFNESS.unit: {"N/m": "1", "kN/m": "1000", "N/mm": "1000"},
-    DAMPING.unit: {"N s/m": "1"},
-    MASS.unit: {"kg": "1", "g": "0.001"},
-    FREQUENCY.unit: {"Hz": "1", "kHz": "1000"},
-    TIME.unit: {"s": "1", "ms": "0.001"},
-    SPEED.unit: {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
-    ANGLE.unit: {"rad": "1", "deg": "0.01745329251994329576923690768"},
-    RATE.unit: {"Hz": "1", "%/ms": "10"},
-    RATIO.unit: {"%": "0.01"},
-}
-"""Factors of common units by SI unit, as pint has them: loading pint doubles a command's start."""
+LENGTH = Dimension(
+    "a length",
+    "m",
+    "1.5 mm",
+    {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
+)
+MODULUS = Dimension("a modulus", "Pa", "70 GPa", {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"})
+DENSITY = Dimension("a density", "kg/m^3", "2700 kg/m^3", {"kg/m^3": "1"})
+STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m", {"N/m": "1", "kN/m": "1000", "N/mm": "1000"})
+DAMPING = Dimension("a damping", "N s/m", "2 N s/m", {"N s/m": "1"})
+MASS = Dimension("a mass", "kg", "5 g", {"kg": "1", "g": "0.001"})
+FREQUENCY = Dimension("a frequency", "Hz", "250 Hz", {"Hz": "1", "kHz": "1000"})
+TIME = Dimension("a time", "s", "50 ms", {"s": "1", "ms": "0.001"})
+SPEED = Dimension("a speed", "m/s", "5 cm/s", {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"})
+ANGLE = Dimension(
+    "an angle", "rad", "15 deg", {"rad": "1", "deg": "0.01745329251994329576923690768"}
+)
+RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
+SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
+RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
 
 # The number is split from its unit here and texts are short, so that nothing is evaluated: pint
 # by itself would compute `9**9**9 m`.
@@ -87,7 +89,7 @@ def _parse(text: str, dimension: Dimension) -> float:
     number, unit = match.groups()
     if unit is None:
         return _to_float(number, dimension)
-    known = COMMON_FACTORS[dimension.unit].get(unit)
+    known = dimension.factors.get(unit)
     factor = unit_factor(text, unit, dimension) if known is None else Decimal(known)
     return _to_float(Decimal(number) * factor, dimension)
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.forward import LEAST_LOSS, PlateAt
 from model.reduction.receptance import TERMS, combined
-from model.structure.modal_elasticity import check_scales
 from model.structure.plate import LOSS_FREQUENCY
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
@@ -56,10 +55,6 @@ Columns: TypeAlias = dict[str, ComplexArray]
 
 def _by_plate(plate: PlateAt) -> Columns:
     """By thickness, modulus and loss factor of the whole plate."""
-    # Also where they are those solved, their slopes are those of a plate that scales.
-    space = plate.model.space
-    stds = (space.std[space.groups[kind]] for kind in ("thickness", "modulus"))
-    check_scales(plate.model.rig.plate, *(1 + std for std in stds))
     functions, reach, n = plate.functions, plate.reach, plate.base.shape[1]
     seen, driven = reach[:, plate.model.observed], reach[:, :n].swapaxes(1, 2)
 

@@ -27,7 +27,7 @@ from model.structure.attachments import (
     coupled_forces,
     footprints_of,
 )
-from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
+from model.structure.modal_elasticity import ModalElasticity, check_scales, lowest_elastic
 from model.structure.plate import LOSS_FREQUENCY
 
 LEAST_LOSS = 1e-9
@@ -59,6 +59,7 @@ class ForwardModel:
 
     frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
     others; space: what may differ; form: the plate in coordinates in which it may have form errors.
+    Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
     """
 
     rig: Rig
@@ -69,6 +70,11 @@ class ForwardModel:
     fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
     last_places: dict[bytes, Places] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse a plate of which neither responses nor slopes would be right."""
+        stds = (self.space.std[self.space.groups[kind]] for kind in ("thickness", "modulus"))
+        check_scales(self.rig.plate, *(1 + std for std in stds))
 
     @cached_property
     def omega(self) -> FloatArray:

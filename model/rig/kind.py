@@ -186,12 +186,11 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
 def _urls(document: Document) -> dict[str, str]:
     """All URLs that are text."""
     amplifiers = document.data.get("amplifiers")
-    urls = {}
-    for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():
-        url = amplifier.get("url") if isinstance(amplifier, dict) else None
-        if isinstance(url, str):
-            urls[name] = whole_url(url, document.source, str(name))
-    return urls
+    return {
+        name: whole_url(url, document.source, str(name))
+        for name, amplifier in (amplifiers.items() if isinstance(amplifiers, dict) else ())
+        if isinstance(amplifier, dict) and isinstance(url := amplifier.get("url"), str)
+    }
 
 
 def whole_url(url: str, rig_file: str | Path, amplifier: str) -> str:

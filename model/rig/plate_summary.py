@@ -3,7 +3,9 @@
 import math
 from typing import Any
 
+from model.config.sections import Quantity
 from model.rig.rig import Rig
+from model.rig.sections import PlateSection
 from model.structure.laminate_section import (
     bending,
     freely_sliding,
@@ -12,6 +14,14 @@ from model.structure.laminate_section import (
 )
 from model.structure.plate import AirGap, Bond, Laminate, Plate
 from registry.limits import GuardLimits
+
+FURTHER = {
+    name: each.dimension
+    for name, field in PlateSection.model_fields.items()
+    for each in field.metadata
+    if isinstance(each, Quantity) and name not in {"length", "width", "loss_factor"}
+}
+"""Keys of the plate that are plain quantities and have no line of their own in a summary."""
 
 
 def plate_summary(rig: Rig) -> dict[str, Any]:
@@ -31,6 +41,7 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "rho_kg_m3": plate.material.rho,
         "nu": plate.material.nu,
         "loss_factor": plate.loss_factor,
+        "further": {each.key(name): getattr(plate, name) for name, each in FURTHER.items()},
         "mass_kg": plate.mass,
         "surface_density_kg_m2": plate.surface_density,
         "flexural_rigidity_n_m": plate.flexural_rigidity,
@@ -68,7 +79,9 @@ def _air_gap(gap: AirGap, limits: GuardLimits) -> dict[str, Any]:
 
 
 def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
-    summary: dict[str, Any] = {
+    frequencies = limits.frequency_min, limits.frequency_max
+    by_frequency = {f"{each:g}_hz": bending(laminate, each).rigidity for each in frequencies}
+    return {
         "layers": [
             {
                 "material": layer.material.name,
@@ -85,10 +98,5 @@ def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
         "bond": laminate.bond.value,
         "rigidity_perfectly_bonded_n_m": perfectly_bonded(laminate.layers).rigidity,
         "rigidity_freely_sliding_n_m": freely_sliding(laminate.layers).rigidity,
+        **({"rigidity_by_frequency_n_m": by_frequency} if laminate.bond is Bond.FULL else {}),
     }
-    if laminate.bond is Bond.FULL:
-        summary["rigidity_by_frequency_n_m"] = {
-            f"{frequency:g}_hz": bending(laminate, frequency).rigidity
-            for frequency in (limits.frequency_min, limits.frequency_max)
-        }
-    return summary

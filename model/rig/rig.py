@@ -84,8 +84,10 @@ class Rig:
         """The ERA of a name; raises InputError for an unknown one."""
         eras = {era.name: era for era in self.eras}
         if name not in eras:
-            meant = did_you_mean(str(name), eras)
-            raise InputError(f"unknown ERA {name!r}; {meant}choose from {', '.join(eras)}")
+            raise InputError(
+                f"unknown ERA {name!r}; {did_you_mean(str(name), eras)}"
+                f"choose from {', '.join(eras)}"
+            )
         return eras[name]
 
     @property

@@ -278,11 +278,6 @@ class AmplifierSection(Section):
 class UncertaintySection(Section):
     """Standard deviations of a rig's parameters, see `Uncertainty`; a key left out means none."""
 
-    @classmethod
-    def not_measured(cls) -> "UncertaintySection":
-        """Return the section of a rig that was not measured."""
-        return cls(**asdict(Uncertainty()))
-
     gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
     """Gain of each channel, relative."""
 
@@ -415,9 +410,9 @@ class RigSection(Section):
     limits: LimitsSection = LimitsSection()
     """Limits of commands, see [limits](#limits)."""
 
-    uncertainty: Annotated[UncertaintySection, BeforeValidator(_mapping)] = (
-        UncertaintySection.not_measured()
-    )
+    uncertainty: Annotated[UncertaintySection, BeforeValidator(_mapping)] = UncertaintySection(
+        **asdict(Uncertainty())
+    )  # of a rig that was not measured
     """How well the rig is known, see [uncertainty](#uncertainty)."""
 
     fingertip: FingertipSection | Literal["none"] = FingertipSection()

@@ -130,8 +130,8 @@ def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
     if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(
             f"plate.{stays[0]}: thickness and modulus must be those that were solved, since this "
-            "part does not scale with them; set uncertainty.thickness to 0, or solve the plate "
-            "for each thickness"
+            "part does not scale with them; set uncertainty.thickness to 0; what varies them all "
+            "the same (era rig check, era calibrate, a daemon that learns) needs a rig without it"
         )
 
 

@@ -268,12 +268,10 @@ class Plate(Sheet):
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
         expect_values(self, "plate", above="length width thickness")
-        if not (math.isfinite(self.loss_factor) and 0 <= self.loss_factor < 1):
-            raise InputError(
-                f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
-            )
-        bounds = -MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT
-        expect_between(self.loss_exponent, *bounds, what="plate: loss_exponent")
+        expect_between(self.loss_factor, 0, 1, what="plate: loss_factor")
+        expect_between(
+            self.loss_exponent, -MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT, what="plate: loss_exponent"
+        )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)
         object.__setattr__(self, "mode_deviations", deviations)
@@ -294,9 +292,18 @@ class Plate(Sheet):
         )
 
     @property
+    def rigid_masses(self) -> tuple[float, float, float]:
+        """Mass [kg] of the bare rigid plate in heave and in both tilts.
+
+        In w = q0 + q1 (x / length - 1/2) + q2 (y / width - 1/2).
+        """
+        mass = self.surface_density * self.length * self.width
+        return mass, mass / 12, mass / 12
+
+    @property
     def mass(self) -> float:
         """Mass of the bare plate [kg]."""
-        return self.surface_density * self.length * self.width
+        return self.rigid_masses[0]
 
     @property
     def shear_rigidity(self) -> float:

@@ -25,7 +25,7 @@ def rigid_body_frequencies(
     """
     p, stiffness, mass = _attached(plate, eras, loads)
     K = (p * stiffness) @ p.T
-    M = (p * mass) @ p.T + plate.mass * np.diag([1.0, 1 / 12, 1 / 12])
+    M = (p * mass) @ p.T + np.diag(plate.rigid_masses)
     inverse = np.linalg.inv(np.linalg.cholesky(M))
     eigenvalues = np.linalg.eigvalsh(inverse @ K @ inverse.T)
     return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2 * np.pi))
@@ -74,6 +74,5 @@ def support_problem(
 
 def check_supported(plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()) -> None:
     """Raise InputError for a plate that its ERAs and loads do not support."""
-    problem = support_problem(plate, eras, loads=loads)
-    if problem is not None:
+    if (problem := support_problem(plate, eras, loads=loads)) is not None:
         raise InputError(problem)

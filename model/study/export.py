@@ -133,11 +133,11 @@ _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad"}
 def _physics(table: LocalizationTable) -> dict[str, Any]:
     """All that a table must have of its rig, numbers with the units of the rig's file."""
     by_unit = {
-        key: f"{key}_{unit.lower().replace(' ', '').replace('/', '_').replace('^', '')}"
+        key: each.dimension.key(key)
         for section in (*_SECTIONS, FingertipSection)
         for key, field in section.model_fields.items()
-        for unit in (each.dimension.unit for each in field.metadata if isinstance(each, Quantity))
-        if unit
+        for each in field.metadata
+        if isinstance(each, Quantity)
     } | _NAMES
     return {
         name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)

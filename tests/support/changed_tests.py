@@ -32,7 +32,8 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (
         (
             *("drivers/protocol/", "controller/api/", "controller/cli/", "drivers/by_hand/cli.py"),
-            *("model/commands/", "sim/cli.py", "era_haptics/", "docs/generators/"),
+            *("controller/effects/", "model/commands/", "model/rig/sections.py", "sim/cli.py"),
+            *("era_haptics/", "docs/generators/"),
         ),
         ("make pages",),
     ),

@@ -9,6 +9,7 @@ import pytest
 from controller.api.jsonrpc import ErrorCode
 from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
+from controller.effects.layout import default_effects
 from controller.gateway.settings import read_token
 from controller.play.observer import Silenced
 from daemon_bench import (
@@ -241,7 +242,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
         assert [region["name"] for region in layout["regions"]] == ["pad", "quiet"]
         assert layout["regions"][0] | {"x_m": 0.0, "width_m": 0.15} == layout["regions"][0]
         listed = {each.name: each for each in (await era.effects()).effects}
-        assert listed.keys() == {"alert", "buzz", "click", "hum"}
+        assert listed.keys() == {"alert", "hum", *default_effects()}
         assert (listed["alert"].kind, listed["alert"].parameters["duration"]) == ("buzz", 10.0)
         assert await error_code(era.play("alert", ON_QUIET)) is ErrorCode.WRONG_STATE
         await era.arm("me", lease_s=60)

@@ -1,9 +1,12 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
+import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import pairwise
+from pathlib import Path
 from types import EllipsisType
 
 import pytest
@@ -15,6 +18,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
+from controller.effects.kinds import BUILT_IN
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
@@ -505,6 +509,16 @@ def test_shapes(
     """Edges and corners belong to a shape."""
     assert [shape.contains(*point) for point in inside] == [True] * len(inside)
     assert [shape.contains(*point) for point in outside] == [False] * len(outside)
+
+
+def test_every_effect_of_the_project_is_registered() -> None:
+    """In BUILT_IN of controller/effects/kinds.py, by name."""
+    modules = Path(inspect.getfile(Effect)).parent.glob("*.py")
+    members = [vars(import_module(f"controller.effects.{each.stem}")) for each in modules]
+    kinds = {each for every in members for each in every.values() if inspect.isclass(each)}
+    effects = {each for each in kinds if issubclass(each, Effect) and not inspect.isabstract(each)}
+    assert effects == set(BUILT_IN), "add it to BUILT_IN in controller/effects/kinds.py"
+    assert sorted(names := [each.kind for each in BUILT_IN]) == names
 
 
 def test_effect_kinds_include_plug_ins() -> None:

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml.comments import CommentedMap
 
+from model.config import units
 from model.config.document import ConfigError, parse_document, read_document
 from model.config.editing import data_text, edited_text
 from model.config.points import in_metres, parse_frequencies
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import (
-    COMMON_FACTORS,
     DAMPING,
     DENSITY,
     FREQUENCY,
@@ -295,9 +295,14 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
 
 
 @pytest.mark.parametrize(
-    ("si", "unit"), [(si, unit) for si, factors in COMMON_FACTORS.items() for unit in factors]
+    ("dimension", "unit"),
+    [
+        (each, unit)
+        for each in vars(units).values()
+        if isinstance(each, Dimension)
+        for unit in each.factors
+    ],
 )
-def test_common_factors_are_those_of_pint(si: str, unit: str) -> None:
+def test_common_factors_are_those_of_pint(dimension: Dimension, unit: str) -> None:
     """They agree to the last digit, so that it does not matter which of the two is used."""
-    factor = unit_factor(f"1 {unit}", unit, Dimension("a value", si, ""))
-    assert factor == Decimal(COMMON_FACTORS[si][unit])
+    assert unit_factor(f"1 {unit}", unit, dimension) == Decimal(dimension.factors[unit])

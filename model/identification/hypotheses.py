@@ -1,10 +1,9 @@
 """What may have happened to a plate at once.
 
-One spring, one gain, the thickness, a mass, a hand that stays or a crack: each is a wide prior of
-the parameters that would have changed, those of a hand and a crack beside the plate's
-(`model.identification.alterations`). The most likely one is that whose batch estimate over the last
-patterns costs least, a further cost for each parameter that changed; where even that leaves
-residuals that chance does not, the plate has changed in a way not known.
+One spring, one gain, the thickness or a mass: each is a wide prior of the parameters that would
+have changed. The most likely one is that whose batch estimate over the last patterns costs least, a
+further cost for each parameter that changed; where even that leaves residuals that chance does not,
+the plate has changed in a way not known.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,6 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import ranked_by
 from model.identification.alarm import PLACES
-from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
 from model.identification.settled import Touched, finger_covariance
@@ -26,10 +24,9 @@ from model.identification.settled_update import State, Updated, update
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3
 _COST_OF_CHANGE = 4.0
-_UNLIKELY, _FAR_AHEAD, _ROUGHLY = 1e-4, 25.0, 4.0
-_STARTS, _ALTERED_STARTS = 3, 2
-_ALTERATIONS: tuple[Alteration, ...] = (Hand(), Crack())
-_FIRST_EVALUATIONS, _ALTERED_EVALUATIONS, _EVALUATIONS = 10, 15, 40
+_UNLIKELY = 1e-4
+_STARTS = 3
+_FIRST_EVALUATIONS, _EVALUATIONS = 10, 40
 BY_MASS = "a mass"
 _WITHIN_REACH = 300.0  # of the least cost
 _FOLLOWED = 3  # of the least cost after the first evaluations
@@ -40,9 +37,7 @@ class Explanation:
     """What explains some patterns: its name, "" for nothing known, and the state it leads to.
 
     change: of the parameter, a mass in kg, others as the logarithm of a factor; lead: by how much
-    the next best costs more; resembles: what explains most of it, though not enough; found: of a
-    hand or a crack, where it is and how large. No parameter of a plate stands for these, and the
-    state is that before.
+    the next best costs more; resembles: what explains most of it, though not enough.
     """
 
     name: str
@@ -50,16 +45,8 @@ class Explanation:
     lead: float
     state: State
     resembles: str = ""
-    found: str = ""
-
-    @property
-    def can_be_followed(self) -> bool:
-        """Whether the state has taken up the change."""
-        return bool(self.name) and not self.found
 
     def __str__(self) -> str:
-        if self.found:
-            return f"{self.name}, {self.found}"
         if self.name == BY_MASS:
             return f"{self.name} by {1000 * self.change:+.3g} g"
         if self.name:
@@ -71,15 +58,13 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     """Find the one change that explains patterns, from the state before it."""
     tried = ranked_by(
         [
-            _Tried(each, each.update(evaluations=each.evaluations, start=start))
+            _Tried(each, each.update(evaluations=_FIRST_EVALUATIONS, start=start))
             for each in _hypotheses(before, patterns)
             for start in each.starts
         ],
         _likelihood,
     )
-    names = list(dict.fromkeys(each.supposed.name for each in tried))
-    # Hands and cracks may still be far from their least cost.
-    followed = {*names[:_FOLLOWED], *(each.name for each in _ALTERATIONS)}
+    followed = set(list(dict.fromkeys(each.supposed.name for each in tried))[:_FOLLOWED])
     within = tried[0].cost + _WITHIN_REACH
     for number, each in enumerate(tried):
         if each.supposed.name not in followed or each.cost > within:
@@ -89,21 +74,12 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
         after = each.supposed.update(evaluations=_EVALUATIONS, start=x)
         tried[number] = replace(each, after=after)
     best, *others = ranked_by(tried, _likelihood)
-    supposed, after, first = best.supposed, best.after, best.supposed.patterns[0]
+    supposed, after = best.supposed, best.after
     lead = min(each.cost for each in others if each.supposed.name != supposed.name) - best.cost
-    altered = first if isinstance(first, Altered) else None
-    # What a crack leaves is the error of its model, which is of the first order.
-    is_coarse = altered is not None and altered.alteration.is_of_modes
-    is_rough = is_coarse and lead > _FAR_AHEAD and best.cost < _ROUGHLY * after.count
-    if not is_rough and chdtrc(after.count, best.cost) < _UNLIKELY:
+    if chdtrc(after.count, best.cost) < _UNLIKELY:
         return Explanation("", 0.0, 0.0, before, resembles=supposed.name)
-    if altered is not None:
-        theta = after.state.x[len(before.x) :]
-        x, y = 100 * altered.place(theta)
-        what = f"{altered.alteration.described(theta[2:])} at {x:.1f}, {y:.1f} cm"
-        return Explanation(supposed.name, float(theta[2]), lead, before, found=what)
     index = supposed.changed[0]
-    change = float(first.space.std[index] * (after.state.x[index] - before.x[index]))
+    change = float(patterns[0].space.std[index] * (after.state.x[index] - before.x[index]))
     return Explanation(supposed.name, change, lead, after.state)
 
 
@@ -111,7 +87,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
 class _Hypothesis:
     """What may have changed: name, numbers of the parameters, their prior, patterns with them.
 
-    starts: of the first estimates, by so many evaluations at most; None: the state before.
+    starts: of the first estimates; None: the state before.
     """
 
     name: str
@@ -119,7 +95,6 @@ class _Hypothesis:
     prior: State
     patterns: Sequence[Touched]
     starts: Sequence[FloatArray | None] = (None,)
-    evaluations: int = _FIRST_EVALUATIONS
 
     def update(self, *, evaluations: int, start: FloatArray | None) -> Updated:
         """The batch estimate by the patterns."""
@@ -144,7 +119,7 @@ def _likelihood(tried: _Tried) -> float:
 
 
 def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothesis]:
-    """All that may have changed; a mass, a hand or a crack where it would explain most."""
+    """All that may have changed; a mass where it would explain most."""
     space = patterns[0].space
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
     for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
@@ -154,8 +129,6 @@ def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothe
         if all(space.std[n] > 0 for n in changed):
             yield _Hypothesis(name, (*changed,), _widened(before, space, changed), patterns)
     yield _by_mass(before, patterns)
-    for alteration in _ALTERATIONS:
-        yield _by_alteration(before, patterns, alteration)
 
 
 def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
@@ -171,7 +144,7 @@ def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
     sides, mass = np.array([plate.length, plate.width]), space.groups["masses"].stop - 3
     changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
     starts = []
-    for size, place in _scan(before, patterns, None, _MASS)[:_STARTS]:
+    for size, place in _scan(before, patterns)[:_STARTS]:
         start = before.x.copy()
         start[mass] = size / space.std[mass]
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
@@ -180,31 +153,8 @@ def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
     return _Hypothesis(BY_MASS, (*changed,), prior, patterns, starts)
 
 
-def _by_alteration(
-    before: State, patterns: Sequence[Touched], alteration: Alteration
-) -> _Hypothesis:
-    altered, p = [Altered.by(alteration, each) for each in patterns], len(before.x)
-    wider = linalg.block_diag(before.covariance, np.eye(alteration.size))
-    return _Hypothesis(
-        alteration.name,
-        (*range(p, p + alteration.size),),
-        State(np.concatenate([before.x, np.zeros(alteration.size)]), wider),
-        altered,
-        [
-            np.concatenate([before.x, altered[0].parameters(place, alteration.start(size))])
-            for size, place in _scan(before, patterns, alteration, 1.0)[:_ALTERED_STARTS]
-        ],
-        _ALTERED_EVALUATIONS,
-    )
-
-
-def _scan(
-    before: State, patterns: Sequence[Touched], alteration: Alteration | None, std: float
-) -> list[tuple[float, FloatArray]]:
-    """Sizes and places [m] of an alteration that would explain most, best first, all else linear.
-
-    None: a mass [kg]; std: of sizes.
-    """
+def _scan(before: State, patterns: Sequence[Touched]) -> list[tuple[float, FloatArray]]:
+    """Masses [kg] and their places [m] that would explain most, best first, all else linear."""
     points = PLACES.centres(patterns[0].touched.rig.plate)
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))
     for each in patterns:
@@ -213,12 +163,8 @@ def _scan(
         P = linalg.block_diag(before.covariance, finger_covariance([each.pattern]))
         S = H @ P @ H.T + np.diag(each.std**2)
         at = each.touched.at(np.concatenate([before.x, fingers]))
-        column = (
-            each.by_mass_at(at, points)
-            if alteration is None
-            else scores(each, at, alteration, points)
-        )
+        column = each.by_mass_at(at, points)
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)
-    return [(size, points[n]) for n, size in single_changes(slope, curvature, std)]
+    return [(size, points[n]) for n, size in single_changes(slope, curvature, _MASS)]

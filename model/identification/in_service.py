@@ -4,8 +4,8 @@ The parameters of an identification drift; an update moves them together with th
 pattern, which are dropped afterwards. Where innovations are unlikely (`model.identification.alarm`)
 the state goes back to where they began, since an update smears a jump over all parameters, and is
 held until the patterns since then are explained together by one change
-(`model.identification.hypotheses`). A change of its parameters is followed; with a hand on it, a
-crack or a change that nothing explains the plate counts as changed, until patterns are those of the
+(`model.identification.hypotheses`). Such a change is followed; after one that nothing explains, as
+by a crack or a hand that rests on it, the plate counts as changed, until patterns are those of the
 plate as it was.
 """
 
@@ -157,7 +157,7 @@ class LivePlate:
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
             return Report(np.nan, 0, False, True, None)
         self._held = []
-        if found.can_be_followed:
+        if found.name:
             self.known = replace(self.known, state=found.state, time=time)
         else:
             self.known = replace(self.known, change=str(found))

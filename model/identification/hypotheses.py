@@ -18,8 +18,8 @@ from model.choice import ranked_by
 from model.identification.alarm import PLACES
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
-from model.identification.settled import Touched, finger_covariance
-from model.identification.settled_update import State, Updated, update
+from model.identification.settled import PatternModel, finger_covariance
+from model.identification.settled_update import State, StateUpdate, update
 
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3
@@ -33,7 +33,7 @@ _FOLLOWED = 3  # of the least cost after the first evaluations
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class PlateChange:
     """What explains some patterns: its name, "" for nothing known, and the state it leads to.
 
     change: of the parameter, a mass in kg, others as the logarithm of a factor; lead: by how much
@@ -54,11 +54,11 @@ class Explanation:
         return f"the plate has changed, most as if {self.resembles} had"
 
 
-def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
+def explain(before: State, patterns: Sequence[PatternModel]) -> PlateChange:
     """Find the one change that explains patterns, from the state before it."""
     tried = ranked_by(
         [
-            _Tried(each, each.update(evaluations=_FIRST_EVALUATIONS, start=start))
+            _Trial(each, each.update(evaluations=_FIRST_EVALUATIONS, start=start))
             for each in _hypotheses(before, patterns)
             for start in each.starts
         ],
@@ -77,10 +77,10 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     supposed, after = best.supposed, best.after
     lead = min(each.cost for each in others if each.supposed.name != supposed.name) - best.cost
     if chdtrc(after.count, best.cost) < _UNLIKELY:
-        return Explanation("", 0.0, 0.0, before, resembles=supposed.name)
+        return PlateChange("", 0.0, 0.0, before, resembles=supposed.name)
     index = supposed.changed[0]
     change = float(patterns[0].space.std[index] * (after.state.x[index] - before.x[index]))
-    return Explanation(supposed.name, change, lead, after.state)
+    return PlateChange(supposed.name, change, lead, after.state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,20 +93,20 @@ class _Hypothesis:
     name: str
     changed: tuple[int, ...]
     prior: State
-    patterns: Sequence[Touched]
+    patterns: Sequence[PatternModel]
     starts: Sequence[FloatArray | None] = (None,)
 
-    def update(self, *, evaluations: int, start: FloatArray | None) -> Updated:
+    def update(self, *, evaluations: int, start: FloatArray | None) -> StateUpdate:
         """The batch estimate by the patterns."""
         return update(self.prior, self.patterns, evaluations=evaluations, start=start)
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
+class _Trial:
     """A hypothesis, and what it leads to."""
 
     supposed: _Hypothesis
-    after: Updated
+    after: StateUpdate
 
     @property
     def cost(self) -> float:
@@ -114,11 +114,11 @@ class _Tried:
         return self.after.cost + _COST_OF_CHANGE * len(self.supposed.changed)
 
 
-def _likelihood(tried: _Tried) -> float:
+def _likelihood(tried: _Trial) -> float:
     return -tried.cost
 
 
-def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothesis]:
+def _hypotheses(before: State, patterns: Sequence[PatternModel]) -> Iterator[_Hypothesis]:
     """All that may have changed; a mass where it would explain most."""
     space = patterns[0].space
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
@@ -139,7 +139,7 @@ def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
     return State(before.x, covariance)
 
 
-def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
+def _by_mass(before: State, patterns: Sequence[PatternModel]) -> _Hypothesis:
     space, plate = patterns[0].space, patterns[0].touched.rig.plate
     sides, mass = np.array([plate.length, plate.width]), space.groups["masses"].stop - 3
     changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
@@ -153,7 +153,7 @@ def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
     return _Hypothesis(BY_MASS, (*changed,), prior, patterns, starts)
 
 
-def _scan(before: State, patterns: Sequence[Touched]) -> list[tuple[float, FloatArray]]:
+def _scan(before: State, patterns: Sequence[PatternModel]) -> list[tuple[float, FloatArray]]:
     """Masses [kg] and their places [m] that would explain most, best first, all else linear."""
     points = PLACES.centres(patterns[0].touched.rig.plate)
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))

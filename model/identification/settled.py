@@ -62,7 +62,7 @@ def finger_covariance(patterns: Sequence[SettledPattern]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Touched:
+class PatternModel:
     """The plate of a forward model under the fingers of one pattern.
 
     space: of the model, which has no fingers of its own; touched: the model with the fingers;
@@ -82,7 +82,7 @@ class Touched:
         finger_std: float,
         *,
         noise: float = 1.0,
-    ) -> "Touched":
+    ) -> "PatternModel":
         """A model under the fingers of a pattern, of loads known to finger_std (of logarithms)."""
         count, space = len(FINGER_PARTS) * len(pattern.fingers), model.space
         names = [f"finger part {number}" for number in range(count)]

@@ -17,7 +17,7 @@ from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Bond, Laminate, Layer, Material
+from model.structure.plate import Bond, Laminate, LaminateLayer, Material
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
 PAD = Sensor("pad", x=0.1, y=0.07)
@@ -95,7 +95,11 @@ def of_a_laminate(model: ForwardModel) -> ForwardModel:
     glass = Material("glass", E=70e9, rho=2500.0, nu=0.23)
     soft = Material("soft", E=6e6, rho=1000.0, nu=0.49)
     laminate = Laminate(
-        (Layer(glass, 1e-3), Layer(soft, 0.5e-3, loss_factor=0.5), Layer(glass, 1e-3)),
+        (
+            LaminateLayer(glass, 1e-3),
+            LaminateLayer(soft, 0.5e-3, loss_factor=0.5),
+            LaminateLayer(glass, 1e-3),
+        ),
         bond=Bond.FULL,
     )
     plate = equivalent_plate(laminate, length=0.3048, width=0.2286, frequency=500.0)

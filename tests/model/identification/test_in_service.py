@@ -8,14 +8,14 @@ import pytest
 
 from benchmarks.identification.hidden import Hidden, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
-from model.identification.in_service import Known, LivePlate
+from model.identification.in_service import LivePlate, PlateEstimate
 from settled_patterns import played, settled_patterns
 
 NE = 2  # number of that ERA
 HAND = np.array([0.25, 0.05])  # m
 
 
-def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> None:
+def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: PlateEstimate) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
     live = LivePlate(known)
     quiet = played(live.take, hidden, hidden.mounted, count=10)
@@ -33,7 +33,7 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> N
 
 
 def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
-    known: Known,
+    known: PlateEstimate,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
     live = LivePlate(replace(known, time=0.0))
@@ -51,7 +51,7 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 
 
 @pytest.mark.long
-def test_sticker_is_named_in_its_place(hidden: Hidden, known: Known) -> None:
+def test_sticker_is_named_in_its_place(hidden: Hidden, known: PlateEstimate) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
     live = LivePlate(known)
     played(live.take, hidden, hidden.mounted, count=10)
@@ -65,14 +65,14 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, known: Known) -> None:
     assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
 
 
-def test_heavy_finger_is_no_change(hidden: Hidden, known: Known) -> None:
+def test_heavy_finger_is_no_change(hidden: Hidden, known: PlateEstimate) -> None:
     """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
     live = LivePlate(known)
     heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
     assert not any(live.take(each).alarm for each in heavy)
 
 
-def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: Known) -> None:
+def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: PlateEstimate) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
     live = LivePlate(replace(known, is_explained=False))
     before = live.known.state
@@ -122,7 +122,7 @@ def rested(mounted: Mounted) -> Mounted:
 @pytest.mark.long
 @pytest.mark.parametrize("change", [retuned, cracked, rested])
 def test_change_that_nothing_explains_is_said_until_it_is_gone(
-    hidden: Hidden, known: Known, change: Callable[[Mounted], Mounted]
+    hidden: Hidden, known: PlateEstimate, change: Callable[[Mounted], Mounted]
 ) -> None:
     """It is followed as no other: the state stays and says so; then service goes on."""
     live = LivePlate(known)

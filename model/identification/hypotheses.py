@@ -7,7 +7,7 @@ the plate has changed in a way not known.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
@@ -56,36 +56,34 @@ class PlateChange:
 
 def explain(before: State, patterns: Sequence[PatternModel]) -> PlateChange:
     """Find the one change that explains patterns, from the state before it."""
-    tried = ranked_by(
-        [
-            _Trial(each, each.update(evaluations=_FIRST_EVALUATIONS, start=start))
-            for each in _hypotheses(before, patterns)
-            for start in each.starts
-        ],
-        _likelihood,
-    )
-    followed = set(list(dict.fromkeys(each.supposed.name for each in tried))[:_FOLLOWED])
-    within = tried[0].cost + _WITHIN_REACH
-    for number, each in enumerate(tried):
-        if each.supposed.name not in followed or each.cost > within:
+    tried = [
+        (each, update(each.prior, patterns, evaluations=_FIRST_EVALUATIONS, start=start))
+        for each in _hypotheses(before, patterns)
+        for start in each.starts
+    ]
+    tried = ranked_by(tried, _likelihood)
+    followed = set(list(dict.fromkeys(each.name for each, _ in tried))[:_FOLLOWED])
+    least = _likelihood(tried[0]) - _WITHIN_REACH
+    for number, (supposed, after) in enumerate(tried):
+        if supposed.name not in followed or _likelihood((supposed, after)) < least:
             continue
-        followed.remove(each.supposed.name)
-        x = np.concatenate([each.after.state.x, each.after.fingers])
-        after = each.supposed.update(evaluations=_EVALUATIONS, start=x)
-        tried[number] = replace(each, after=after)
+        followed.remove(supposed.name)
+        x = np.concatenate([after.state.x, after.fingers])
+        after = update(supposed.prior, patterns, evaluations=_EVALUATIONS, start=x)
+        tried[number] = supposed, after
     best, *others = ranked_by(tried, _likelihood)
-    supposed, after = best.supposed, best.after
-    lead = min(each.cost for each in others if each.supposed.name != supposed.name) - best.cost
-    if chdtrc(after.count, best.cost) < _UNLIKELY:
+    (supposed, after), likelihood = best, _likelihood(best)
+    rivals = [_likelihood(each) for each in others if each[0].name != supposed.name]
+    if chdtrc(after.count, -likelihood) < _UNLIKELY:
         return PlateChange("", 0.0, 0.0, before, resembles=supposed.name)
     index = supposed.changed[0]
     change = float(patterns[0].space.std[index] * (after.state.x[index] - before.x[index]))
-    return PlateChange(supposed.name, change, lead, after.state)
+    return PlateChange(supposed.name, change, likelihood - max(rivals), after.state)
 
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """What may have changed: name, numbers of the parameters, their prior, patterns with them.
+    """What may have changed: name, numbers of the parameters, and their prior.
 
     starts: of the first estimates; None: the state before.
     """
@@ -93,29 +91,13 @@ class _Hypothesis:
     name: str
     changed: tuple[int, ...]
     prior: State
-    patterns: Sequence[PatternModel]
     starts: Sequence[FloatArray | None] = (None,)
 
-    def update(self, *, evaluations: int, start: FloatArray | None) -> StateUpdate:
-        """The batch estimate by the patterns."""
-        return update(self.prior, self.patterns, evaluations=evaluations, start=start)
 
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A hypothesis, and what it leads to."""
-
-    supposed: _Hypothesis
-    after: StateUpdate
-
-    @property
-    def cost(self) -> float:
-        """Of residuals and changes, and of supposing a change."""
-        return self.after.cost + _COST_OF_CHANGE * len(self.supposed.changed)
-
-
-def _likelihood(tried: _Trial) -> float:
-    return -tried.cost
+def _likelihood(tried: tuple[_Hypothesis, StateUpdate]) -> float:
+    """Less the cost of residuals and changes after an update, and of supposing a change."""
+    supposed, after = tried
+    return -(after.cost + _COST_OF_CHANGE * len(supposed.changed))
 
 
 def _hypotheses(before: State, patterns: Sequence[PatternModel]) -> Iterator[_Hypothesis]:
@@ -127,7 +109,7 @@ def _hypotheses(before: State, patterns: Sequence[PatternModel]) -> Iterator[_Hy
     kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
     for name, changed in kinds:
         if all(space.std[n] > 0 for n in changed):
-            yield _Hypothesis(name, (*changed,), _widened(before, space, changed), patterns)
+            yield _Hypothesis(name, (*changed,), _widened(before, space, changed))
     yield _by_mass(before, patterns)
 
 
@@ -150,7 +132,7 @@ def _by_mass(before: State, patterns: Sequence[PatternModel]) -> _Hypothesis:
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
         starts.append(start)
     prior = _widened(before, space, changed)
-    return _Hypothesis(BY_MASS, (*changed,), prior, patterns, starts)
+    return _Hypothesis(BY_MASS, (*changed,), prior, starts)
 
 
 def _scan(before: State, patterns: Sequence[PatternModel]) -> list[tuple[float, FloatArray]]:

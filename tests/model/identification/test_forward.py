@@ -8,7 +8,7 @@ import pytest
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, RestingFinger, Sensor
-from model.identification.parameters import Space, inwards, space_of
+from model.identification.parameters import FINGER_PARTS, Space, inwards, space_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.meshes import mesh_of
@@ -35,7 +35,8 @@ def model(rig: Rig) -> ForwardModel:
     """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
     names = [sensor.name for sensor in sensors]
-    space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1, fingers=1)
+    space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1)
+    space = space.and_further("fingers", [f"{part} of finger" for part in FINGER_PARTS])
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     return ForwardModel(rig, sensors, FREQUENCIES, space, free, [FINGER])
 

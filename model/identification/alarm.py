@@ -39,7 +39,7 @@ class Observation:
     the last `masses` directions can only be upwards.
     """
 
-    touched: PatternModel
+    model: PatternModel
     before: State
     time: float | None
     nis: float
@@ -51,23 +51,21 @@ class Observation:
     @classmethod
     def of(
         cls,
-        touched: PatternModel,
+        model: PatternModel,
         before: State,
         time: float | None,
         found: StateUpdate,
         at: FloatArray,
     ) -> "Observation":
         """That of a pattern after its update; at (m, 2) [m]: places of masses."""
-        space = touched.space
+        space = model.space
         own = np.flatnonzero(space.of(*_KINDS))
-        plate = touched.touched.at(np.concatenate([found.state.x, found.fingers]))
-        masses = touched.by_mass_at(plate, at)
+        plate = model.forward.at(np.concatenate([found.state.x, found.fingers]))
+        masses = model.by_mass_at(plate, at)
         columns = np.hstack([found.slopes[:, own], masses])
         slopes = columns.T @ (found.precision @ found.innovation)
         curvatures = (columns * (found.precision @ columns)).sum(axis=0)
-        return cls(
-            touched, before, time, found.nis, found.count, slopes, curvatures, masses.shape[1]
-        )
+        return cls(model, before, time, found.nis, found.count, slopes, curvatures, masses.shape[1])
 
 
 class Alarm:
@@ -88,9 +86,9 @@ class Alarm:
         """Forget the patterns."""
         self._recent.clear()
 
-    def take(self, taken: Observation) -> list[Observation] | None:
+    def take(self, observation: Observation) -> list[Observation] | None:
         """Take a pattern; those since the plate has changed, by the last, None if it has not."""
-        self._recent.append(taken)
+        self._recent.append(observation)
         last = list(self._recent)[::-1]
         along, confirmed = self._along(last)
         if confirmed.max() > _ALONG:
@@ -99,7 +97,9 @@ class Alarm:
         numbers = np.cumsum([each.count for each in last])
         largest = np.maximum.accumulate([each.nis for each in last])
         unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
-        rest = chdtrc(np.maximum(numbers - taken.count, 1), squares - largest) < _UNLIKELY_REST
+        rest = (
+            chdtrc(np.maximum(numbers - observation.count, 1), squares - largest) < _UNLIKELY_REST
+        )
         if np.any(unlikely & rest):
             return last[: best_of(squares - _REFERENCE * numbers) + 1][::-1]
         return None

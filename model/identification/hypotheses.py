@@ -122,7 +122,7 @@ def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
 
 
 def _by_mass(before: State, patterns: Sequence[PatternModel]) -> _Hypothesis:
-    space, plate = patterns[0].space, patterns[0].touched.rig.plate
+    space, plate = patterns[0].space, patterns[0].forward.rig.plate
     sides, mass = np.array([plate.length, plate.width]), space.groups["masses"].stop - 3
     changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
     starts = []
@@ -137,14 +137,14 @@ def _by_mass(before: State, patterns: Sequence[PatternModel]) -> _Hypothesis:
 
 def _scan(before: State, patterns: Sequence[PatternModel]) -> list[tuple[float, FloatArray]]:
     """Masses [kg] and their places [m] that would explain most, best first, all else linear."""
-    points = PLACES.centres(patterns[0].touched.rig.plate)
+    points = PLACES.centres(patterns[0].forward.rig.plate)
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))
     for each in patterns:
-        fingers = np.zeros(each.touched.space.size - len(before.x))
+        fingers = np.zeros(each.forward.space.size - len(before.x))
         predicted, H = each.predicted(before.x, fingers)
         P = linalg.block_diag(before.covariance, finger_covariance([each.pattern]))
         S = H @ P @ H.T + np.diag(each.std**2)
-        at = each.touched.at(np.concatenate([before.x, fingers]))
+        at = each.forward.at(np.concatenate([before.x, fingers]))
         column = each.by_mass_at(at, points)
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted

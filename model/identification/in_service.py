@@ -116,16 +116,16 @@ class LivePlate:
 
     def take(self, pattern: SettledPattern) -> PatternReport:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = PatternModel.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
+        model = PatternModel.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
         if self.known.time is None:
             self.known = replace(self.known, time=pattern.time)
         known, drifted = self.known, self._drifted(pattern.time)
         if self._held:
-            self._held.append(touched)
+            self._held.append(model)
             return self._explained(pattern.time)
-        after = update(drifted, [touched], evaluations=_EVALUATIONS, theory=self._theory)
-        taken = Observation.of(touched, known.state, known.time, after, self._places)
-        suspect = self._alarm.take(taken)
+        after = update(drifted, [model], evaluations=_EVALUATIONS, theory=self._theory)
+        observation = Observation.of(model, known.state, known.time, after, self._places)
+        suspect = self._alarm.take(observation)
         if suspect is not None:
             explanation, is_new = None, not self.known.change
             if known.is_explained and is_new:
@@ -143,7 +143,7 @@ class LivePlate:
     def _go_back(self, suspect: list[Observation]) -> None:
         """Return to the state before the first suspect pattern, and hold them."""
         self.known = replace(self.known, state=suspect[0].before, time=suspect[0].time)
-        self._held, self._suspects = [each.touched for each in suspect], len(suspect)
+        self._held, self._suspects = [each.model for each in suspect], len(suspect)
 
     def _explained(self, time: float) -> PatternReport:
         """Explain what was held, early if it is certain."""

@@ -63,10 +63,10 @@ def test_update_within_bounds_explains_a_pattern(
     A hundred parameters are free for eight numbers: at the most likely state these are explained to
     their errors, by no more changes than eight directions of the prior are likely to make.
     """
-    touched = PatternModel.of(known.model, pattern, 0.5)
-    found = update(known.state, [touched], evaluations=20)
-    predicted, _ = touched.predicted(found.state.x, found.fingers)
-    residuals = (predicted - pattern.numbers) / touched.std
+    model = PatternModel.of(known.model, pattern, 0.5)
+    found = update(known.state, [model], evaluations=20)
+    predicted, _ = model.predicted(found.state.x, found.fingers)
+    residuals = (predicted - pattern.numbers) / model.std
     assert residuals @ residuals < found.count
     assert found.cost < 3 * found.count
     space = known.model.space
@@ -79,15 +79,15 @@ def test_numbers_change_as_their_derivatives_say(
 ) -> None:
     """Central differences of the numbers without a phase; none lies along a common turn."""
     without = turned(pattern, 1.0, has_phase=False)
-    touched = PatternModel.of(known.model, without, 0.5)
+    model = PatternModel.of(known.model, without, 0.5)
     x, fingers = np.zeros(known.model.space.size), np.zeros(4 * len(pattern.fingers))
-    _, J = touched.predicted(x, fingers)
+    _, J = model.predicted(x, fingers)
     step = 1e-5
     for number in known.model.space.indices("stiffness"):
         moved = x.copy()
         moved[number] = step
-        ahead, _ = touched.predicted(moved, fingers)
-        behind, _ = touched.predicted(-moved, fingers)
+        ahead, _ = model.predicted(moved, fingers)
+        behind, _ = model.predicted(-moved, fingers)
         slopes = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(slopes, J[:, number], rtol=1e-3, atol=1e-7)
     turn = np.concatenate([(1j * without.values).real, (1j * without.values).imag])

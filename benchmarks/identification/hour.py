@@ -30,7 +30,7 @@ from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.identification.forward import RestingFinger, Sensor
 from model.identification.identify import identify
-from model.identification.in_service import Known, LivePlate, Report
+from model.identification.in_service import LivePlate, PatternReport, PlateEstimate
 from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
@@ -84,7 +84,7 @@ class Hour:
     false_alarms: int = 0
     contrasts: dict[tuple[float, str], list[float]] = field(default_factory=dict)
 
-    def take(self, seed: int, minute: float, report: Report) -> None:
+    def take(self, seed: int, minute: float, report: PatternReport) -> None:
         """Take what a pattern has shown."""
         awaited = [name for name, at in self.named.items() if at is None]
         if report.alarm:
@@ -122,7 +122,7 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
     identified = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=seed)
-    live, mounted = LivePlate(Known.of_rig(identified.rig, sensors)), hidden.mounted
+    live, mounted = LivePlate(PlateEstimate.of_rig(identified.rig, sensors)), hidden.mounted
     loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
     weightless = table_of(identified.rig, FREQUENCIES, loaded=False)
     table, first, rng = loaded, mounted.plate, np.random.default_rng([seed, 2])

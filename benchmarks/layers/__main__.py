@@ -14,13 +14,13 @@ from model.rig.rig import Rig
 from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
-from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
+from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.vibration.natural_modes import natural_modes
 
 PANEL = load_rig(RIG.parent / "glass_panel.yaml")
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ADHESIVE = Material("adhesive", E=1e6, rho=1000.0, nu=0.49)
-THIN = (Layer(GLASS, 0.7e-3), Layer(ADHESIVE, 0.1e-3), Layer(GLASS, 0.7e-3))
+THIN = (LaminateLayer(GLASS, 0.7e-3), LaminateLayer(ADHESIVE, 0.1e-3), LaminateLayer(GLASS, 0.7e-3))
 LENGTH, MODES, AT = 0.375, 6, 150.0
 FREE_BEAM = np.array([4.730041, 7.853205, 10.995608, 14.137165, 17.278760, 20.420352])
 BY_FREQUENCY = ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))
@@ -76,18 +76,18 @@ def _row(*cells: object) -> None:
     print(f"| {' | '.join(values)} |")
 
 
-def _layers() -> tuple[Layer, ...]:
+def _layers() -> tuple[LaminateLayer, ...]:
     assert PANEL.laminate is not None
     return PANEL.laminate.layers
 
 
-def _plate(layers: tuple[Layer, ...], *, width: float = 0.225) -> Plate:
+def _plate(layers: tuple[LaminateLayer, ...], *, width: float = 0.225) -> Plate:
     return equivalent_plate(
         Laminate(layers), length=LENGTH, width=width, frequency=500.0, loss_factor=0.01
     )
 
 
-def _strip(layers: tuple[Layer, ...]) -> FloatArray:
+def _strip(layers: tuple[LaminateLayer, ...]) -> FloatArray:
     """Natural frequencies [Hz] of a strip of infinite width."""
     solved = SpectralPlate(_plate(layers, width=1.0), (16, 0), AT)
     found = [
@@ -99,14 +99,14 @@ def _strip(layers: tuple[Layer, ...]) -> FloatArray:
     return np.asarray(np.sqrt(squares[squares > 1][:MODES]) / (2 * np.pi))
 
 
-def _one_rigidity(layers: tuple[Layer, ...]) -> FloatArray:
+def _one_rigidity(layers: tuple[LaminateLayer, ...]) -> FloatArray:
     """Of a thin strip with the rigidity of a wave of one frequency."""
     laminate = Laminate(layers)
     speed = np.sqrt(bending(laminate, AT).rigidity / laminate.surface_density)
     return np.asarray((FREE_BEAM / LENGTH) ** 2 * speed / (2 * np.pi))
 
 
-def _waves(layers: tuple[Layer, ...]) -> float:
+def _waves(layers: tuple[LaminateLayer, ...]) -> float:
     """Largest error [%] of the frequency of a wave of given length."""
     worst = 0.0
     for modulus in (0.1e6, 1e6, 10e6, 1e9):

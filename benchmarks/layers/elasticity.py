@@ -12,7 +12,7 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import eigsh
 
 from model.arrays import FloatArray
-from model.structure.plate import Layer, Material
+from model.structure.plate import LaminateLayer, Material
 
 _GAUSS = [(-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)]
 
@@ -32,13 +32,18 @@ def _elasticity(modulus: float, nu: float) -> FloatArray:
     return np.asarray(factor * whole)
 
 
-def _pieces(layers: Sequence[Layer], count: int) -> list[tuple[Material, float]]:
+def _pieces(layers: Sequence[LaminateLayer], count: int) -> list[tuple[Material, float]]:
     """Material and thickness of the elements through the thickness."""
     return [(layer.material, layer.thickness / count) for layer in layers for _ in range(count)]
 
 
 def strip_frequencies(
-    layers: Sequence[Layer], length: float, modes: int, *, along: int = 100, through: int = 2
+    layers: Sequence[LaminateLayer],
+    length: float,
+    modes: int,
+    *,
+    along: int = 100,
+    through: int = 2,
 ) -> FloatArray:
     """Natural frequencies [Hz] of bending of a wide free strip of layers, without rigid motions.
 
@@ -90,7 +95,7 @@ def _unit_matrices(material: Material) -> tuple[FloatArray, ...]:
     return xx, xz, zz, mass
 
 
-def wave_number(layers: Sequence[Layer], frequency: float) -> float:
+def wave_number(layers: Sequence[LaminateLayer], frequency: float) -> float:
     """Wavenumber [1/m] of the bending wave of a frequency [Hz] in layers without edges."""
     pieces = _pieces(layers, 4)
 

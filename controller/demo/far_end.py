@@ -101,7 +101,7 @@ class SimulatedPlate:
         return reply
 
 
-class _Felt(BaseModel):
+class _FingerRecord(BaseModel):
     """Vibration of a finger, as the control socket has it."""
 
     frequencies_hz: list[float]
@@ -114,7 +114,7 @@ class _Reply(BaseModel):
     """What is read of a reply of the control socket."""
 
     error: str | None = None
-    fingers: dict[str, _Felt] = {}
+    fingers: dict[str, _FingerRecord] = {}
 
 
 @contextlib.asynccontextmanager

@@ -29,7 +29,7 @@ Step = tuple[tuple[int, float], ...]
 
 
 @dataclass(frozen=True)
-class Interleaved:
+class ToneSchedule:
     """Steps of interleaved tones; settling, window [s]: of each step."""
 
     steps: tuple[Step, ...]
@@ -39,7 +39,7 @@ class Interleaved:
 
 def interleaved(
     rig: Rig, frequency_range: tuple[float, float], *, is_quick: bool = False
-) -> Interleaved:
+) -> ToneSchedule:
     """Tones over a range [Hz] for a rig; is_quick: one round only."""
     low, high = frequency_range
     steps: list[Step] = []
@@ -51,7 +51,7 @@ def interleaved(
         steps += own
         closest = min(closest, apart)
     window = max(WINDOW, _MARGIN / closest, _MARGIN / low)
-    return Interleaved(tuple(steps), settling(rig, frequency_range), window)
+    return ToneSchedule(tuple(steps), settling(rig, frequency_range), window)
 
 
 def _rounds(

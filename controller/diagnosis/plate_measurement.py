@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
+from controller.diagnosis.interleaved_tones import Step, ToneSchedule, interleaved
 from controller.diagnosis.plate_sensors import (
     PlateSensor,
     plate_sensors,
@@ -39,7 +39,7 @@ _READINGS = 2  # of a step, where the first is disturbed or overloaded
 
 
 @dataclass(frozen=True, eq=False)
-class _Heard:
+class _StepResponses:
     """One step: frequency [Hz] of each ERA (n,), NaN where silent; responses (s, n) [1/s²]."""
 
     frequencies: FloatArray
@@ -101,10 +101,10 @@ class PlateSelfMeasurement:
         )
 
     async def _all(
-        self, tones: Interleaved, sensors: Sequence[PlateSensor]
-    ) -> tuple[list[_Heard], tuple[int, _Heard], _Heard]:
+        self, tones: ToneSchedule, sensors: Sequence[PlateSensor]
+    ) -> tuple[list[_StepResponses], tuple[int, _StepResponses], _StepResponses]:
         """All steps; the loudest at half the level, with its number; the first once more."""
-        heard: list[_Heard] = []
+        heard: list[_StepResponses] = []
         count = len(tones.steps) + 2
         for step in tones.steps:
             heard.append(await self._hear(step, tones, sensors, level=self._level))
@@ -117,8 +117,8 @@ class PlateSelfMeasurement:
         return heard, (loudest, half), last
 
     async def _hear(
-        self, step: Step, tones: Interleaved, sensors: Sequence[PlateSensor], *, level: float
-    ) -> _Heard:
+        self, step: Step, tones: ToneSchedule, sensors: Sequence[PlateSensor], *, level: float
+    ) -> _StepResponses:
         """Play a step until the plate has settled, and read it."""
         eras = {self._rig.eras[number].name: frequency for number, frequency in step}
         plays = await self._player.play(
@@ -189,7 +189,7 @@ class PlateSelfMeasurement:
         frequencies: FloatArray,
         readings: Mapping[str, Reading],
         sensors: Sequence[PlateSensor],
-    ) -> _Heard:
+    ) -> _StepResponses:
         """Responses to the tones that ERAs play, of sensors whose phases count from theirs."""
         rig = self._rig
         number = {era.name: n for n, era in enumerate(rig.eras)}
@@ -205,7 +205,7 @@ class PlateSelfMeasurement:
                     base = command.level * rig.era(era).stroke
                     turned = np.exp(-1j * math.radians(command.phase))
                     responses[row, number[era]] = acceleration * turned / base
-        return _Heard(played, responses)
+        return _StepResponses(played, responses)
 
     async def _wait(self, seconds: float) -> None:
         """Wait [s], feeding the watchdogs."""
@@ -217,9 +217,9 @@ class PlateSelfMeasurement:
     def _measurement(
         self,
         sensors: Sequence[PlateSensor],
-        heard: Sequence[_Heard],
-        half: tuple[int, _Heard],
-        last: _Heard,
+        heard: Sequence[_StepResponses],
+        half: tuple[int, _StepResponses],
+        last: _StepResponses,
     ) -> Measurement:
         """All responses, with the repeated ones."""
         frequencies = np.unique(np.concatenate([each.frequencies for each in heard]))
@@ -237,7 +237,7 @@ class PlateSelfMeasurement:
             at_end=self._repeats(heard[0], last),
         )
 
-    def _repeats(self, first: _Heard, again: _Heard) -> tuple[Repeat, ...]:
+    def _repeats(self, first: _StepResponses, again: _StepResponses) -> tuple[Repeat, ...]:
         """The loudest tones of a step and of its repetition: noise hides changes of the others."""
         sizes = np.linalg.norm(np.nan_to_num(first.responses), axis=0)
         found = []

@@ -84,7 +84,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Refreshed:
+class RefreshedAnswers:
     """Answers prepared whole while nothing else was to be done, and robust ones of that plate."""
 
     answers: Answers
@@ -102,7 +102,7 @@ class Note:
 Request: TypeAlias = Start | SettledPattern | None
 """None: to save and prepare what is due."""
 
-Reply: TypeAlias = Ready | Estimate | Refreshed | Note
+Reply: TypeAlias = Ready | Estimate | RefreshedAnswers | Note
 
 
 def packed(message: Request | list[Reply]) -> bytes:

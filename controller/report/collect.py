@@ -44,14 +44,14 @@ _REQUIREMENT = re.compile(r"(?im)^[ \t]*([A-Z0-9](?:[A-Z0-9._-]*[A-Z0-9])?)")
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportFiles:
     """Files of a report by name, and descriptions of what is missing."""
 
     files: Mapping[str, str]
     missing: tuple[str, ...]
 
 
-def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Report:
+def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> ReportFiles:
     """Collect a report; whatever is not available is listed as missing.
 
     configs: rig, layout and daemon files, with the files that a daemon's file names; socket: the
@@ -67,7 +67,7 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
             files["status.json"] = daemon.status().model_dump_json(indent=2)
     except (LinkError, RpcError) as error:
         missing.append(f"status of a daemon ({type(error).__name__})")
-    return Report(
+    return ReportFiles(
         {
             name: shown(text, home=home, is_dump=name.endswith(".jsonl"))
             for name, text in files.items()
@@ -77,7 +77,7 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     )
 
 
-def write_zip(path: Path, report: Report) -> None:
+def write_zip(path: Path, report: ReportFiles) -> None:
     """Write a new file of mode 0600, completely or not at all.
 
     Raises InputError if it exists already or cannot be created, OSError if writing fails.

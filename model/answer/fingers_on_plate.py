@@ -10,7 +10,7 @@ from model.drive_modes.forms import Forms
 from model.ensemble.draws import Drawing
 from model.ensemble.measures import over_fingertips
 from model.ensemble.touched_by_kernel import touch
-from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, outer
+from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate, outer
 from model.table.raster import FingertipShapes
 from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
@@ -67,7 +67,7 @@ class FingersOnPlate:
 
     def drawn(
         self, by: Drawing, rows: IntArray, weights: Complex64Array, *, with_powers: bool = False
-    ) -> Sensed:
+    ) -> FingertipAmplitudes:
         """What tones at rows (m,) of weights (m, n) do at all fine points on drawn plates."""
         points, table = self.tips.fine.reshape(-1, self.tips.fine.shape[2]), self.table
         given = points, self.tips.fine_weights, table.error_power, table.thresholds

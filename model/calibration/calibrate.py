@@ -13,7 +13,7 @@ from model.calibration.calibration_result import (
     FittedParameter,
     SensorScale,
 )
-from model.calibration.fit import Fit, Problem, solve, start_at
+from model.calibration.fit import CalibrationProblem, Fit, solve, start_at
 from model.calibration.fitted_rig import (
     gain_rows,
     moved_eras,
@@ -23,7 +23,7 @@ from model.calibration.fitted_rig import (
     uncertainty_of,
 )
 from model.calibration.held_out import hold_out, initial_responses, relative_error
-from model.calibration.responses import Responses, Screened, check_enough_sensors
+from model.calibration.responses import Responses, Screening, check_enough_sensors
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.variable_projection import row_rms
 from model.choice import best_of
@@ -38,7 +38,7 @@ _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
 def calibrate(
-    rig: Rig, responses: Responses, screened: Screened, *, all_scales: bool = False
+    rig: Rig, responses: Responses, screened: Screening, *, all_scales: bool = False
 ) -> Calibration:
     """Fit a rig to responses measured on it, as `check_consistency` has found them.
 
@@ -52,7 +52,7 @@ def calibrate(
         values = live.values.copy()
         values[:, dead_eras] = np.nan
         plate = sensed_plate(rig, live.points, live.frequencies, has_form=True)
-        part, z = Problem.of(plate, values), np.zeros(plate.model.space.size)
+        part, z = CalibrationProblem.of(plate, values), np.zeros(plate.model.space.size)
         z[plate.numbers] = screened.start
         start = start_at(part, z)
         heard = start.used.sum(axis=(0, 1)) > np.isfinite(values).sum(axis=(0, 1)) / 2
@@ -81,7 +81,7 @@ def calibrate(
     )
 
 
-def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
+def _identified(problem: CalibrationProblem, start: Fit) -> tuple[CalibrationProblem, Fit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
     fit = solve(problem, start)
     while True:
@@ -97,12 +97,12 @@ def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
         fit = solve(problem, replace(fit, z=z))
 
 
-def _fit_error(problem: Problem, fit: Fit) -> float:
+def _fit_error(problem: CalibrationProblem, fit: Fit) -> float:
     size = row_rms(problem.values, fit.used)
     return relative_error(problem.values, fit.predicted, size, fit.used)
 
 
-def _check_outliers(problem: Problem, fit: Fit) -> None:
+def _check_outliers(problem: CalibrationProblem, fit: Fit) -> None:
     count = int(np.isfinite(problem.values).sum())
     out = count - int(fit.used.sum())
     if out > MAX_OUTLIERS * count:
@@ -113,7 +113,7 @@ def _check_outliers(problem: Problem, fit: Fit) -> None:
         )
 
 
-def _check_sides(problem: Problem, fit: Fit) -> None:
+def _check_sides(problem: CalibrationProblem, fit: Fit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
     if _fit_error(problem, fit) > MAX_FIT_ERROR:
         return
@@ -133,7 +133,7 @@ def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     )
 
 
-def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:
+def _with_median_scale_one(problem: CalibrationProblem, fit: Fit) -> Fit:
     """Attribute the common scale of sensors to the gains, which do not tell them apart."""
     scales = problem.scales(fit.z)
     middle = float(np.median(scales))
@@ -150,7 +150,7 @@ def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:
 
 
 def _report(
-    problem: Problem,
+    problem: CalibrationProblem,
     fit: Fit,
     live: Responses,
     *,

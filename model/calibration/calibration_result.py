@@ -52,7 +52,7 @@ class MovedEra:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutSensors:
     """Prediction at sensors held out of the fit.
 
     before, after: error of the old and the fitted rig, root mean square over responses, each
@@ -88,7 +88,7 @@ class Calibration:
     value_count: int
     error: float
     chi2: float
-    held_out: HeldOut | None
+    held_out: HeldOutSensors | None
     sensors: tuple[str, ...]
     frequencies: FloatArray
     measured: ComplexArray

@@ -34,7 +34,7 @@ from model.calibration.variable_projection import (
     responses_of,
     row_rms,
 )
-from model.identification.least_squares import Found
+from model.identification.least_squares import Minimum
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _ROUNDS = 8
@@ -45,7 +45,7 @@ _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong b
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class CalibrationProblem:
     """The plate of a rig with its form errors, and the measured values (f, e, s), NaN where none.
 
     searched (p,), free_scales (s,): masks of the parameters to be fitted, and of the scales without
@@ -108,7 +108,7 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class FitStart:
     """Where a fit begins.
 
     z (p,): parameters; noise (f, e): standard deviation of a value; used (f, e, s): mask of values
@@ -121,7 +121,7 @@ class Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit(Start):
+class Fit(FitStart):
     """Result of a fit.
 
     error (p,): standard errors of the parameters; gains, gains_error (f, e), NaN where unmeasured,
@@ -137,10 +137,10 @@ class Fit(Start):
     chi2: float
 
 
-def start_at(problem: Problem, z: FloatArray) -> Start:
+def start_at(problem: CalibrationProblem, z: FloatArray) -> FitStart:
     """Scales of sensors, outliers and noise by the plate at z (p,)."""
     scales, noise, used = without_outliers(problem.values, problem.plate.responses(z))
-    return Start(problem.at_scales(z, scales), noise, used)
+    return FitStart(problem.at_scales(z, scales), noise, used)
 
 
 def without_outliers(
@@ -168,7 +168,7 @@ def without_outliers(
     return scales, noise, used
 
 
-def solve(problem: Problem, start: Start) -> Fit:
+def solve(problem: CalibrationProblem, start: FitStart) -> Fit:
     """Fit parameters, scales and form errors."""
     finite = np.isfinite(problem.values)
     z, noise, used = start.z, start.noise, start.used & finite
@@ -189,7 +189,7 @@ def solve(problem: Problem, start: Start) -> Fit:
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> Found:
+def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:
     return fit_with_gains(
         problem.plate.model,
         problem.values,
@@ -200,7 +200,7 @@ def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> Found:
     )
 
 
-def _noise_left(model: ComplexArray, found: Found, weight: FloatArray) -> FloatArray:
+def _noise_left(model: ComplexArray, found: Minimum, weight: FloatArray) -> FloatArray:
     """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
 
     That is of its row's gain, and of all that is searched, for which tolerances leave less.
@@ -214,7 +214,7 @@ def _noise_left(model: ComplexArray, found: Found, weight: FloatArray) -> FloatA
     return np.asarray(left)
 
 
-def _directions(found: Found) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def _directions(found: Minimum) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Singular vectors (m, k) of the derivatives, and what each moves by one standard error (n, k).
 
     Then a mask (n,) of what none of them determines.
@@ -227,7 +227,9 @@ def _directions(found: Found) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]
     return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
 
 
-def _result(problem: Problem, found: Found, noise: FloatArray, used: NDArray[np.bool_]) -> Fit:
+def _result(
+    problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
+) -> Fit:
     z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
     rows = int(used.any(axis=2).sum())
     freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)

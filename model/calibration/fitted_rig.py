@@ -9,8 +9,8 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_result import FittedParameter, HeldOut, MovedEra
-from model.calibration.fit import Fit, Problem
+from model.calibration.calibration_result import FittedParameter, HeldOutSensors, MovedEra
+from model.calibration.fit import CalibrationProblem, Fit
 from model.calibration.sensed_plate import Parameter, sensed_plate
 from model.calibration.variable_projection import project_gains
 from model.identification.form_errors import MASS_CELLS
@@ -30,7 +30,7 @@ _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
 _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
 
 
-def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
+def rig_of_fit(problem: CalibrationProblem, fit: Fit) -> Rig:
     """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
     rig = problem.plate.rig_at(fit.z)
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
@@ -41,7 +41,7 @@ def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
     return replace(rig, eras=eras)
 
 
-def moved_eras(problem: Problem, fit: Fit) -> tuple[MovedEra, ...]:
+def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
     rig, space, found = problem.plate.rig, problem.plate.model.space, []
     sides = np.array([rig.plate.length, rig.plate.width])
@@ -62,7 +62,7 @@ def moved_eras(problem: Problem, fit: Fit) -> tuple[MovedEra, ...]:
 
 
 def predicted_by(
-    rig: Rig, problem: Problem, points: FloatArray, fit: Fit
+    rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
     model = sensed_plate(rig, points, problem.plate.model.frequencies).responses()
@@ -96,10 +96,10 @@ def _mass_scale_error(rig: Rig) -> float:
 
 def uncertainty_of(
     before: Uncertainty,
-    problem: Problem,
+    problem: CalibrationProblem,
     fit: Fit,
     parameters: Sequence[FittedParameter],
-    held_out: HeldOut | None,
+    held_out: HeldOutSensors | None,
     gains: ComplexArray,
 ) -> Uncertainty:
     """How well a calibrated rig is known, for its file.

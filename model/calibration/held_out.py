@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_result import HeldOut
-from model.calibration.fit import Fit, Problem, solve
+from model.calibration.calibration_result import HeldOutSensors
+from model.calibration.fit import CalibrationProblem, Fit, solve
 from model.calibration.fitted_rig import predicted_by, rig_of_fit
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
 from model.identification.held_out import SHARE, relative_rms
 
 
-def hold_out(problem: Problem, fit: Fit, live: Responses) -> HeldOut | None:
+def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutSensors | None:
     """Fit without some of the live sensors of known scale, and predict their responses.
 
     Predicted by the rig as its file has it, without other form errors.
@@ -37,7 +37,7 @@ def hold_out(problem: Problem, fit: Fit, live: Responses) -> HeldOut | None:
     predicted = gains[:, :, None] * responses * scales
     size = row_rms(problem.values)
     which = fit.used & unseen
-    return HeldOut(
+    return HeldOutSensors(
         tuple(compress(live.sensors, unseen)),
         relative_error(
             problem.values, initial_responses(problem) * scales, size, unseen[None, None]
@@ -47,7 +47,7 @@ def hold_out(problem: Problem, fit: Fit, live: Responses) -> HeldOut | None:
     )
 
 
-def initial_responses(problem: Problem) -> ComplexArray:
+def initial_responses(problem: CalibrationProblem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
     plate = problem.plate
     gains = np.column_stack([era.gain(plate.model.frequencies) for era in plate.rig.eras])

@@ -162,7 +162,7 @@ def _shown(point: tuple[float, float]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Screened:
+class Screening:
     """What a check of responses has found.
 
     dead_eras (e,), dead_sensors (s,): masks of those that do not move the plate, and that hear next

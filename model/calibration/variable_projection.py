@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel
-from model.identification.least_squares import Found, search
+from model.identification.least_squares import Minimum, search
 
 
 def fit_with_gains(
@@ -29,7 +29,7 @@ def fit_with_gains(
     robust: float | None = None,
     drives: Sequence[int] | None = None,
     tolerance: float | None = None,
-) -> Found:
+) -> Minimum:
     """Fit some parameters (p,) of a model to values (f, e, s), every gain g beside them.
 
     weight (f, e, s): zero where nothing was measured; start (p,), of which searched are changed;

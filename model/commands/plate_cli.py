@@ -27,7 +27,7 @@ from model.files.replacing import check_picture
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
 
-class Support(StrEnum):
+class BoundaryCondition(StrEnum):
     """Boundary condition of the plate."""
 
     ERAS = "eras"
@@ -39,7 +39,9 @@ class Support(StrEnum):
 def modes(
     rig_file: RigArgument,
     mesh: MeshOption = None,
-    support: Annotated[Support, typer.Option(help="Boundary condition.")] = Support.ERAS,
+    support: Annotated[
+        BoundaryCondition, typer.Option(help="Boundary condition.")
+    ] = BoundaryCondition.ERAS,
     count: Annotated[int, typer.Option("-n", min=1, help="Number of modes.")] = 12,
     as_json: JsonOption = False,
 ) -> None:

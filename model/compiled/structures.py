@@ -39,7 +39,7 @@ def as_given(values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values, dtype=_TYPES[values.dtype.kind])
 
 
-class Plates(Structure):
+class TouchedPlates(Structure):
     """`plates`: the plate on its ERAs, with fingers on it."""
 
     _fields_ = [
@@ -49,7 +49,7 @@ class Plates(Structure):
     ]
 
 
-class Grouped(Structure):
+class PointGroups(Structure):
     """`grouped`: groups of points whose expected powers are wanted."""
 
     _fields_ = [
@@ -58,7 +58,7 @@ class Grouped(Structure):
     ]
 
 
-class Drawn(Structure):
+class PlateDraws(Structure):
     """`draws`: plates within the uncertainty."""
 
     _fields_ = _fields(
@@ -73,7 +73,7 @@ class Sensors(Structure):
     _fields_ = _fields(i="points", p="rows weights error threshold")
 
 
-class Method(Structure):
+class WeightSearch(Structure):
     """`method`: weights that are tried at each frequency."""
 
     _fields_ = _fields(i="steps limited", f="variance gain reserve growth most")
@@ -87,9 +87,9 @@ class Rules(Structure):
         *_fields(i="rim_count is_deep others"),
         *_fields(f="gain_variance ridge margin highest reached"),
         *_fields(f="judged promised", i="starts iterations again"),
-        ("one_finger", Method),
-        ("several", Method),
-        ("within", 3 * Method),
+        ("one_finger", WeightSearch),
+        ("several", WeightSearch),
+        ("within", 3 * WeightSearch),
         *_fields(p="rim threshold error frequencies"),
     ]
 

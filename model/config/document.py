@@ -36,7 +36,7 @@ KeyPath: TypeAlias = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
-class Problem:
+class ConfigProblem:
     """One thing wrong in a file: its line (None: the file as a whole), the key, what to do."""
 
     line: int | None
@@ -47,7 +47,7 @@ class Problem:
 class ConfigError(InputError):
     """A configuration file that cannot be used, with every problem that was found in it."""
 
-    def __init__(self, source: str, problems: Sequence[Problem]) -> None:
+    def __init__(self, source: str, problems: Sequence[ConfigProblem]) -> None:
         """Say the problems, `FILE:LINE: key: what is wrong; what to do`, one on a line.
 
         Of more than MAX_PROBLEMS the first ones.
@@ -61,7 +61,7 @@ class ConfigError(InputError):
             lines = [f"{source} has {count} errors:", *(f"  {line}" for line in lines)]
         super().__init__("\n".join(lines))
 
-    def _sentence(self, problem: Problem) -> str:
+    def _sentence(self, problem: ConfigProblem) -> str:
         place = self.source if problem.line is None else f"{self.source}:{problem.line}"
         return ": ".join(part for part in (place, problem.key, problem.message) if part)
 
@@ -95,9 +95,9 @@ class Document:
         # Path.expanduser raises where there is no such home; this leaves the name as it is.
         return Path(self.source).parent / os.path.expanduser(name)  # noqa: PTH111
 
-    def problem(self, path: KeyPath, message: str) -> Problem:
+    def problem(self, path: KeyPath, message: str) -> ConfigProblem:
         """A problem at a key."""
-        return Problem(self.line_of(path), key_name(path), message)
+        return ConfigProblem(self.line_of(path), key_name(path), message)
 
 
 def key_name(path: KeyPath) -> str:
@@ -142,7 +142,7 @@ def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"
-        raise ConfigError(source, [Problem(line, "", message)]) from error
+        raise ConfigError(source, [ConfigProblem(line, "", message)]) from error
     return parse_document(source, text, if_empty=if_empty)
 
 
@@ -151,7 +151,7 @@ def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Docum
     if found := _NOT_ALLOWED.search(text):
         line = text.count("\n", 0, found.start()) + 1
         message = f"character U+{ord(found[0]):04X} is not allowed in YAML; remove it"
-        raise ConfigError(source, [Problem(line, "", message)])
+        raise ConfigError(source, [ConfigProblem(line, "", message)])
     with _errors_at(source, text):
         reader = _PlainReader(text)
         data = reader.document()
@@ -163,7 +163,7 @@ def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Docum
 
 
 def _whole(source: str, message: str) -> ConfigError:
-    return ConfigError(source, [Problem(None, "", message)])
+    return ConfigError(source, [ConfigProblem(None, "", message)])
 
 
 @contextmanager
@@ -171,14 +171,14 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
     """Raise what the parser raises as ConfigError, with the line."""
     try:
         yield
-    except _Refused as error:
+    except _Refusal as error:
         raise ConfigError(source, error.problems) from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = None if mark is None else mark.line + 1
         said = " ".join(part for part in (error.context, error.problem) if part)
         remedy = "" if line is None else _remedy(text, line)
-        problem = Problem(line, "", f"is not valid YAML: {said}{remedy}")
+        problem = ConfigProblem(line, "", f"is not valid YAML: {said}{remedy}")
         raise ConfigError(source, [problem]) from error
 
 
@@ -207,10 +207,10 @@ def _remedy(text: str, line: int) -> str:
     return ""
 
 
-class _Refused(Exception):
+class _Refusal(Exception):
     """A part of a file that is not plain data."""
 
-    def __init__(self, *problems: Problem) -> None:
+    def __init__(self, *problems: ConfigProblem) -> None:
         self.problems = problems
 
 
@@ -228,7 +228,7 @@ class _PlainReader:
         self._text = text
         self._events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         self.lines: dict[KeyPath, int] = {}
-        self.repeated: list[Problem] = []
+        self.repeated: list[ConfigProblem] = []
         self._count = 0
 
     def document(self) -> Any:
@@ -268,9 +268,9 @@ class _PlainReader:
             value = self._value(inner, next(self._events))
             if is_repeated:
                 message = f"is given twice, first on line {self.lines[inner]}; remove one"
-                self.repeated.append(Problem(_line(key), key_name(inner), message))
+                self.repeated.append(ConfigProblem(_line(key), key_name(inner), message))
                 if len(self.repeated) > MAX_PROBLEMS:
-                    raise _Refused(*self.repeated)
+                    raise _Refusal(*self.repeated)
             else:
                 mapping[key.value] = value
         return mapping
@@ -288,8 +288,8 @@ class _PlainReader:
         if self._count > _MAX_VALUES:
             raise self._refused((), event, f"has more than {_MAX_VALUES} values")
 
-    def _refused(self, path: KeyPath, event: Any, message: str) -> _Refused:
-        return _Refused(Problem(_line(event), key_name(path), message))
+    def _refused(self, path: KeyPath, event: Any, message: str) -> _Refusal:
+        return _Refusal(ConfigProblem(_line(event), key_name(path), message))
 
 
 _WORDS: dict[str, Scalar] = {

@@ -14,8 +14,8 @@ from ruamel.yaml.resolver import BaseResolver, VersionedResolver
 
 from model.config.document import (
     ConfigError,
+    ConfigProblem,
     Document,
-    Problem,
     Value,
     parse_document,
     plain_value,
@@ -81,7 +81,7 @@ def _refused_if_lossy(document: Document) -> Iterator[None]:
             "cannot be edited with its comments kept; write every value on the line of its key, "
             "and comments on lines of their own"
         )
-        raise ConfigError(document.source, [Problem(None, "", message)]) from error
+        raise ConfigError(document.source, [ConfigProblem(None, "", message)]) from error
 
 
 def data_text(data: Mapping[str, Value]) -> str:

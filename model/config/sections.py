@@ -10,7 +10,7 @@ from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from model.config.document import MAX_PROBLEMS, ConfigError, Document, KeyPath, Problem, Value
+from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
 from model.config.units import Dimension, quantity, shown
 from model.counting import counted
 from registry.suggestions import did_you_mean
@@ -76,7 +76,7 @@ class Validation(Generic[SectionT]):
         """Find every key that is unknown, missing, or has a value that its section refuses."""
         self._section: SectionT | None = None
         self._document = document
-        self._problems: list[Problem] = []
+        self._problems: list[ConfigProblem] = []
         try:
             self._section = root.model_validate(document.data)
         except ValidationError as error:
@@ -142,7 +142,7 @@ def _field_reader(section: type[Section], name: str) -> TypeAdapter[Any]:
 
 def _problem(
     document: Document, root: type[Section], details: ErrorDetails, *, below: KeyPath = ()
-) -> Problem:
+) -> ConfigProblem:
     """Convert a pydantic error of a section below a path."""
     # pydantic marks an error in the key of a mapping by a last entry "[key]".
     path = tuple(part for part in details["loc"] if part != "[key]")

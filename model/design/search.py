@@ -29,7 +29,7 @@ _UNSUPPORTED = -100.0  # dB; below every layout that supports the plate
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ScoredLayout:
     """A layout: positions (n, 2) [m], those kept first, and its score [dB]."""
 
     positions: FloatArray
@@ -58,7 +58,7 @@ class LayoutSearch:
         )
         self._places = self._scorer.places(np.vstack([kept, problem.candidates]))
 
-    def path(self) -> Iterator[Found]:
+    def path(self) -> Iterator[ScoredLayout]:
         """Layouts of ever more ERAs, from those kept or as few as support the plate."""
         problem, positions = self.problem, self.problem.kept_positions
         while len(positions) < problem.count:
@@ -69,11 +69,11 @@ class LayoutSearch:
         if len(positions) == self._k:
             yield self.refine(positions)
 
-    def from_random(self, rng: np.random.Generator) -> Found:
+    def from_random(self, rng: np.random.Generator) -> ScoredLayout:
         """The layout found from one at random; raises InputError where there is no room."""
         return self.refine(self.exchange(self.problem.random_layout(rng)))
 
-    def add(self, positions: FloatArray) -> Found:
+    def add(self, positions: FloatArray) -> ScoredLayout:
         """Add the best candidate to positions (n, 2) [m]; raises InputError without room."""
         tried = [np.vstack([positions, place]) for place in self._open(positions)]
         return best_by(self.scored(tried), _score)
@@ -92,14 +92,14 @@ class LayoutSearch:
                 break
         return best.positions
 
-    def one_more(self, positions: FloatArray) -> Found | None:
+    def one_more(self, positions: FloatArray) -> ScoredLayout | None:
         """Add the best candidate to positions (n, 2) [m], then move all; None without room."""
         try:
             return self.refine(self.add(positions).positions)
         except InputError:
             return None
 
-    def refine(self, positions: FloatArray) -> Found:
+    def refine(self, positions: FloatArray) -> ScoredLayout:
         """Move positions (n, 2) [m] freely by ever smaller steps."""
         (best,) = self.scored([positions])
         step = self.problem.spacing / 2
@@ -116,14 +116,14 @@ class LayoutSearch:
                 step /= 2
         return best
 
-    def scored(self, layouts: Sequence[FloatArray]) -> list[Found]:
+    def scored(self, layouts: Sequence[FloatArray]) -> list[ScoredLayout]:
         """The score of each of some layouts (n, 2) [m], as it is."""
         if not layouts:
             return []
         every = np.unique(np.vstack(layouts), axis=0)
         is_known = (every[:, None] == self._places.at).all(axis=-1).any(axis=1).all()
         places = self._places if is_known else self._scorer.places(every)
-        return [Found(each, self._score_at(places, each)) for each in layouts]
+        return [ScoredLayout(each, self._score_at(places, each)) for each in layouts]
 
     def sensitivities(self, positions: FloatArray, *, step: float) -> FloatArray:
         """The most that the score [dB] changes by a step [m] of each ERA, per metre, (n,)."""
@@ -158,7 +158,7 @@ class LayoutSearch:
         return self.problem.candidates[self.problem.open_candidates(positions)]
 
 
-def _score(found: Found) -> float:
+def _score(found: ScoredLayout) -> float:
     return found.score_db
 
 

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import wrong_size
-from model.calibration.responses import Responses, Screened
+from model.calibration.responses import Responses, Screening
 from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
@@ -60,7 +60,7 @@ _QUANTITIES = (
 )
 
 
-def check_consistency(rig: Rig, responses: Responses) -> Screened:
+def check_consistency(rig: Rig, responses: Responses) -> Screening:
     """Refuse responses that are not what they claim; return what of them a fit can use.
 
     Raises InputError that names the cause: too few sensors or frequencies, another quantity or
@@ -79,7 +79,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Screened:
     _check_wiring(verdict)
     _check_size(verdict)
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
-    return Screened(
+    return Screening(
         np.array(["dead" in channel.states for channel in verdict.channels]),
         np.isin(responses.sensors, [each.name for each in verdict.bad_sensors if each.is_mute]),
         verdict.match.z,

@@ -47,7 +47,7 @@ LEVEL_RESERVE = 1.02
 
 
 @dataclass(frozen=True)
-class Method:
+class LawsonMethod:
     """Weights that are tried at each frequency.
 
     steps: of Lawson's algorithm; is_limited: whether each is brought to the level within full
@@ -61,12 +61,12 @@ class Method:
     gain: float = 0.0
 
 
-ONE_FINGER, SEVERAL = Method(1), Method(1 + LAWSON_STEPS)
+ONE_FINGER, SEVERAL = LawsonMethod(1), LawsonMethod(1 + LAWSON_STEPS)
 
 WITHIN_STROKE = (
-    Method(LIMITED_STEPS, is_limited=True, gain=1.0),
-    Method(1, variance=1.0, gain=3.0),
-    Method(1, variance=1e6, gain=1e6),
+    LawsonMethod(LIMITED_STEPS, is_limited=True, gain=1.0),
+    LawsonMethod(1, variance=1.0, gain=3.0),
+    LawsonMethod(1, variance=1e6, gain=1e6),
 )
 """Tried in turn where the first weights miss the level: such within full stroke, and then such for
 which the quiet points count less against each ERA's own power."""
@@ -134,7 +134,7 @@ def max_sensation(forms: Forms) -> float:
     return float((peak / forms.threshold).max())
 
 
-def tried(forms: Forms, method: Method) -> CoherentResult:
+def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
     """Find the best of the weights of a method at every frequency.
 
     Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are

@@ -9,10 +9,16 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.compiled.kernels import Kernels, kernels, run
-from model.compiled.structures import Drawn, Grouped, Plates, Sensors, as_given
+from model.compiled.structures import PlateDraws, PointGroups, Sensors, TouchedPlates, as_given
 from model.ensemble.draws import Drawing, Draws
 from model.ensemble.plate_on_eras import PlateOnEras
-from model.ensemble.touched_plate import RIDGE, LoadedContacts, Sensed, TouchedPlate, drawn_on
+from model.ensemble.touched_plate import (
+    RIDGE,
+    FingertipAmplitudes,
+    LoadedContacts,
+    TouchedPlate,
+    drawn_on,
+)
 
 _MAX_LANES = 16
 _OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
@@ -37,9 +43,9 @@ class TouchedByKernel(TouchedPlate):
     kernels: Kernels
 
     @cached_property
-    def structure(self) -> Plates:
+    def structure(self) -> TouchedPlates:
         """The plate as kernels read it."""
-        found = Plates.from_buffer_copy(plates_structure(self.on))
+        found = TouchedPlates.from_buffer_copy(plates_structure(self.on))
         found.k = len(self.centres)
         found.point(centres=self.centres, stiffness=self.stiffness)
         return found
@@ -57,7 +63,7 @@ class TouchedByKernel(TouchedPlate):
         fine_count = 0 if fine is None else fine.shape[1]
         known = plate.uncertainty
         rules = known.thickness > 0, known.gain_variance, RIDGE
-        of = Grouped(g, p, g * fine_count, *rules)
+        of = PointGroups(g, p, g * fine_count, *rules)
         of.point(points=points, fine_points=fine, weights=weights, error=error_power)
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
@@ -76,7 +82,7 @@ class TouchedByKernel(TouchedPlate):
         threshold: Float32Array,
         *,
         with_powers: bool = False,
-    ) -> Sensed:
+    ) -> FingertipAmplitudes:
         """As of `TouchedPlate`."""
         m, (k, p) = len(rows), shares.shape
         at = Sensors(k * p)
@@ -92,17 +98,17 @@ class TouchedByKernel(TouchedPlate):
             self.kernels.library.tones_stage,
             *(self.structure, draws, at, given[0].ctypes, m, given[1].ctypes, to),
         )
-        return Sensed(means, loudest, powers if with_powers else None)
+        return FingertipAmplitudes(means, loudest, powers if with_powers else None)
 
 
-def plates_structure(on: PlateOnEras) -> Plates:
+def plates_structure(on: PlateOnEras) -> TouchedPlates:
     """A plate without fingers as kernels read it, kept with it."""
     kept = _kept.get(on)
     if kept is not None:
         return kept
     plate = on.plate
     (b, r), t = plate.shapes.shape, on.receptance.shape[1]
-    found = Plates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
+    found = TouchedPlates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
@@ -111,22 +117,24 @@ def plates_structure(on: PlateOnEras) -> Plates:
     return _kept.setdefault(on, found)  # of threads at once all take the first one's
 
 
-_kept: WeakKeyDictionary[PlateOnEras, Plates] = WeakKeyDictionary()
+_kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()
 
 
-def draws_structure(on: PlateOnEras, finger_count: int, by: Drawing) -> Drawn:
+def draws_structure(on: PlateOnEras, finger_count: int, by: Drawing) -> PlateDraws:
     """Drawn plates with so many fingers as kernels read them."""
     draws, nodes, (bases, first_base), first_node = drawn_on(on, finger_count, by)
     return _structure(draws, nodes, bases, first_base, first_node)
 
 
 @lru_cache(maxsize=64)
-def _structure(draws: Draws, nodes: int, bases: int, first_base: int, first_node: int) -> Drawn:
+def _structure(
+    draws: Draws, nodes: int, bases: int, first_base: int, first_node: int
+) -> PlateDraws:
     def padded(values: Float32Array) -> Float32Array:
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])
 
     count = len(draws.node)
-    found = Drawn(count, bases, nodes, count + _MAX_LANES, first_base, first_node)
+    found = PlateDraws(count, bases, nodes, count + _MAX_LANES, first_base, first_node)
     gains, errors = (np.stack([each.real, each.imag]) for each in (draws.gains, draws.errors))
     floats = {"loss": draws.loss, "damping": draws.damping, "own": draws.own}
     floats |= {"gains": gains, "errors": errors}

@@ -66,7 +66,7 @@ class Changes:
 
 
 @dataclass(frozen=True, eq=False)
-class Sensed:
+class FingertipAmplitudes:
     """Amplitudes to threshold of m tones at k fingertips, nominal and on d drawn plates.
 
     means: (m, k, 1 + d) mean amplitude over each fingertip; loudest: (m, k, 1 + d) squared
@@ -209,7 +209,7 @@ class TouchedPlate:
         threshold: Float32Array,
         *,
         with_powers: bool = False,
-    ) -> Sensed:
+    ) -> FingertipAmplitudes:
         """What is felt on the nominal plate and on drawn ones of tones at rows (m,).
 
         weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
@@ -246,7 +246,9 @@ class TouchedPlate:
         found.reshape(m, k, p, d)[:] += (error[:, None, None] * draws.errors)[:, :, None]
         every = np.concatenate([at_nodes[:, 0, :, None], found], axis=2)
         powers = power_of(every) / (threshold[rows] ** 2)[:, None, None]
-        return Sensed(*over_fingertips(powers, shares), powers if with_powers else None)
+        return FingertipAmplitudes(
+            *over_fingertips(powers, shares), powers if with_powers else None
+        )
 
     def _fingers(
         self, rows: IntArray, nodes: IntArray

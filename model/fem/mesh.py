@@ -1,13 +1,13 @@
 """A structured mesh over the plate of Reissner-Mindlin rectangles: MITC4, the paper's, Q3 to Q5.
 
 Every function of the mesh is the product of one of x and one of y, and so is every integral over
-the plate (`Line`). From the third order on, on Gauss-Lobatto nodes, thin plates do not lock. The
-four-node element would: its shear strain along x is assumed constant along x, that along y constant
-along y (Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383), which on a rectangle takes
-rotations by their mean along the strain. Narrow elements at a free edge resolve the boundary layer,
-as wide as the plate is thick, that limits elements of low order to linear convergence (Babuška and
-Li, Comput. Methods Appl. Mech. Engrg. 100 (1992) 249-273; Häggblad and Bathe, Int. J. Num. Meth.
-Eng. 30 (1990) 981-1011).
+the plate (`ElementRow`). From the third order on, on Gauss-Lobatto nodes, thin plates do not lock.
+The four-node element would: its shear strain along x is assumed constant along x, that along y
+constant along y (Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383), which on a
+rectangle takes rotations by their mean along the strain. Narrow elements at a free edge resolve the
+boundary layer, as wide as the plate is thick, that limits elements of low order to linear
+convergence (Babuška and Li, Comput. Methods Appl. Mech. Engrg. 100 (1992) 249-273; Häggblad and
+Bathe, Int. J. Num. Meth. Eng. 30 (1990) 981-1011).
 """
 
 import math
@@ -68,7 +68,7 @@ class Element:
         return np.asarray(np.linalg.inv(np.vander(self.side, increasing=True)))
 
 
-class Line:
+class ElementRow:
     """Elements in a row: nodes at `nodes` (n,) [m] between the ends of elements (m + 1,) [m].
 
     integrals: by name, sparse (n, n), of functions "vv", of a slope and a function "sv" and "vs",
@@ -191,14 +191,14 @@ class Mesh(Discretisation):
         return (self.length - 2 * self.strip) / self.nx, (self.width - 2 * self.strip) / self.ny
 
     @cached_property
-    def along(self) -> tuple[Line, Line]:
+    def along(self) -> tuple[ElementRow, ElementRow]:
         """Its elements along x and along y."""
         found = []
         for length, count in ((self.length, self.nx), (self.width, self.ny)):
             ends = np.linspace(self.strip, length - self.strip, count + 1)
             if self.strip:
                 ends = np.concatenate([[0.0], ends, [length]])
-            found.append(Line(self.element, ends))
+            found.append(ElementRow(self.element, ends))
         return found[0], found[1]
 
     @property

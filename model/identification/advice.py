@@ -9,7 +9,7 @@ from model.choice import best_of
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.posterior import Posterior, relevant
-from model.identification.stages import Fitted, Setting
+from model.identification.stages import FittedModel, Setting
 
 UNKNOWN = 0.5
 """Share of its standard deviation before, beyond which a measurement has not shown something.
@@ -23,7 +23,7 @@ _SHARES = (0.13, 0.5, 0.87)  # of the sides, where further sensors are considere
 
 
 @dataclass(frozen=True)
-class Unknown:
+class UnknownQuantity:
     """Something that was not identified: its name and standard deviations before and after.
 
     Advised: an ERA and a frequency [Hz] to play, and a sensor at an ERA or at x, y [m].
@@ -45,7 +45,7 @@ class Unknown:
         )
 
 
-def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unknown]:
+def unknowns(setting: Setting, fitted: FittedModel, posterior: Posterior) -> list[UnknownQuantity]:
     """All that answers depend on and the measurement has not shown, with what would show it."""
     space, found = posterior.space, []
     prior = replace(posterior, covariance=np.diag(space.uncertain.astype(float)))
@@ -59,7 +59,7 @@ def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unk
         worst = unknown[best_of(after[unknown])]
         name = kind if kind in ("frequency", "loss") else _name(rows[worst], space.names)
         best = _best(setting, fitted, posterior, rows[worst])
-        found.append(Unknown(name, float(before[worst]), float(after[worst]), *best))
+        found.append(UnknownQuantity(name, float(before[worst]), float(after[worst]), *best))
     return found
 
 
@@ -68,7 +68,7 @@ def _name(row: FloatArray, names: tuple[str, ...]) -> str:
 
 
 def _best(
-    setting: Setting, fitted: Fitted, posterior: Posterior, row: FloatArray
+    setting: Setting, fitted: FittedModel, posterior: Posterior, row: FloatArray
 ) -> tuple[str, float, Sensor]:
     """ERA, frequency and sensor whose response would tell most of a combination (p,)."""
     rig, model = setting.rig, fitted.problem.model

@@ -17,8 +17,8 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.grid import Grid
-from model.identification.settled import Touched
-from model.identification.settled_update import State, Updated
+from model.identification.settled import PatternModel
+from model.identification.settled_update import State, StateUpdate
 
 WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
@@ -32,14 +32,14 @@ _KINDS = ("stiffness", "gain", "phase", "thickness")
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class Observation:
     """A pattern with the state before it, when that was updated [s], and its innovation.
 
     slopes, curvatures (d,): by a change along each direction, of half its squared innovation;
     the last `masses` directions can only be upwards.
     """
 
-    touched: Touched
+    model: PatternModel
     before: State
     time: float | None
     nis: float
@@ -50,19 +50,22 @@ class Taken:
 
     @classmethod
     def of(
-        cls, touched: Touched, before: State, time: float | None, found: Updated, at: FloatArray
-    ) -> "Taken":
+        cls,
+        model: PatternModel,
+        before: State,
+        time: float | None,
+        found: StateUpdate,
+        at: FloatArray,
+    ) -> "Observation":
         """That of a pattern after its update; at (m, 2) [m]: places of masses."""
-        space = touched.space
+        space = model.space
         own = np.flatnonzero(space.of(*_KINDS))
-        plate = touched.touched.at(np.concatenate([found.state.x, found.fingers]))
-        masses = touched.by_mass_at(plate, at)
+        plate = model.forward.at(np.concatenate([found.state.x, found.fingers]))
+        masses = model.by_mass_at(plate, at)
         columns = np.hstack([found.slopes[:, own], masses])
         slopes = columns.T @ (found.precision @ found.innovation)
         curvatures = (columns * (found.precision @ columns)).sum(axis=0)
-        return cls(
-            touched, before, time, found.nis, found.count, slopes, curvatures, masses.shape[1]
-        )
+        return cls(model, before, time, found.nis, found.count, slopes, curvatures, masses.shape[1])
 
 
 class Alarm:
@@ -72,7 +75,7 @@ class Alarm:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[Taken] = deque(maxlen=WINDOW)
+        self._recent: deque[Observation] = deque(maxlen=WINDOW)
 
     @property
     def is_full(self) -> bool:
@@ -83,9 +86,9 @@ class Alarm:
         """Forget the patterns."""
         self._recent.clear()
 
-    def take(self, taken: Taken) -> list[Taken] | None:
+    def take(self, observation: Observation) -> list[Observation] | None:
         """Take a pattern; those since the plate has changed, by the last, None if it has not."""
-        self._recent.append(taken)
+        self._recent.append(observation)
         last = list(self._recent)[::-1]
         along, confirmed = self._along(last)
         if confirmed.max() > _ALONG:
@@ -94,7 +97,9 @@ class Alarm:
         numbers = np.cumsum([each.count for each in last])
         largest = np.maximum.accumulate([each.nis for each in last])
         unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
-        rest = chdtrc(np.maximum(numbers - taken.count, 1), squares - largest) < _UNLIKELY_REST
+        rest = (
+            chdtrc(np.maximum(numbers - observation.count, 1), squares - largest) < _UNLIKELY_REST
+        )
         if np.any(unlikely & rest):
             return last[: best_of(squares - _REFERENCE * numbers) + 1][::-1]
         return None
@@ -109,7 +114,7 @@ class Alarm:
         )
 
     @staticmethod
-    def _along(last: list[Taken]) -> tuple[FloatArray, FloatArray]:
+    def _along(last: list[Observation]) -> tuple[FloatArray, FloatArray]:
         """Most squared deviations along a direction, by the number of the last patterns.
 
         Of any direction, and of those along which the rest deviates without any one of them.

@@ -16,7 +16,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import ReducedModes
 from model.identification.parameters import Space
-from model.identification.places import Modes, Places, places_of
+from model.identification.places import AttachmentPoints, Modes, places_of
 from model.identification.values import Values
 from model.reduction.free_plate import FreePlate
 from model.reduction.receptance import TERMS, FreeReceptance, combined
@@ -69,7 +69,7 @@ class ForwardModel:
     free: FreePlate
     fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
-    last_places: dict[bytes, Places] = field(default_factory=dict)
+    last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse a plate of which neither responses nor slopes would be right."""
@@ -148,7 +148,7 @@ class ForwardModel:
         """The plate for parameters x (p,)."""
         return PlateAt(self, x)
 
-    def places(self, values: Values) -> Places:
+    def places(self, values: Values) -> AttachmentPoints:
         """Solution for all attachments where they are; the last one is kept.
 
         Of a plate with form errors by slopes from the rig's places, which may leave the plate.
@@ -160,7 +160,7 @@ class ForwardModel:
         footprints[:, :2] = np.clip(footprints[:, :2], 0, self._sides)
         return self._solved(footprints)
 
-    def _solved(self, footprints: FloatArray) -> Places:
+    def _solved(self, footprints: FloatArray) -> AttachmentPoints:
         key = footprints.tobytes()
         if key not in self.last_places:
             self.last_places.clear()

@@ -15,8 +15,8 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.identification.derivatives import jacobian
-from model.identification.least_squares import Problem, solve
-from model.identification.stages import Fitted, chi2
+from model.identification.least_squares import IdentificationProblem, solve
+from model.identification.stages import FittedModel, chi2
 
 SHARE = 5
 """One in so many is held out."""
@@ -29,7 +29,7 @@ _IN_COMMON = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutPaths:
     """Errors of prediction, root mean square relative to the responses at a tone.
 
     total: without what noise explains; unexplained: without what noise and the uncertain parameters
@@ -41,7 +41,7 @@ class HeldOut:
     disagreement: FloatArray
 
 
-def hold_out(fitted: Fitted) -> HeldOut | None:
+def hold_out(fitted: FittedModel) -> HeldOutPaths | None:
     """Predict paths from a fit to the others; None where these do not tell enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
     folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % SHARE
@@ -54,7 +54,7 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
             continue
         if (unseen == measurement.known).all():
             return None
-        shown = Problem(model, measurement.part(folds != fold))
+        shown = IdentificationProblem(model, measurement.part(folds != fold))
         found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
         fits.append(found.x)
         plate = model.at(found.x)
@@ -75,7 +75,7 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
     share = (unexplained / total) ** 2 if unexplained else 0.0
     off = np.array(fits) - np.mean(fits, axis=0)
     jackknife = (1 - 1 / len(fits)) * off.T @ off
-    return HeldOut(total, unexplained, share * _IN_COMMON**2 * jackknife)
+    return HeldOutPaths(total, unexplained, share * _IN_COMMON**2 * jackknife)
 
 
 def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:

@@ -1,14 +1,13 @@
 """What may have happened to a plate at once.
 
-One spring, one gain, the thickness, a mass, a hand that stays or a crack: each is a wide prior of
-the parameters that would have changed, those of a hand and a crack beside the plate's
-(`model.identification.alterations`). The most likely one is that whose batch estimate over the last
-patterns costs least, a further cost for each parameter that changed; where even that leaves
-residuals that chance does not, the plate has changed in a way not known.
+One spring, one gain, the thickness or a mass: each is a wide prior of the parameters that would
+have changed. The most likely one is that whose batch estimate over the last patterns costs least, a
+further cost for each parameter that changed; where even that leaves residuals that chance does not,
+the plate has changed in a way not known.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
@@ -17,32 +16,28 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import ranked_by
 from model.identification.alarm import PLACES
-from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
-from model.identification.settled import Touched, finger_covariance
-from model.identification.settled_update import State, Updated, update
+from model.identification.settled import PatternModel, finger_covariance
+from model.identification.settled_update import State, StateUpdate, update
 
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3
 _COST_OF_CHANGE = 4.0
-_UNLIKELY, _FAR_AHEAD, _ROUGHLY = 1e-4, 25.0, 4.0
-_STARTS, _ALTERED_STARTS = 3, 2
-_ALTERATIONS: tuple[Alteration, ...] = (Hand(), Crack())
-_FIRST_EVALUATIONS, _ALTERED_EVALUATIONS, _EVALUATIONS = 10, 15, 40
+_UNLIKELY = 1e-4
+_STARTS = 3
+_FIRST_EVALUATIONS, _EVALUATIONS = 10, 40
 BY_MASS = "a mass"
 _WITHIN_REACH = 300.0  # of the least cost
 _FOLLOWED = 3  # of the least cost after the first evaluations
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class PlateChange:
     """What explains some patterns: its name, "" for nothing known, and the state it leads to.
 
     change: of the parameter, a mass in kg, others as the logarithm of a factor; lead: by how much
-    the next best costs more; resembles: what explains most of it, though not enough; found: of a
-    hand or a crack, where it is and how large. No parameter of a plate stands for these, and the
-    state is that before.
+    the next best costs more; resembles: what explains most of it, though not enough.
     """
 
     name: str
@@ -50,16 +45,8 @@ class Explanation:
     lead: float
     state: State
     resembles: str = ""
-    found: str = ""
-
-    @property
-    def can_be_followed(self) -> bool:
-        """Whether the state has taken up the change."""
-        return bool(self.name) and not self.found
 
     def __str__(self) -> str:
-        if self.found:
-            return f"{self.name}, {self.found}"
         if self.name == BY_MASS:
             return f"{self.name} by {1000 * self.change:+.3g} g"
         if self.name:
@@ -67,84 +54,54 @@ class Explanation:
         return f"the plate has changed, most as if {self.resembles} had"
 
 
-def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
+def explain(before: State, patterns: Sequence[PatternModel]) -> PlateChange:
     """Find the one change that explains patterns, from the state before it."""
-    tried = ranked_by(
-        [
-            _Tried(each, each.update(evaluations=each.evaluations, start=start))
-            for each in _hypotheses(before, patterns)
-            for start in each.starts
-        ],
-        _likelihood,
-    )
-    names = list(dict.fromkeys(each.supposed.name for each in tried))
-    # Hands and cracks may still be far from their least cost.
-    followed = {*names[:_FOLLOWED], *(each.name for each in _ALTERATIONS)}
-    within = tried[0].cost + _WITHIN_REACH
-    for number, each in enumerate(tried):
-        if each.supposed.name not in followed or each.cost > within:
+    tried = [
+        (each, update(each.prior, patterns, evaluations=_FIRST_EVALUATIONS, start=start))
+        for each in _hypotheses(before, patterns)
+        for start in each.starts
+    ]
+    tried = ranked_by(tried, _likelihood)
+    followed = set(list(dict.fromkeys(each.name for each, _ in tried))[:_FOLLOWED])
+    least = _likelihood(tried[0]) - _WITHIN_REACH
+    for number, (supposed, after) in enumerate(tried):
+        if supposed.name not in followed or _likelihood((supposed, after)) < least:
             continue
-        followed.remove(each.supposed.name)
-        x = np.concatenate([each.after.state.x, each.after.fingers])
-        after = each.supposed.update(evaluations=_EVALUATIONS, start=x)
-        tried[number] = replace(each, after=after)
+        followed.remove(supposed.name)
+        x = np.concatenate([after.state.x, after.fingers])
+        after = update(supposed.prior, patterns, evaluations=_EVALUATIONS, start=x)
+        tried[number] = supposed, after
     best, *others = ranked_by(tried, _likelihood)
-    supposed, after, first = best.supposed, best.after, best.supposed.patterns[0]
-    lead = min(each.cost for each in others if each.supposed.name != supposed.name) - best.cost
-    altered = first if isinstance(first, Altered) else None
-    # What a crack leaves is the error of its model, which is of the first order.
-    is_coarse = altered is not None and altered.alteration.is_of_modes
-    is_rough = is_coarse and lead > _FAR_AHEAD and best.cost < _ROUGHLY * after.count
-    if not is_rough and chdtrc(after.count, best.cost) < _UNLIKELY:
-        return Explanation("", 0.0, 0.0, before, resembles=supposed.name)
-    if altered is not None:
-        theta = after.state.x[len(before.x) :]
-        x, y = 100 * altered.place(theta)
-        what = f"{altered.alteration.described(theta[2:])} at {x:.1f}, {y:.1f} cm"
-        return Explanation(supposed.name, float(theta[2]), lead, before, found=what)
+    (supposed, after), likelihood = best, _likelihood(best)
+    rivals = [_likelihood(each) for each in others if each[0].name != supposed.name]
+    if chdtrc(after.count, -likelihood) < _UNLIKELY:
+        return PlateChange("", 0.0, 0.0, before, resembles=supposed.name)
     index = supposed.changed[0]
-    change = float(first.space.std[index] * (after.state.x[index] - before.x[index]))
-    return Explanation(supposed.name, change, lead, after.state)
+    change = float(patterns[0].space.std[index] * (after.state.x[index] - before.x[index]))
+    return PlateChange(supposed.name, change, likelihood - max(rivals), after.state)
 
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """What may have changed: name, numbers of the parameters, their prior, patterns with them.
+    """What may have changed: name, numbers of the parameters, and their prior.
 
-    starts: of the first estimates, by so many evaluations at most; None: the state before.
+    starts: of the first estimates; None: the state before.
     """
 
     name: str
     changed: tuple[int, ...]
     prior: State
-    patterns: Sequence[Touched]
     starts: Sequence[FloatArray | None] = (None,)
-    evaluations: int = _FIRST_EVALUATIONS
-
-    def update(self, *, evaluations: int, start: FloatArray | None) -> Updated:
-        """The batch estimate by the patterns."""
-        return update(self.prior, self.patterns, evaluations=evaluations, start=start)
 
 
-@dataclass(frozen=True, eq=False)
-class _Tried:
-    """A hypothesis, and what it leads to."""
-
-    supposed: _Hypothesis
-    after: Updated
-
-    @property
-    def cost(self) -> float:
-        """Of residuals and changes, and of supposing a change."""
-        return self.after.cost + _COST_OF_CHANGE * len(self.supposed.changed)
+def _likelihood(tried: tuple[_Hypothesis, StateUpdate]) -> float:
+    """Less the cost of residuals and changes after an update, and of supposing a change."""
+    supposed, after = tried
+    return -(after.cost + _COST_OF_CHANGE * len(supposed.changed))
 
 
-def _likelihood(tried: _Tried) -> float:
-    return -tried.cost
-
-
-def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothesis]:
-    """All that may have changed; a mass, a hand or a crack where it would explain most."""
+def _hypotheses(before: State, patterns: Sequence[PatternModel]) -> Iterator[_Hypothesis]:
+    """All that may have changed; a mass where it would explain most."""
     space = patterns[0].space
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
     for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
@@ -152,10 +109,8 @@ def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothe
     kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
     for name, changed in kinds:
         if all(space.std[n] > 0 for n in changed):
-            yield _Hypothesis(name, (*changed,), _widened(before, space, changed), patterns)
+            yield _Hypothesis(name, (*changed,), _widened(before, space, changed))
     yield _by_mass(before, patterns)
-    for alteration in _ALTERATIONS:
-        yield _by_alteration(before, patterns, alteration)
 
 
 def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
@@ -166,59 +121,32 @@ def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
     return State(before.x, covariance)
 
 
-def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
-    space, plate = patterns[0].space, patterns[0].touched.rig.plate
+def _by_mass(before: State, patterns: Sequence[PatternModel]) -> _Hypothesis:
+    space, plate = patterns[0].space, patterns[0].forward.rig.plate
     sides, mass = np.array([plate.length, plate.width]), space.groups["masses"].stop - 3
     changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
     starts = []
-    for size, place in _scan(before, patterns, None, _MASS)[:_STARTS]:
+    for size, place in _scan(before, patterns)[:_STARTS]:
         start = before.x.copy()
         start[mass] = size / space.std[mass]
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
         starts.append(start)
     prior = _widened(before, space, changed)
-    return _Hypothesis(BY_MASS, (*changed,), prior, patterns, starts)
+    return _Hypothesis(BY_MASS, (*changed,), prior, starts)
 
 
-def _by_alteration(
-    before: State, patterns: Sequence[Touched], alteration: Alteration
-) -> _Hypothesis:
-    altered, p = [Altered.by(alteration, each) for each in patterns], len(before.x)
-    wider = linalg.block_diag(before.covariance, np.eye(alteration.size))
-    return _Hypothesis(
-        alteration.name,
-        (*range(p, p + alteration.size),),
-        State(np.concatenate([before.x, np.zeros(alteration.size)]), wider),
-        altered,
-        [
-            np.concatenate([before.x, altered[0].parameters(place, alteration.start(size))])
-            for size, place in _scan(before, patterns, alteration, 1.0)[:_ALTERED_STARTS]
-        ],
-        _ALTERED_EVALUATIONS,
-    )
-
-
-def _scan(
-    before: State, patterns: Sequence[Touched], alteration: Alteration | None, std: float
-) -> list[tuple[float, FloatArray]]:
-    """Sizes and places [m] of an alteration that would explain most, best first, all else linear.
-
-    None: a mass [kg]; std: of sizes.
-    """
-    points = PLACES.centres(patterns[0].touched.rig.plate)
+def _scan(before: State, patterns: Sequence[PatternModel]) -> list[tuple[float, FloatArray]]:
+    """Masses [kg] and their places [m] that would explain most, best first, all else linear."""
+    points = PLACES.centres(patterns[0].forward.rig.plate)
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))
     for each in patterns:
-        fingers = np.zeros(each.touched.space.size - len(before.x))
+        fingers = np.zeros(each.forward.space.size - len(before.x))
         predicted, H = each.predicted(before.x, fingers)
         P = linalg.block_diag(before.covariance, finger_covariance([each.pattern]))
         S = H @ P @ H.T + np.diag(each.std**2)
-        at = each.touched.at(np.concatenate([before.x, fingers]))
-        column = (
-            each.by_mass_at(at, points)
-            if alteration is None
-            else scores(each, at, alteration, points)
-        )
+        at = each.forward.at(np.concatenate([before.x, fingers]))
+        column = each.by_mass_at(at, points)
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)
-    return [(size, points[n]) for n, size in single_changes(slope, curvature, std)]
+    return [(size, points[n]) for n, size in single_changes(slope, curvature, _MASS)]

@@ -18,7 +18,7 @@ _ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phas
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A parameter: its value less the rig's, standard error, standard deviation before; unit.
 
     Per cent are those of the rig's value; places of a mass count from the middle of the plate. key:
@@ -34,7 +34,7 @@ class Estimate:
     key: str
 
 
-def estimates(found: Identification) -> list[Estimate]:
+def estimates(found: Identification) -> list[ParameterEstimate]:
     """All parameters that were uncertain."""
     space, posterior = found.posterior.space, found.posterior
     kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
@@ -51,7 +51,7 @@ def estimates(found: Identification) -> list[Estimate]:
             std, error = math.expm1(std), math.exp(difference) * error
             difference = math.expm1(difference)
         difference, error, std = (known.per_unit * each for each in (difference, error, std))
-        rows.append(Estimate(name, kind, difference, error, std, known.unit, known.key))
+        rows.append(ParameterEstimate(name, kind, difference, error, std, known.unit, known.key))
     return rows
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
-from model.identification.held_out import HeldOut, hold_out
+from model.identification.held_out import HeldOutPaths, hold_out
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space
 from model.identification.posterior import Posterior
-from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
+from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
@@ -46,8 +46,8 @@ class Identification:
     values: Values
     posterior: Posterior
     chi2: float
-    held_out: HeldOut | None
-    fitted: Fitted
+    held_out: HeldOutPaths | None
+    fitted: FittedModel
     seed: int
 
     @property

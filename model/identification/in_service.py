@@ -4,8 +4,8 @@ The parameters of an identification drift; an update moves them together with th
 pattern, which are dropped afterwards. Where innovations are unlikely (`model.identification.alarm`)
 the state goes back to where they began, since an update smears a jump over all parameters, and is
 held until the patterns since then are explained together by one change
-(`model.identification.hypotheses`). A change of its parameters is followed; with a hand on it, a
-crack or a change that nothing explains the plate counts as changed, until patterns are those of the
+(`model.identification.hypotheses`). Such a change is followed; after one that nothing explains, as
+by a crack or a hand that rests on it, the plate counts as changed, until patterns are those of the
 plate as it was.
 """
 
@@ -17,12 +17,12 @@ from typing import Self
 import numpy as np
 
 from model.arrays import FloatArray
-from model.identification.alarm import PLACES, Alarm, Taken
+from model.identification.alarm import PLACES, Alarm, Observation
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.hypotheses import Explanation, explain
+from model.identification.hypotheses import PlateChange, explain
 from model.identification.identify import solved_for
 from model.identification.parameters import KINDS, MODE_SHIFTS, space_of
-from model.identification.settled import SettledPattern, Touched
+from model.identification.settled import PatternModel, SettledPattern
 from model.identification.settled_update import NoiseLevel, State, update
 from model.identification.values import Values, rig_with
 from model.rig.rig import Rig
@@ -42,7 +42,7 @@ _NOT_STATED = (
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class PatternReport:
     """What one pattern has shown.
 
     nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one, none
@@ -54,11 +54,11 @@ class Report:
     count: int
     alarm: bool
     is_held: bool
-    explanation: Explanation | None
+    explanation: PlateChange | None
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class PlateEstimate:
     """What is known of a plate in service.
 
     before: the rig that parameters count from; uncertainty: of the rig as known; model: with a
@@ -106,46 +106,46 @@ class Known:
 class LivePlate:
     """An identified plate in service; known: what is known of it now."""
 
-    def __init__(self, known: Known) -> None:
+    def __init__(self, known: PlateEstimate) -> None:
         self.known = known
         self._alarm = Alarm()
         self._places = PLACES.centres(known.before.plate)
         self._noise = NoiseLevel()
-        self._held: list[Touched] = []
+        self._held: list[PatternModel] = []
         self._suspects = 0
 
-    def take(self, pattern: SettledPattern) -> Report:
+    def take(self, pattern: SettledPattern) -> PatternReport:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = Touched.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
+        model = PatternModel.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
         if self.known.time is None:
             self.known = replace(self.known, time=pattern.time)
         known, drifted = self.known, self._drifted(pattern.time)
         if self._held:
-            self._held.append(touched)
+            self._held.append(model)
             return self._explained(pattern.time)
-        after = update(drifted, [touched], evaluations=_EVALUATIONS, theory=self._theory)
-        taken = Taken.of(touched, known.state, known.time, after, self._places)
-        suspect = self._alarm.take(taken)
+        after = update(drifted, [model], evaluations=_EVALUATIONS, theory=self._theory)
+        observation = Observation.of(model, known.state, known.time, after, self._places)
+        suspect = self._alarm.take(observation)
         if suspect is not None:
             explanation, is_new = None, not self.known.change
             if known.is_explained and is_new:
                 self._go_back(suspect)
                 explanation = self._explained(pattern.time).explanation
             self._alarm.clear()
-            return Report(after.nis, after.count, is_new, bool(self._held), explanation)
+            return PatternReport(after.nis, after.count, is_new, bool(self._held), explanation)
         if self.known.change and self._alarm.is_full:
             self.known = replace(self.known, change="")
         if known.is_explained and not self.known.change and not self._alarm.is_odd:
             self.known = replace(self.known, state=after.state, time=pattern.time)
             self._noise.take(after)
-        return Report(after.nis, after.count, False, False, None)
+        return PatternReport(after.nis, after.count, False, False, None)
 
-    def _go_back(self, suspect: list[Taken]) -> None:
+    def _go_back(self, suspect: list[Observation]) -> None:
         """Return to the state before the first suspect pattern, and hold them."""
         self.known = replace(self.known, state=suspect[0].before, time=suspect[0].time)
-        self._held, self._suspects = [each.touched for each in suspect], len(suspect)
+        self._held, self._suspects = [each.model for each in suspect], len(suspect)
 
-    def _explained(self, time: float) -> Report:
+    def _explained(self, time: float) -> PatternReport:
         """Explain what was held, early if it is certain."""
         count, drifted = len(self._held), self._drifted(time)
         is_full = count >= max(_HELD, self._suspects + _AFTER_ALARM)
@@ -155,13 +155,13 @@ class LivePlate:
             later = explain(drifted, self._held[-_EARLY:])
             found = later if later.name else found
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
-            return Report(np.nan, 0, False, True, None)
+            return PatternReport(np.nan, 0, False, True, None)
         self._held = []
-        if found.can_be_followed:
+        if found.name:
             self.known = replace(self.known, state=found.state, time=time)
         else:
             self.known = replace(self.known, change=str(found))
-        return Report(np.nan, 0, False, False, found)
+        return PatternReport(np.nan, 0, False, False, found)
 
     @cached_property
     def _theory(self) -> FloatArray:

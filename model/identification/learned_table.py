@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from model.errors import InputError
-from model.identification.in_service import Known, LivePlate, Report, widest
+from model.identification.in_service import LivePlate, PatternReport, PlateEstimate, widest
 from model.identification.learned_file import LearnedPlate, OtherPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
@@ -22,10 +22,10 @@ from model.table.table import LocalizationTable
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class LearningStep:
     """What a pattern has led to: its report, and the table from now on, None for the same."""
 
-    report: Report
+    report: PatternReport
     table: LocalizationTable | None
 
 
@@ -36,14 +36,16 @@ class LearnedTable:
     kept, None for nowhere.
     """
 
-    def __init__(self, table: LocalizationTable, known: Known, *, file: Path | None = None) -> None:
+    def __init__(
+        self, table: LocalizationTable, known: PlateEstimate, *, file: Path | None = None
+    ) -> None:
         self._table, self._file = table, file
         self.live = LivePlate(known)
         self.current = table
         """The table as corrected so far."""
 
     @classmethod
-    def resumed(cls, table: LocalizationTable, known: Known, *, file: Path) -> Self:
+    def resumed(cls, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> Self:
         """A table with what was learned of it before, if its file is there.
 
         Raises InputError for another kind of file, OtherPlate for one of another table or of other
@@ -68,7 +70,7 @@ class LearnedTable:
         """How the plate has changed in a way that its parameters do not follow, or nothing."""
         return self.live.known.change
 
-    def take(self, pattern: SettledPattern) -> Learned:
+    def take(self, pattern: SettledPattern) -> LearningStep:
         """Take a settled pattern, and correct the table by it.
 
         Raises InputError or another ValueError for a pattern that leads to no plate that a table
@@ -83,12 +85,12 @@ class LearnedTable:
             if not np.isfinite(state.x).all() or not np.isfinite(state.covariance).all():
                 raise InputError("parameters must be finite after a pattern, got others")
             if state is before.state and bool(change) == bool(before.change):
-                return Learned(report, None)
+                return LearningStep(report, None)
             self.current = self._followed()
         except Exception:
             self.live = LivePlate(before)
             raise
-        return Learned(report, self.current)
+        return LearningStep(report, self.current)
 
     def _followed(self) -> LocalizationTable:
         """The table for the plate as it is known now."""

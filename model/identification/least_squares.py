@@ -20,7 +20,7 @@ _CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Minimum:
     """Where a search ended: x (p,), and half the sum of squares that it minimised.
 
     residuals (2 m + k,), jacobian (2 m + k, n): real parts of all m values, imaginary parts, then
@@ -44,7 +44,7 @@ def search(
     evaluations: int = 60,
     tolerance: float = 1e-8,
     inside: float = 1e-9,
-) -> Found:
+) -> Minimum:
     """Minimize complex residuals (m,) over the n of x (p,) that are searched (p,).
 
     All in standard deviations. linearised: residuals of x, and their derivatives (m, n) by what is
@@ -100,7 +100,7 @@ def search(
         ftol=tolerance,
     )
     plain = both(found.x) if robust is None else real(found.x, None)
-    return Found(whole(found.x), float(found.cost), *plain)
+    return Minimum(whole(found.x), float(found.cost), *plain)
 
 
 def single_changes(
@@ -128,7 +128,7 @@ def _softened(
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class Linearization:
     """Residuals in standard deviations (2 n,) and their derivatives by x (2 n, p) at x (p,)."""
 
     x: FloatArray
@@ -154,7 +154,7 @@ class Linearised:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class IdentificationProblem:
     """A model of a measurement; extra_noise (f, 1, 1): of each part beside its error."""
 
     model: ForwardModel
@@ -173,16 +173,20 @@ class Problem:
         J = jacobian(plate)[measurement.known] / self.std[:, None]
         return (plate.responses - measurement.values)[measurement.known] / self.std, J
 
-    def linearised(self, x: FloatArray) -> Linearised:
+    def linearised(self, x: FloatArray) -> Linearization:
         """The same in real and imaginary parts."""
         found, J = self.residuals(x)
         residuals = np.concatenate([found.real, found.imag])
-        return Linearised(x, residuals, np.concatenate([J.real, J.imag]))
+        return Linearization(x, residuals, np.concatenate([J.real, J.imag]))
 
 
 def solve(
-    problem: Problem, start: FloatArray, free: NDArray[np.bool_], *, evaluations: int = 40
-) -> Linearised:
+    problem: IdentificationProblem,
+    start: FloatArray,
+    free: NDArray[np.bool_],
+    *,
+    evaluations: int = 40,
+) -> Linearization:
     """Minimise the cost over the free parameters (p,) within their bounds, from a start (p,).
 
     evaluations: of the model, at most.

@@ -208,11 +208,10 @@ def space_of(
     *,
     drives_lag: bool = False,
     masses: int = 0,
-    fingers: int = 0,
     mode_count: int = MODE_SHIFTS,
     form_of: int | None = None,
 ) -> Space:
-    """Parameters of a rig with sensors by name, with additional masses and fingers on it.
+    """Parameters of a rig with sensors by name, with additional masses on it.
 
     uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
     mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
@@ -285,8 +284,7 @@ def space_of(
     add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
     of_mode = KINDS["mode_losses"].std * lossy
     add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
-    resting = range(1, fingers + 1)
-    add("fingers", [f"{part} of finger {n}" for n in resting for part in FINGER_PARTS])
+    add("fingers", [])
     has_form = form_of is not None
     add("sensor_scale", [f"scale of sensor {name}" for name in sensors if has_form])
     add("sensor_place", [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"])

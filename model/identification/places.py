@@ -14,7 +14,7 @@ Modes: TypeAlias = FreeModes | ReducedModes
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class AttachmentPoints:
     """Points of attachment and observation, a of them, of which v may move along x and y.
 
     footprints (a, 3) [m]; shapes (a, r); truncated (TERMS, a, a): sums over truncated modes;
@@ -28,7 +28,7 @@ class Places:
     shape_slopes: FloatArray
     truncated_slopes: FloatArray
 
-    def moved(self, footprints: FloatArray, movable: IntArray) -> "Places":
+    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
         """The same for other footprints (a, 3), by the slopes of the shapes alone."""
         off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
         slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
@@ -37,7 +37,9 @@ class Places:
         return replace(self, footprints=footprints, shapes=shapes)
 
 
-def places_of(modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray) -> Places:
+def places_of(
+    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
+) -> AttachmentPoints:
     """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
 
     movable (v,): numbers of those that may move.
@@ -46,13 +48,13 @@ def places_of(modes: Modes, footprints: FloatArray, movable: IntArray, sides: Fl
     truncated = modes.truncated_terms(footprints, footprints)
     if not len(movable):
         none = np.zeros((len(truncated), 0, len(footprints)))
-        return Places(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
+        return AttachmentPoints(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
 
     def field(points: FloatArray) -> FloatArray:
         return modes.truncated_terms(points, footprints).swapaxes(0, 1)
 
     by_place = place_slopes(field, moving, sides)
-    return Places(
+    return AttachmentPoints(
         footprints,
         shapes,
         truncated,

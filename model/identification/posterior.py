@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.identification.least_squares import Linearised
+from model.identification.least_squares import Linearization
 from model.identification.parameters import KINDS, Space
 from model.rig.uncertainty import Uncertainty
 
@@ -35,7 +35,7 @@ class Posterior:
     covariance: FloatArray
 
     @classmethod
-    def of(cls, space: Space, best: Linearised) -> "Posterior":
+    def of(cls, space: Space, best: Linearization) -> "Posterior":
         """That about the most likely parameters: (J^T J + 1)^-1, known ones without variance."""
         free = np.flatnonzero(space.uncertain)
         covariance = np.zeros((space.size, space.size))

@@ -62,16 +62,16 @@ def finger_covariance(patterns: Sequence[SettledPattern]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Touched:
+class PatternModel:
     """The plate of a forward model under the fingers of one pattern.
 
-    space: of the model, which has no fingers of its own; touched: the model with the fingers;
+    space: of the model, which has no fingers of its own; forward: the model with the fingers;
     noise: of the pattern's readings, relative to its largest.
     """
 
     pattern: SettledPattern
     space: Space
-    touched: ForwardModel
+    forward: ForwardModel
     noise: float = 1.0
 
     @classmethod
@@ -82,19 +82,19 @@ class Touched:
         finger_std: float,
         *,
         noise: float = 1.0,
-    ) -> "Touched":
+    ) -> "PatternModel":
         """A model under the fingers of a pattern, of loads known to finger_std (of logarithms)."""
         count, space = len(FINGER_PARTS) * len(pattern.fingers), model.space
         names = [f"finger part {number}" for number in range(count)]
         wider = space.and_further("fingers", names, finger_std)
-        touched = replace(
+        forward = replace(
             model,
             frequencies=np.array([pattern.frequency]),
             fingers=pattern.fingers,
             space=wider,
             last_places={},
         )
-        return cls(pattern, space, touched, noise)
+        return cls(pattern, space, forward, noise)
 
     @property
     def std(self) -> FloatArray:
@@ -106,17 +106,17 @@ class Touched:
 
         x (p,): of the plate; fingers (q,): of theirs.
         """
-        plate = self.touched.at(np.concatenate([x, fingers]))
+        plate = self.forward.at(np.concatenate([x, fingers]))
         values = plate.responses[0] @ self.pattern.bases
         changes = np.einsum("snp,n->sp", jacobian(plate)[0], self.pattern.bases)
-        return self.as_numbers(values, changes)
+        return self._as_numbers(values, changes)
 
     def by_mass_at(self, plate: PlateAt, points: FloatArray) -> FloatArray:
         """Change of the numbers of the pattern by a mass [kg] at points (m, 2) [m], (2 s, m)."""
         changes = np.einsum("snp,n->sp", by_mass_at(plate, points)[0], self.pattern.bases)
-        return self.as_numbers(plate.responses[0] @ self.pattern.bases, changes)[1]
+        return self._as_numbers(plate.responses[0] @ self.pattern.bases, changes)[1]
 
-    def as_numbers(
+    def _as_numbers(
         self, values: ComplexArray, changes: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
         """Real and imaginary parts of values at the sensors (s,) and their changes (s, q).

@@ -9,7 +9,7 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.identification.least_squares import search
-from model.identification.settled import Touched, finger_count, finger_covariance
+from model.identification.settled import PatternModel, finger_count, finger_covariance
 
 _LEAST = 1e-14  # of the largest variance
 _INSIDE = 0.1  # standard deviations
@@ -27,7 +27,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Updated:
+class StateUpdate:
     """A state after some patterns.
 
     nis: normalised innovation squared before the update, of `count` real numbers; cost: squared
@@ -51,12 +51,12 @@ class Updated:
 
 def update(
     before: State,
-    patterns: Sequence[Touched],
+    patterns: Sequence[PatternModel],
     *,
     evaluations: int,
     start: FloatArray | None = None,
     theory: FloatArray | None = None,
-) -> Updated:
+) -> StateUpdate:
     """Most likely state after patterns within its bounds, from the state or from a start.
 
     evaluations: of the model, at most; start: of the plate (p,), or of plate and fingers (p + q,);
@@ -107,7 +107,7 @@ def update(
     precision = linalg.inv(expected)
     nis = float(innovation @ precision @ innovation)
     own = covariance[:p, :p]
-    return Updated(
+    return StateUpdate(
         State(at[:p], (own + own.T) / 2),
         nis,
         len(values),
@@ -122,7 +122,7 @@ def update(
 
 
 def _linearised(
-    patterns: Sequence[Touched], at: FloatArray, p: int, q: int
+    patterns: Sequence[PatternModel], at: FloatArray, p: int, q: int
 ) -> tuple[FloatArray, FloatArray]:
     """Numbers of all patterns, and their derivatives by plate and fingers (m, p + q)."""
     predicted, rows, first = [], [], p
@@ -152,7 +152,7 @@ class NoiseLevel:
         self._recent: deque[tuple[float, float]] = deque(maxlen=_PATTERNS)
         self.relative = 1.0
 
-    def take(self, updated: Updated) -> None:
+    def take(self, updated: StateUpdate) -> None:
         """Take what an update by a pattern of this noise has left of it."""
         self._recent.append((self.relative**2 * updated.misfit, updated.freedom))
         misfit, freedom = np.array(self._recent).sum(axis=0) + _FIRST_NOISE

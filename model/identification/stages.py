@@ -16,7 +16,12 @@ from model.choice import NEARLY, best_by, ranked_by
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.least_squares import Linearised, Problem, single_changes, solve
+from model.identification.least_squares import (
+    IdentificationProblem,
+    Linearization,
+    single_changes,
+    solve,
+)
 from model.identification.measurement import Measurement
 from model.identification.parameters import MODE_SHIFTS, Space, inwards, space_of
 from model.identification.values import plate_with
@@ -77,11 +82,11 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedModel:
     """The most likely parameters in one model, and the problem that they solve."""
 
-    problem: Problem
-    best: Linearised
+    problem: IdentificationProblem
+    best: Linearization
 
     @property
     def space(self) -> Space:
@@ -89,14 +94,14 @@ class Fitted:
         return self.problem.model.space
 
 
-def fit_in_stages(setting: Setting) -> Fitted:
+def fit_in_stages(setting: Setting) -> FittedModel:
     """Find the most likely parameters of a measurement."""
     measurement = setting.measurement
     model = setting.model(masses=1)
-    raised = Problem(model, measurement, _EXTRA_NOISE * measurement.tone_rms)
+    raised = IdentificationProblem(model, measurement, _EXTRA_NOISE * measurement.tone_rms)
     simple = _simple(raised)
     located = _with_mass(raised, simple.x, number=0)
-    found = _in_full(Problem(model, measurement), located)
+    found = _in_full(IdentificationProblem(model, measurement), located)
     while chi2(found) > _MORE_MASS_BEYOND and found.problem.model.mass_count < 2:
         more = _another_mass(setting, found)
         if more.best.cost > found.best.cost - _MASS_GAINS:
@@ -105,15 +110,15 @@ def fit_in_stages(setting: Setting) -> Fitted:
     return _solved_anew(setting, found)
 
 
-def _solved_anew(setting: Setting, found: Fitted) -> Fitted:
+def _solved_anew(setting: Setting, found: FittedModel) -> FittedModel:
     """Fit from there with the plate solved for its thickness and modulus, as a table will be."""
     values, plate = found.problem.model.at(found.best.x).values, setting.rig.plate
     identified = plate_with(plate, values)
     identified = replace(identified, mode_deviations=plate.mode_deviations)
     free = solved_with_modes_of(setting.free, identified)
     model = replace(found.problem.model, free=free, last_places={})
-    problem = Problem(model, setting.measurement)
-    return Fitted(problem, solve(problem, found.best.x, found.space.uncertain))
+    problem = IdentificationProblem(model, setting.measurement)
+    return FittedModel(problem, solve(problem, found.best.x, found.space.uncertain))
 
 
 def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
@@ -123,18 +128,18 @@ def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
     return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
 
 
-def chi2(fitted: Fitted) -> float:
+def chi2(fitted: FittedModel) -> float:
     """Squared residuals in standard deviations, per value beyond the parameters they determine."""
     r, J = fitted.best.residuals, fitted.best.jacobian
     determined = np.trace(linalg.solve(fitted.best.information, J.T @ J, assume_a="pos"))
     return float(r @ r / max(len(r) - determined, 1.0))
 
 
-def _simple(problem: Problem) -> Linearised:
+def _simple(problem: IdentificationProblem) -> Linearization:
     """Fit without form errors from several thicknesses."""
     space = problem.model.space
     free = space.of(*SIMPLE)
-    best: Linearised | None = None
+    best: Linearization | None = None
     for thickness in _THICKNESSES:
         start = np.zeros(space.size)
         start[space.groups["thickness"]] = thickness
@@ -147,7 +152,9 @@ def _simple(problem: Problem) -> Linearised:
     return best
 
 
-def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearised]:
+def _with_mass(
+    problem: IdentificationProblem, x: FloatArray, *, number: int
+) -> list[Linearization]:
     """Fit places and an additional mass from where it explains most, and from none."""
     space = problem.model.space
     start = inwards(space, x, by=_INWARDS)
@@ -162,7 +169,9 @@ def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearis
     return ranked_by(found, lambda each: -each.cost)
 
 
-def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, float]]:
+def _scan(
+    problem: IdentificationProblem, x: FloatArray, own: int
+) -> list[tuple[FloatArray, float]]:
     """Places and sizes of x at which an additional mass would explain most, all else linear."""
     model = problem.model
     space = model.space
@@ -186,19 +195,21 @@ def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, f
     return [(off[number], size) for number, size in heaviest[:_KEPT]]
 
 
-def _in_full(problem: Problem, starts: list[Linearised]) -> Fitted:
+def _in_full(problem: IdentificationProblem, starts: list[Linearization]) -> FittedModel:
     """Fit everything to the noise as it is, from the two best starts."""
     free = problem.model.space.uncertain
     found = [solve(problem, each.x, free) for each in starts[:2]]
-    return Fitted(problem, best_by(found, lambda each: -each.cost))
+    return FittedModel(problem, best_by(found, lambda each: -each.cost))
 
 
-def _another_mass(setting: Setting, found: Fitted) -> Fitted:
+def _another_mass(setting: Setting, found: FittedModel) -> FittedModel:
     """Fit with one mass more."""
     before = found.problem.model.mass_count
     model = setting.model(masses=before + 1)
-    raised = Problem(model, setting.measurement, _EXTRA_NOISE * setting.measurement.tone_rms)
+    raised = IdentificationProblem(
+        model, setting.measurement, _EXTRA_NOISE * setting.measurement.tone_rms
+    )
     at = found.space.groups["masses"].stop
     x = np.insert(found.best.x, at, np.zeros(3))
     starts = _with_mass(raised, x, number=before)
-    return _in_full(Problem(model, setting.measurement), starts)
+    return _in_full(IdentificationProblem(model, setting.measurement), starts)

@@ -14,7 +14,7 @@ from model.arrays import FloatArray
 from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (
-    Unresolved,
+    UnresolvedCompliance,
     compliance_between,
     uncertain_compliance,
     unresolved_at,
@@ -30,12 +30,12 @@ _MAX_CACHED = 4  # sets of points whose shapes are kept
 
 
 @dataclass(frozen=True, eq=False)
-class _Observed:
+class _PointShapes:
     """At p points: shapes of the modes (p, r) and truncated ones (p, t), unresolved compliance."""
 
     shapes: FloatArray
     truncated: FloatArray
-    unresolved: Unresolved
+    unresolved: UnresolvedCompliance
 
 
 class SpectralModes:
@@ -74,7 +74,7 @@ class SpectralModes:
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         # By shape and content, of which either alone may be those of others.
-        self._known: dict[tuple[tuple[int, ...], bytes], _Observed] = {}
+        self._known: dict[tuple[tuple[int, ...], bytes], _PointShapes] = {}
         self._is_softer = False
 
     def softer(self) -> "SpectralModes":
@@ -114,11 +114,11 @@ class SpectralModes:
             mode, rest = mode + modes, rest + rests
         return tuple(found)
 
-    def _residuals(self, at: _Observed) -> FloatArray:
+    def _residuals(self, at: _PointShapes) -> FloatArray:
         """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
         return np.concatenate(at.truncated * self._powers[:RESIDUAL_ORDER, None])
 
-    def _local(self, own: _Observed, other: _Observed) -> FloatArray:
+    def _local(self, own: _PointShapes, other: _PointShapes) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
         places = self._local_plate, own.unresolved, other.unresolved
         missing = compliance_between(*places)
@@ -126,7 +126,7 @@ class SpectralModes:
             missing = missing + uncertain_compliance(*places)
         return missing / self.largest_truncated
 
-    def _observe(self, points: FloatArray) -> _Observed:
+    def _observe(self, points: FloatArray) -> _PointShapes:
         """What is known of points or footprints on the plate, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
@@ -142,5 +142,5 @@ class SpectralModes:
             ]
             shapes, truncated = (np.hstack(each) for each in zip(*found, strict=True))
             unresolved = unresolved_at(self._local_plate, degrees, points)
-            self._known[key] = _Observed(shapes, truncated, unresolved)
+            self._known[key] = _PointShapes(shapes, truncated, unresolved)
         return self._known[key]

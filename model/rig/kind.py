@@ -13,7 +13,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from urllib.parse import quote
 
-from model.config.document import ConfigError, Document, Problem
+from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of
@@ -31,7 +31,7 @@ _FAR_FROM_SLIDING = 2.0
 
 def _check(document: Document) -> CheckedFile:
     """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     rig = None
     try:
         rig = rig_of(document)
@@ -170,7 +170,7 @@ errors by the amplifier's name, and warnings, and opens none.
 """
 
 
-def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
+def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[ConfigProblem], list[str]]:
     """Problems and warnings; rig: of the document, None if it is invalid."""
     urls = _urls(document)
     counts = rig.channel_counts if rig else Counter[str]()

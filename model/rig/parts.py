@@ -12,7 +12,7 @@ from model.rig.sections import (
 )
 from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
+from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from registry.limits import GuardLimits
 
 _OF_PLATE = {each.name for each in fields(Plate)} - {"thickness", "material", "air_gap"}
@@ -44,7 +44,7 @@ def laminate_of(section: PlateSection) -> Laminate | None:
     if section.layers is None:
         return None
     layers = (
-        Layer(
+        LaminateLayer(
             Material(**layer.material.model_dump()),
             layer.thickness,
             loss_factor=layer.loss_factor or 0.0,

@@ -18,7 +18,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.structure.footprint import mean_over
-from model.structure.laminate_section import Section
+from model.structure.laminate_section import CrossSection
 
 EVEN, ODD = 1, -1
 
@@ -176,7 +176,7 @@ def _polynomials(x: FloatArray, length: float, degree: int) -> FloatArray:
     return np.asarray(legvander(2 * x / length - 1, degree) * scale)
 
 
-def edge_decays(section: Section) -> tuple[float, ...]:
+def edge_decays(section: CrossSection) -> tuple[float, ...]:
     """Decays [1/m] of the boundary layers of a laminate's free edge, the widest first.
 
     Displacements along an edge twist the layers against each other: twist v'' = slip v over the

@@ -72,7 +72,7 @@ def local_compliance(
 
 
 @dataclass(frozen=True, eq=False)
-class Unresolved:
+class UnresolvedCompliance:
     """At n footprints [m] (n, 3): compliance of a point force in bending and in shear [m/N] (n,).
 
     wavenumber [1/m] (n,): where it begins; decade [m/N] (n,): of shear in ten times shorter waves.
@@ -85,7 +85,9 @@ class Unresolved:
     decade: FloatArray
 
 
-def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
+def compliance_between(
+    plate: Plate, own: UnresolvedCompliance, other: UnresolvedCompliance
+) -> FloatArray:
     """Unresolved compliance [m/N] (n, m); see `local_compliance`."""
     places, others = own.footprints, other.footprints
     distance = np.hypot(*(places[:, None, :2] - others[:, :2]).transpose(2, 0, 1))
@@ -127,7 +129,9 @@ def edge_compliance(plate: Plate, side: float, degrees: IntArray, foot: float) -
     return np.asarray(np.maximum(bending * share + decade * decades, _ON_FOOT * at_point))
 
 
-def uncertain_compliance(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
+def uncertain_compliance(
+    plate: Plate, own: UnresolvedCompliance, other: UnresolvedCompliance
+) -> FloatArray:
     """By how much the unresolved compliance may be too low [m/N] (n, m).
 
     A share of it, and for a point, of which shear has no limit, ten times shorter waves.
@@ -138,7 +142,9 @@ def uncertain_compliance(plate: Plate, own: Unresolved, other: Unresolved) -> Fl
     return np.asarray(_UNCERTAIN * compliance_between(plate, own, other) + decade)
 
 
-def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) -> Unresolved:
+def unresolved_at(
+    plate: Plate, degrees: tuple[int, int], places: FloatArray
+) -> UnresolvedCompliance:
     """What polynomials of these degrees do not resolve at footprints (n, 3) or points (n, 2)."""
     places = as_footprints(places)
     points = places[:, :2]
@@ -164,7 +170,7 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
     mean = wavelengths2.mean(axis=1)
     logarithm = np.log(np.maximum(1, wavelengths2 / h**2)).mean(axis=1) / 2
     images = (1 + edge / ratio_at_edge).prod(axis=1)
-    return Unresolved(
+    return UnresolvedCompliance(
         places,
         bending * mean / (4 * np.pi * D),
         images * logarithm / (2 * np.pi * plate.shear_rigidity),

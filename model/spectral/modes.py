@@ -32,7 +32,7 @@ from model.structure.laminate_section import (
     section_of,
     shear_corrections,
 )
-from model.structure.plate import Layer, Plate
+from model.structure.plate import LaminateLayer, Plate
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""
@@ -85,11 +85,11 @@ class Band:
         return min(max(frequency, self.low), self.high)
 
 
-def layers_of(plate: Plate) -> tuple[Layer, ...]:
+def layers_of(plate: Plate) -> tuple[LaminateLayer, ...]:
     """The layers of a plate; of a homogeneous one itself."""
     if plate.laminate is not None:
         return plate.laminate.layers
-    return (Layer(plate.material, plate.thickness),)
+    return (LaminateLayer(plate.material, plate.thickness),)
 
 
 class SpectralPlate:

@@ -18,12 +18,12 @@ from model.spectral.functions import CLASSES, EdgedFunctions, edge_decays
 from model.spectral.modes import layers_of
 from model.spectral.stiffness import ClassFunctions, class_stiffness, follow
 from model.structure.laminate_section import (
-    Section,
+    CrossSection,
     interface_mass,
     section_of,
     shear_corrections,
 )
-from model.structure.plate import Layer, Plate
+from model.structure.plate import LaminateLayer, Plate
 
 _NUS = (0.0, 0.4)  # of a difference: any two
 
@@ -46,7 +46,7 @@ def stiffness_slopes(
     moduli = np.array([layer.modulus(frequency).real for layer in layers])
     nus = np.array([layer.material.nu for layer in layers])
 
-    def section(moduli: FloatArray, nu: float | None = None) -> Section:
+    def section(moduli: FloatArray, nu: float | None = None) -> CrossSection:
         changed = layers if nu is None else [_with_nu(each, nu) for each in layers]
         return section_of(changed, moduli.tolist(), corrections)
 
@@ -75,5 +75,5 @@ def stiffness_slopes(
     return slopes
 
 
-def _with_nu(layer: Layer, nu: float) -> Layer:
+def _with_nu(layer: LaminateLayer, nu: float) -> LaminateLayer:
     return replace(layer, material=replace(layer.material, nu=nu))

@@ -26,7 +26,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.spectral.functions import EdgedFunctions
-from model.structure.laminate_section import Section
+from model.structure.laminate_section import CrossSection
 from model.structure.plate import AirGap
 
 
@@ -73,7 +73,9 @@ class ClassFunctions:
         return self.deflections + self.interfaces * along
 
 
-def class_stiffness(of: ClassFunctions, section: Section, by_side: int | None = None) -> FloatArray:
+def class_stiffness(
+    of: ClassFunctions, section: CrossSection, by_side: int | None = None
+) -> FloatArray:
     """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part.
 
     Or its derivative by the logarithm of a side, 0 for length and 1 for width, at the same mass:

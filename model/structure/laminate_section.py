@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.plate import Bond, Laminate, Layer, Material, Plate
+from model.structure.plate import Bond, Laminate, LaminateLayer, Material, Plate
 
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 
@@ -30,7 +30,7 @@ class Bending:
 
 
 @dataclass(frozen=True, eq=False)
-class Section:
+class CrossSection:
     """Stiffness per area of n layers in the displacements u along the plate at n + 1 interfaces.
 
     stretch, across, twist (n + 1, n + 1) [N/m]: of u_x,x u_x,x, of u_x,x u_y,y, and of
@@ -45,16 +45,16 @@ class Section:
     lever: ComplexArray
     shear: complex
 
-    def in_motions(self, motions: FloatArray) -> "Section":
+    def in_motions(self, motions: FloatArray) -> "CrossSection":
         """The section in k motions of the interfaces, each a column (n + 1, k)."""
         stretch, across, twist, slip = (
             motions.T @ each @ motions
             for each in (self.stretch, self.across, self.twist, self.slip)
         )
-        return Section(stretch, across, twist, slip, motions.T @ self.lever, self.shear)
+        return CrossSection(stretch, across, twist, slip, motions.T @ self.lever, self.shear)
 
 
-def opposite_motions(layers: Sequence[Layer]) -> FloatArray:
+def opposite_motions(layers: Sequence[LaminateLayer]) -> FloatArray:
     """Motions of the interfaces that bending can excite, orthonormal columns (n + 1, k).
 
     Where the layers are the same from above as from below, interfaces move opposite to their mirror
@@ -68,8 +68,8 @@ def opposite_motions(layers: Sequence[Layer]) -> FloatArray:
 
 
 def section_of(
-    layers: Sequence[Layer], moduli: Sequence[complex], corrections: FloatArray
-) -> Section:
+    layers: Sequence[LaminateLayer], moduli: Sequence[complex], corrections: FloatArray
+) -> CrossSection:
     """Section of layers with these Young's moduli [Pa]; corrections: of `shear_corrections`."""
     size = len(layers) + 1
     stretch, across, twist, slip = (np.zeros((size, size), dtype=complex) for _ in range(4))
@@ -87,10 +87,10 @@ def section_of(
         slip[own, own] += kappa * G / h * np.outer(ends, ends)
         lever[own] += kappa * G * ends
         shear += kappa * G * h
-    return Section(stretch, across, twist, slip, lever, shear)
+    return CrossSection(stretch, across, twist, slip, lever, shear)
 
 
-def interface_mass(layers: Sequence[Layer]) -> FloatArray:
+def interface_mass(layers: Sequence[LaminateLayer]) -> FloatArray:
     """Mass per area [kg/m²] of displacements along the plate at the interfaces, (n + 1, n + 1)."""
     mass = np.zeros((len(layers) + 1, len(layers) + 1))
     for number, layer in enumerate(layers):
@@ -114,7 +114,7 @@ def slide_frequency(laminate: Laminate, frequency: float) -> float:
     return math.sqrt(np.sort(squares)[1]) / (2 * math.pi)
 
 
-def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
+def shear_corrections(layers: Sequence[LaminateLayer]) -> FloatArray:
     """Shear correction factor of each layer (n,): 5/6 of a single one, 1 of a soft core.
 
     (∫ tau)² / (h ∫ tau²) over the layer, tau the shear stress that balances the bending stress of
@@ -136,7 +136,7 @@ def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
     return factors
 
 
-def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
+def perfectly_bonded(layers: Sequence[LaminateLayer]) -> Bending:
     """Layers without slip: D* = D - B A⁻¹ B of classical laminate theory.
 
     Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is Ashton's, J. Compos.
@@ -153,7 +153,7 @@ def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
     return Bending((equal + opposite) / 2, (equal - opposite) / (equal + opposite))
 
 
-def freely_sliding(layers: Sequence[Layer]) -> Bending:
+def freely_sliding(layers: Sequence[LaminateLayer]) -> Bending:
     """Layers that share only their deflection: the sum of their rigidities."""
     rigidity = sum(layer.flexural_rigidity for layer in layers)
     coupling = sum(layer.material.nu * layer.flexural_rigidity for layer in layers)
@@ -191,7 +191,9 @@ def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
     return better
 
 
-def _columns(layers: Sequence[Layer]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _columns(
+    layers: Sequence[LaminateLayer],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Moduli [Pa], Poisson's ratios, thicknesses, and heights of the middles above the face [m]."""
     rows = [(each.material.E, each.material.nu, each.thickness) for each in layers]
     moduli, nu, thickness = np.array(rows).T

@@ -91,7 +91,7 @@ class Sheet:
 
 
 @dataclass(frozen=True)
-class Layer(Sheet):
+class LaminateLayer(Sheet):
     """One layer of a laminate; thickness [m].
 
     loss_factor: eta of its modulus E (1 + i eta). by_frequency: rows of frequency [Hz], ascending,
@@ -129,7 +129,7 @@ class Layer(Sheet):
 class Laminate:
     """Layers from one face to the other."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[LaminateLayer, ...]
     bond: Bond = Bond.FULL
 
     def __post_init__(self) -> None:

@@ -86,7 +86,7 @@ class Carrier:
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class FingerResponses:
     """Responses of some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers.
 
     hats (samples, t + d, knots, eras), steady (t + d, eras); combinations of ERAs in an onset.
@@ -105,7 +105,7 @@ class Felt:
         quiet_rows: FloatArray,
         *,
         combinations: int = 0,
-    ) -> "Felt":
+    ) -> "FingerResponses":
         """Read all ERAs at rows (t, r) and (d, r) of shapes.
 
         target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
@@ -119,7 +119,7 @@ class Felt:
         combinations = combinations or max(_COMBINATIONS, len(rows) // 4)
         return cls(len(target_rows), hats, rows @ carrier.steady.T, combinations)
 
-    def of(self, active: IntArray) -> "Felt":
+    def of(self, active: IntArray) -> "FingerResponses":
         """That of active ERAs only."""
         if len(active) == self.steady.shape[1]:
             return self
@@ -147,7 +147,9 @@ def solve_carrier(
     )
 
 
-def onset_by_numpy(amplitudes: ComplexArray, found: Felt, gain_variance: float) -> ComplexArray:
+def onset_by_numpy(
+    amplitudes: ComplexArray, found: FingerResponses, gain_variance: float
+) -> ComplexArray:
     """Find all knots (free, eras) in strokes but the last, the amplitudes (eras,).
 
     found: of these ERAs.
@@ -200,7 +202,7 @@ def _rises() -> Float32Array:
 
 
 def quiet_weight(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses
 ) -> float:
     """Weight of the mean square at quiet fingers in an ending, as `ending_by_numpy` has it."""
     vibration = np.linalg.norm(amplitudes @ carrier.steady)
@@ -209,7 +211,11 @@ def quiet_weight(
 
 
 def ending_by_numpy(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt | None, weight: float
+    carrier: Carrier,
+    amplitudes: ComplexArray,
+    active: IntArray,
+    found: FingerResponses | None,
+    weight: float,
 ) -> ComplexArray:
     """Find all knots (free, active) in strokes but the last, which are zero.
 
@@ -231,7 +237,9 @@ def ending_by_numpy(
     return bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
 
 
-def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tuple[Complex, Complex]:
+def while_ending(
+    found: FingerResponses, start: ComplexArray, gain_variance: float
+) -> tuple[Complex, Complex]:
     """Form and right side of the mean square at quiet fingers in an ending.
 
     An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
@@ -258,7 +266,7 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
 def _summed(responses: Complex, gain_variance: float) -> Complex:
     """Expected form over knots and ERAs, summed over time, of the squares over samples and rows.
 
-    responses (samples, d, knots, eras) as in `Felt.hats`. In the step before
+    responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before
     the last, each hat is as that of the next knot in the last step, and so on.
     """
     knots, eras = responses.shape[2:]

@@ -19,7 +19,7 @@ from model.transients.knots import (
     STEPS,
     TARGET_WEIGHT,
     Carrier,
-    Felt,
+    FingerResponses,
     ending_by_numpy,
     onset_by_numpy,
     quiet_weight,
@@ -27,7 +27,9 @@ from model.transients.knots import (
 )
 
 
-def onset_knots(amplitudes: ComplexArray, found: Felt, gain_variance: float) -> ComplexArray:
+def onset_knots(
+    amplitudes: ComplexArray, found: FingerResponses, gain_variance: float
+) -> ComplexArray:
     """Find start and knots (1 + ONSET_KNOTS, eras) in strokes, from rest to amplitudes (eras,).
 
     found: of these ERAs.
@@ -41,7 +43,7 @@ def onset_knots(amplitudes: ComplexArray, found: Felt, gain_variance: float) -> 
 
 
 def ending_knots(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt | None
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses | None
 ) -> ComplexArray:
     """Find start and knots (1 + ENDING_KNOTS, active) in strokes, from amplitudes (eras,) to rest.
 
@@ -62,7 +64,7 @@ def _found_by_kernel(
     knots: ComplexArray,
     given: ShapedTone,
     amplitudes: ComplexArray,
-    found: Felt | None,
+    found: FingerResponses | None,
     *,
     is_ending: bool,
 ) -> bool:

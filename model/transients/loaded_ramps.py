@@ -32,7 +32,7 @@ _MIN_BAND = 200.0  # Hz
 
 
 @dataclass(frozen=True, eq=False)
-class _Line:
+class _TransformLine:
     """Line of the transform and what it needs of a drive, for times (n,).
 
     p: (m,) [1/s]; transform: (m,) [s] of its envelope; inverse: (n, m); envelope: (n,).
@@ -157,7 +157,9 @@ def response_count(duration: float) -> int:
 
 
 @lru_cache(maxsize=32)
-def _line(ramp: float, duration: float, after: float | None, lines: float, within: int) -> _Line:
+def _line(
+    ramp: float, duration: float, after: float | None, lines: float, within: int
+) -> _TransformLine:
     spacing = duration / within
     count = within + math.ceil((after or 0.0) / spacing)
     times = np.asarray(spacing * (np.arange(count) + 0.5), dtype=float)
@@ -173,4 +175,6 @@ def _line(ramp: float, duration: float, after: float | None, lines: float, withi
         transform *= 1 - np.exp(-p * duration)
         drive -= rise(np.asarray(times - duration), ramp)
     inverse = np.exp(np.outer(times, p)) * (step / (2 * math.pi))
-    return _Line(p.astype(complex), transform.astype(complex), inverse.astype(complex), drive)
+    return _TransformLine(
+        p.astype(complex), transform.astype(complex), inverse.astype(complex), drive
+    )

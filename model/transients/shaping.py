@@ -25,7 +25,7 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
-from model.transients.knots import ALONE, Carrier, Felt, mean_square, solve_carrier
+from model.transients.knots import ALONE, Carrier, FingerResponses, mean_square, solve_carrier
 from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
@@ -145,13 +145,13 @@ class Shaper:
 
     def _read(
         self, frequency: float, targets: tuple[Position, ...], quiet: tuple[Position, ...]
-    ) -> Felt:
+    ) -> FingerResponses:
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
         carrier = self.prepare(frequency)
         if quiet:
-            return Felt.at(carrier, means, self._resting(quiet))
-        return Felt.at(carrier, means, self._surroundings(targets), combinations=ALONE)
+            return FingerResponses.at(carrier, means, self._resting(quiet))
+        return FingerResponses.at(carrier, means, self._surroundings(targets), combinations=ALONE)
 
     def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
         """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed."""

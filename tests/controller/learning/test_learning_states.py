@@ -24,7 +24,7 @@ from controller.learning.messages import (
     Estimate,
     Note,
     Ready,
-    Refreshed,
+    RefreshedAnswers,
     Reply,
     Start,
     unpacked,
@@ -164,7 +164,7 @@ def watching() -> Ready:
     return replace(ready(), only_alarms="never measured")
 
 
-REFRESHED = Refreshed(answers(), answers())
+REFRESHED = RefreshedAnswers(answers(), answers())
 CHANGED, FOLLOWING = "changed", "following"
 EXPLAINING, ONLY_ALARMS = "explaining", "only_alarms"
 COURSES = {

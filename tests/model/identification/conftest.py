@@ -6,7 +6,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, draw
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
-from model.identification.in_service import Known
+from model.identification.in_service import PlateEstimate
 from model.identification.measurement import Measurement
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import FREQUENCIES
@@ -28,6 +28,6 @@ def found(hidden: Hidden) -> Identification:
 
 
 @pytest.fixture(scope="session")
-def known(found: Identification) -> Known:
+def known(found: Identification) -> PlateEstimate:
     """What a daemon knows of that plate when it starts: what the identified rig states."""
-    return Known.of_rig(found.rig, found.fitted.problem.model.sensors)
+    return PlateEstimate.of_rig(found.rig, found.fitted.problem.model.sensors)

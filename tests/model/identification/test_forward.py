@@ -8,7 +8,7 @@ import pytest
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, RestingFinger, Sensor
-from model.identification.parameters import Space, inwards, space_of
+from model.identification.parameters import FINGER_PARTS, Space, inwards, space_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.meshes import mesh_of
@@ -17,7 +17,7 @@ from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Bond, Laminate, Layer, Material
+from model.structure.plate import Bond, Laminate, LaminateLayer, Material
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
 PAD = Sensor("pad", x=0.1, y=0.07)
@@ -35,7 +35,8 @@ def model(rig: Rig) -> ForwardModel:
     """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
     names = [sensor.name for sensor in sensors]
-    space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1, fingers=1)
+    space = space_of(rig, names, rig.uncertainty, drives_lag=True, masses=1)
+    space = space.and_further("fingers", [f"{part} of finger" for part in FINGER_PARTS])
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     return ForwardModel(rig, sensors, FREQUENCIES, space, free, [FINGER])
 
@@ -95,7 +96,11 @@ def of_a_laminate(model: ForwardModel) -> ForwardModel:
     glass = Material("glass", E=70e9, rho=2500.0, nu=0.23)
     soft = Material("soft", E=6e6, rho=1000.0, nu=0.49)
     laminate = Laminate(
-        (Layer(glass, 1e-3), Layer(soft, 0.5e-3, loss_factor=0.5), Layer(glass, 1e-3)),
+        (
+            LaminateLayer(glass, 1e-3),
+            LaminateLayer(soft, 0.5e-3, loss_factor=0.5),
+            LaminateLayer(glass, 1e-3),
+        ),
         bond=Bond.FULL,
     )
     plate = equivalent_plate(laminate, length=0.3048, width=0.2286, frequency=500.0)

@@ -10,7 +10,7 @@ from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted
 from model.errors import InputError
 from model.identification import learned_table
-from model.identification.in_service import Known
+from model.identification.in_service import PlateEstimate
 from model.identification.learned_table import LearnedTable
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -23,7 +23,7 @@ POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 
 
 @pytest.fixture(scope="module")
-def table(known: Known) -> LocalizationTable:
+def table(known: PlateEstimate) -> LocalizationTable:
     """The table of the identified rig at a few tones."""
     return build_table(known.before, frequencies=TONES, drive_mode="phased")
 
@@ -43,7 +43,7 @@ def error(table: LocalizationTable, plate: Mounted) -> float:
 
 @pytest.mark.long
 def test_answers_follow_a_loosened_mount(
-    hidden: Hidden, known: Known, table: LocalizationTable
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable
 ) -> None:
     """Fields that a loose mount puts off by over a tenth are within a third of that afterwards."""
     learned = LearnedTable(table, known)
@@ -58,7 +58,7 @@ def test_answers_follow_a_loosened_mount(
 
 @pytest.mark.long
 def test_answers_wait_for_an_explanation(
-    hidden: Hidden, known: Known, table: LocalizationTable
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable
 ) -> None:
     """A quiet pattern gives a new table, odd ones that raise an alarm none."""
     learned = LearnedTable(table, known)
@@ -73,7 +73,7 @@ def test_answers_wait_for_an_explanation(
 
 @pytest.mark.long
 def test_unexplained_change_widens_the_errors_of_answers(
-    hidden: Hidden, known: Known, table: LocalizationTable, tmp_path: Path
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """Answers then are robust to the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
@@ -97,7 +97,7 @@ def test_unexplained_change_widens_the_errors_of_answers(
 
 
 def test_pattern_that_no_table_follows_leaves_the_state(
-    hidden: Hidden, known: Known, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """State, answers and time are those before a refused pattern, and the next one is taken."""
     learned = LearnedTable(table, known)
@@ -118,7 +118,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
 
 
 def test_what_was_learned_is_resumed_for_its_table_only(
-    hidden: Hidden, known: Known, table: LocalizationTable, tmp_path: Path
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """The same state and answers come back; another rig's table and a damaged file are refused."""
     file = tmp_path / "learned.npz"
@@ -142,7 +142,9 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     with pytest.raises(InputError, match="this table"):
         LearnedTable.resumed(replace(table, masses=()), known, file=file)
     with pytest.raises(InputError, match="this rig"):
-        LearnedTable.resumed(table, Known.of_rig(known.before, known.model.sensors[:2]), file=file)
+        LearnedTable.resumed(
+            table, PlateEstimate.of_rig(known.before, known.model.sensors[:2]), file=file
+        )
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(bytes(content))

@@ -8,20 +8,20 @@ import pytest
 
 from benchmarks.identification.hidden import draw
 from model.arrays import FloatArray
-from model.identification.alarm import WINDOW, Alarm, Taken
+from model.identification.alarm import WINDOW, Alarm, Observation
 from model.identification.forward import Sensor
-from model.identification.in_service import Known, LivePlate
-from model.identification.settled import SettledPattern, Touched
-from model.identification.settled_update import NoiseLevel, State, Updated, update
+from model.identification.in_service import LivePlate, PlateEstimate
+from model.identification.settled import PatternModel, SettledPattern
+from model.identification.settled_update import NoiseLevel, State, StateUpdate, update
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import settled_patterns
 
 
 @pytest.fixture(scope="module")
-def known() -> Known:
+def known() -> PlateEstimate:
     """The paper's plate by its drawing."""
     rig = load_rig(example_rig_path())
-    return Known.of_rig(rig, [Sensor(era.name, era.name) for era in rig.eras])
+    return PlateEstimate.of_rig(rig, [Sensor(era.name, era.name) for era in rig.eras])
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def turned(pattern: SettledPattern, phase: float, *, has_phase: bool) -> Settled
     return replace(pattern, values=np.exp(1j * phase) * pattern.values, has_phase=has_phase)
 
 
-def state_after(known: Known, pattern: SettledPattern) -> FloatArray:
+def state_after(known: PlateEstimate, pattern: SettledPattern) -> FloatArray:
     """Parameters after the pattern."""
     live = LivePlate(known)
     live.take(pattern)
@@ -45,7 +45,7 @@ def state_after(known: Known, pattern: SettledPattern) -> FloatArray:
 
 
 def test_update_does_not_depend_on_a_phase_that_is_unknown(
-    known: Known, pattern: SettledPattern
+    known: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """A turn of all readings together changes nothing; where their phase counts, it does."""
     before = state_after(known, turned(pattern, 0.0, has_phase=False))
@@ -55,16 +55,18 @@ def test_update_does_not_depend_on_a_phase_that_is_unknown(
     assert np.abs(counted - before).max() > 0.1
 
 
-def test_update_within_bounds_explains_a_pattern(known: Known, pattern: SettledPattern) -> None:
+def test_update_within_bounds_explains_a_pattern(
+    known: PlateEstimate, pattern: SettledPattern
+) -> None:
     """Of a plate that was not measured, whose ERAs at corners can be off inwards alone.
 
     A hundred parameters are free for eight numbers: at the most likely state these are explained to
     their errors, by no more changes than eight directions of the prior are likely to make.
     """
-    touched = Touched.of(known.model, pattern, 0.5)
-    found = update(known.state, [touched], evaluations=20)
-    predicted, _ = touched.predicted(found.state.x, found.fingers)
-    residuals = (predicted - pattern.numbers) / touched.std
+    model = PatternModel.of(known.model, pattern, 0.5)
+    found = update(known.state, [model], evaluations=20)
+    predicted, _ = model.predicted(found.state.x, found.fingers)
+    residuals = (predicted - pattern.numbers) / model.std
     assert residuals @ residuals < found.count
     assert found.cost < 3 * found.count
     space = known.model.space
@@ -72,35 +74,37 @@ def test_update_within_bounds_explains_a_pattern(known: Known, pattern: SettledP
     assert (found.state.x <= space.upper).all()
 
 
-def test_numbers_change_as_their_derivatives_say(known: Known, pattern: SettledPattern) -> None:
+def test_numbers_change_as_their_derivatives_say(
+    known: PlateEstimate, pattern: SettledPattern
+) -> None:
     """Central differences of the numbers without a phase; none lies along a common turn."""
     without = turned(pattern, 1.0, has_phase=False)
-    touched = Touched.of(known.model, without, 0.5)
+    model = PatternModel.of(known.model, without, 0.5)
     x, fingers = np.zeros(known.model.space.size), np.zeros(4 * len(pattern.fingers))
-    _, J = touched.predicted(x, fingers)
+    _, J = model.predicted(x, fingers)
     step = 1e-5
     for number in known.model.space.indices("stiffness"):
         moved = x.copy()
         moved[number] = step
-        ahead, _ = touched.predicted(moved, fingers)
-        behind, _ = touched.predicted(-moved, fingers)
+        ahead, _ = model.predicted(moved, fingers)
+        behind, _ = model.predicted(-moved, fingers)
         slopes = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(slopes, J[:, number], rtol=1e-3, atol=1e-7)
     turn = np.concatenate([(1j * without.values).real, (1j * without.values).imag])
     assert np.abs(turn @ J).max() < 1e-9 * np.linalg.norm(turn) * np.linalg.norm(J)
 
 
-def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> Taken:
+def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> Observation:
     """A pattern of eight numbers with one direction of unit curvature."""
     slopes, none = np.array([slope]), cast(Any, None)
-    return Taken(none, none, 0.0, nis, 8, slopes, np.ones(1), masses)
+    return Observation(none, none, 0.0, nis, 8, slopes, np.ones(1), masses)
 
 
-def updated(misfit: float, freedom: float) -> Updated:
+def updated(misfit: float, freedom: float) -> StateUpdate:
     """An update that leaves so many squared residuals of so many numbers."""
     empty = np.zeros((0, 0))
     state = State(np.zeros(0), empty)
-    return Updated(state, 0.0, 8, 0.0, misfit, freedom, empty, empty, empty, empty)
+    return StateUpdate(state, 0.0, 8, 0.0, misfit, freedom, empty, empty, empty, empty)
 
 
 def test_change_along_one_direction_is_found_in_likely_patterns() -> None:

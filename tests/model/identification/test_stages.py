@@ -10,7 +10,7 @@ from long_form import shortly
 from model.identification.forward import Sensor
 from model.identification.measurement import Measurement
 from model.identification.stages import (
-    Fitted,
+    FittedModel,
     Setting,
     chi2,
     fit_in_stages,
@@ -22,7 +22,7 @@ from model.rig.file import example_rig_path, load_rig
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
 
 
-def identified(hidden: Hidden, *, rounds: int = 4) -> Fitted:
+def identified(hidden: Hidden, *, rounds: int = 4) -> FittedModel:
     """The paper's rig fitted to a hidden plate; each ERA plays as many in four tones."""
     rig = load_rig(example_rig_path())
     sensors = [Sensor(era.name, era.name) for era in rig.eras]

@@ -14,7 +14,7 @@ from model.fem.plate import assemble
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era, PointLoad
-from model.structure.plate import Laminate, Layer, Plate
+from model.structure.plate import Laminate, LaminateLayer, Plate
 from model.vibration.natural_modes import natural_modes
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
@@ -178,7 +178,7 @@ def test_shapes_at_footprints_are_not_those_of_points_of_the_same_bytes(kind):
     """Three points and two footprints of six numbers each, one after the other."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     if kind == "layers":
-        halves = Layer(ALUMINIUM, 0.0007), Layer(ALUMINIUM, 0.0008)
+        halves = LaminateLayer(ALUMINIUM, 0.0007), LaminateLayer(ALUMINIUM, 0.0008)
         plate = replace(plate, laminate=Laminate(halves))
     mesh = MESHES["4x3 Q4"] if kind == "elements" else SpectralMesh(8, 8, LENGTH, WIDTH)
     modes = solve_free_plate(plate, mesh, frequency_max=200.0).modes

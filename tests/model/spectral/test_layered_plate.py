@@ -20,15 +20,19 @@ from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Laminate, Layer, Material, Plate
+from model.structure.plate import Laminate, LaminateLayer, Material, Plate
 from model.vibration.natural_modes import natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ADHESIVE = Material("adhesive", E=1e6, rho=1000.0, nu=0.49)
-PANEL = (Layer(COVER, 1.8e-3), Layer(ADHESIVE, 0.2e-3), Layer(GLASS, 0.7e-3))
-THIN = (Layer(GLASS, 0.7e-3), Layer(ADHESIVE, 0.1e-3), Layer(GLASS, 0.7e-3))
+PANEL = (
+    LaminateLayer(COVER, 1.8e-3),
+    LaminateLayer(ADHESIVE, 0.2e-3),
+    LaminateLayer(GLASS, 0.7e-3),
+)
+THIN = (LaminateLayer(GLASS, 0.7e-3), LaminateLayer(ADHESIVE, 0.1e-3), LaminateLayer(GLASS, 0.7e-3))
 
 
 def panel(layers, length=0.375, width=0.225, **changes):
@@ -74,7 +78,7 @@ def test_free_strip_equals_elasticity(layers):
 def test_layers_of_one_material_are_the_homogeneous_plate():
     """Three layers of aluminium vibrate as one of their thickness in finite elements, 0.2 %."""
     aluminium = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
-    layers = (Layer(aluminium, 0.5e-3),) * 3
+    layers = (LaminateLayer(aluminium, 0.5e-3),) * 3
     found, _ = frequencies_of(panel(layers, 0.3048, 0.2286), (12, 9), cut=500.0)
     plate = Plate(0.3048, 0.2286, 1.5e-3, aluminium)
     mesh = Mesh.accurate(plate, frequency_max=500.0)

@@ -11,14 +11,14 @@ from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.spectral.shape_stiffness import stiffness_slopes
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Laminate, Layer, Material, Plate
+from model.structure.plate import Laminate, LaminateLayer, Material, Plate
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
 PLATE = Plate(0.3, 0.21, 0.001, GLASS)
 LAYERS = (
-    Layer(GLASS, 0.0004),
-    Layer(Material("glue", E=50e6, rho=1000.0, nu=0.45), 0.0002),
-    Layer(GLASS, 0.0006),
+    LaminateLayer(GLASS, 0.0004),
+    LaminateLayer(Material("glue", E=50e6, rho=1000.0, nu=0.45), 0.0002),
+    LaminateLayer(GLASS, 0.0006),
 )
 SANDWICH = equivalent_plate(Laminate(LAYERS), length=0.3, width=0.21, frequency=200.0)
 DEGREES = (13, 11)

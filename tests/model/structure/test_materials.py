@@ -8,7 +8,7 @@ import pytest
 from model.errors import InputError
 from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.materials import material
-from model.structure.plate import AirGap, Layer, Material, Plate
+from model.structure.plate import AirGap, LaminateLayer, Material, Plate
 from paper_plate import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
@@ -59,7 +59,7 @@ def test_material_refuses_an_unknown_name_with_a_suggestion(name, message):
     [
         (material("steel"), {"E": [0.0, math.nan], "rho": [-1.0], "nu": [0.5, -1.0, math.nan]}),
         (PLATE, {key: [0.0, -0.1, math.nan, math.inf] for key in ("length", "width", "thickness")}),
-        (Layer(GLASS, 1e-3), {"thickness": [0.0, -1e-3, math.nan, math.inf]}),
+        (LaminateLayer(GLASS, 1e-3), {"thickness": [0.0, -1e-3, math.nan, math.inf]}),
         (
             PointLoad(0.1, 0.1),
             {

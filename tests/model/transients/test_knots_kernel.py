@@ -9,7 +9,13 @@ import pytest
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.transients.base_motion import shaped
-from model.transients.knots import Carrier, Felt, ending_by_numpy, onset_by_numpy, quiet_weight
+from model.transients.knots import (
+    Carrier,
+    FingerResponses,
+    ending_by_numpy,
+    onset_by_numpy,
+    quiet_weight,
+)
 from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
@@ -19,7 +25,7 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2
 
 
-def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, Felt]:
+def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, FingerResponses]:
     """Responses that ring and decay, of one target and so many quiet fingers."""
     r, samples, steps = 6 + quiet, 5, 30
 
@@ -37,7 +43,7 @@ def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, Felt]:
         hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
     )
     at = rng.standard_normal((1 + 5 * quiet, r))
-    return carrier, Felt.at(carrier, at[:1], at[1:])
+    return carrier, FingerResponses.at(carrier, at[:1], at[1:])
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")

@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
-from model.table.request import MAX_MODULATION, MIN_MODULATION
 from pydantic import BeforeValidator
 
 from controller.effects.band import Band, TunedSection

@@ -202,6 +202,8 @@ class Acceptor:
 
     async def _admit(self, accepted: socket.socket) -> None:
         try:
+            if self.tls is not None:
+                await _first_byte(accepted)  # a silent connection takes no time or memory for TLS
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: ClientConnection(self), accepted, ssl=self.tls
             )
@@ -209,3 +211,15 @@ class Acceptor:
             accepted.close()
         finally:
             self._handshakes.cancel(asyncio.current_task())
+
+
+async def _first_byte(accepted: socket.socket) -> None:
+    """Wait until a client sends something, which is left to be read; raises OSError at its end."""
+    loop, has_come = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(accepted, has_come.set)
+    try:
+        await has_come.wait()
+    finally:
+        loop.remove_reader(accepted)
+    if not accepted.recv(1, socket.MSG_PEEK):
+        raise ConnectionResetError

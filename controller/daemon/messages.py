@@ -150,18 +150,12 @@ def playing_of(applied: Applied | None) -> dict[str, Any]:
     return {
         "drive": {} if applied is None else played_tones(applied.drive),
         "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
-        **{key: pattern and _finite(getattr(pattern, name)) for key, name in _PREDICTED.items()},
+        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
+        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
+        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
+        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
+        "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
     }
-
-
-_PREDICTED = {
-    "robust_felt_contrast_db": "robust_felt_contrast_db",
-    "predicted_felt_contrast_db": "felt_contrast_db",
-    "robust_contrast_db": "robust_contrast_db",
-    "predicted_contrast_db": "contrast_db",
-    "predicted_level_db_sl": "level_db_sl",
-}
-"""Keys of a `Playing`, and what of a pattern they have."""
 
 
 def played_tones(drive: Drive) -> dict[str, PlayedTone]:

@@ -141,6 +141,7 @@ def _print_row(
                 fingers,
                 apart_hz=20,
                 bands_may_swap=has_bands,
+                drive_mode="phased",
                 min_contrast_db=-np.inf,
             )
             for bands in choices
@@ -235,9 +236,9 @@ def _print_modulated(
     for places in _sets(table, contents, quiet, count=count, apart=apart):
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
-        plain = answer(table, requests, fingers)
+        plain = answer(table, requests, fingers, drive_mode="phased")
         requests[0] = replace(requests[0], modulation_hz=modulation)
-        found = answer(table, requests, fingers)
+        found = answer(table, requests, fingers, drive_mode="phased")
         before, after = plain.promised_worst_db, found.promised_worst_db
         if found.layers[0].side_bands and before is not None and after is not None:
             steady.append(before)
@@ -272,7 +273,7 @@ def _print_distorted(
     for places in _sets(table, contents, quiet, count=count, apart=apart):
         requests = [Request(at, (40.0, 320.0)) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
-        found = answer(table, requests, fingers, min_contrast_db=-np.inf)
+        found = answer(table, requests, fingers, drive_mode="phased", min_contrast_db=-np.inf)
         tones = []
         for layer in found.layers:
             frequencies, bases = base_amplitudes(layer.excitation, table.eras)

@@ -87,11 +87,13 @@ def answer(
     *,
     apart_hz: float = APART_HZ,
     bands_may_swap: bool = False,
+    drive_mode: str | None = None,
 ) -> Answer:
     """Answer the requests of several fingers at once, each with a vibration of its own.
 
     fingers: the others, which are to feel nothing; apart_hz: distance of the frequencies;
-    bands_may_swap: whether a finger may have another one's band. Where the worst finger would have
+    bands_may_swap: whether a finger may have another one's band; drive_mode: the table's own if
+    None, which must be `phased` for more than one vibration. Where the worst finger would have
     less than 6 dB, contents are shared or held back as the requests allow (`Answer.applied`).
     Raises InputError for fingers off the plate or at one place, and for a band without
     frequencies. The same as `era table query --own`.
@@ -104,7 +106,16 @@ def answer(
     for finger in fingers:
         expect(finger, Finger, what="a finger", made_by="era.Finger((0.22, 0.16))")
     expect_number(apart_hz, what="apart_hz", unit="hertz")
-    return _answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
+    if drive_mode is not None:
+        _expect_mode(drive_mode)
+    return _answer(
+        table,
+        requests,
+        fingers,
+        apart_hz=apart_hz,
+        bands_may_swap=bands_may_swap,
+        drive_mode=drive_mode,
+    )
 
 
 def contrast_map(

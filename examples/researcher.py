@@ -88,7 +88,7 @@ the power of all others where that finger is.
 """
 
 # %%
-both = era.answer(table, [era.Request(target), era.Request(quiet[0])])
+both = era.answer(table, [era.Request(target), era.Request(quiet[0])], drive_mode="phased")
 for layer in both.layers:
     print(f"{layer.request.at}: {layer.verdict}, {layer.promised_contrast_db:.1f} dB promised")
 
@@ -115,7 +115,7 @@ for name, (predicted, felt) in played.items():
     )
 promised = pattern.robust_felt_contrast_db
 drawn = [
-    era.SolvedPlate(rig, seed=seed).play(pattern, target, quiet=quiet).felt_contrast_db
+    era.SolvedPlate(rig, seed=seed).play(pattern, target, quiet=quiet).contrast_db
     for seed in range(10)
 ]
 print(

@@ -165,4 +165,4 @@ class _InTime:
             ramp=ONSET_RAMP,
             onset=None,
             imperfections=self._drawn,
-        ).felt_contrast_db
+        ).contrast_db

@@ -69,7 +69,13 @@ class Case:
             requests = [
                 Request(at, band, LEVEL_DB_SL) for at, band in zip(places, bands, strict=True)
             ]
-            found = answer(self.table, requests, bands_may_swap=True, min_contrast_db=-np.inf)
+            found = answer(
+                self.table,
+                requests,
+                bands_may_swap=True,
+                drive_mode="phased",
+                min_contrast_db=-np.inf,
+            )
             played = [next(iter(each.excitation.values())).frequency for each in found.layers]
             bands = [next(b for b in bands if b[0] <= each <= b[1]) for each in played]
         return bands

@@ -23,6 +23,7 @@ from model.answer.request import MIN_CONTRAST_DB, Answer
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
+from model.drive_modes import UNRESTRICTED
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
@@ -253,4 +254,11 @@ def _answered(
     requests = requests_of(table, fingers, playable, protected or frozenset())
     others = fingers_of(quiet, protected or frozenset())
     least = -math.inf if protected is None else MIN_CONTRAST_DB
-    return answer(table, requests, others, min_contrast_db=least, playable=playable)
+    return answer(
+        table,
+        requests,
+        others,
+        drive_mode=UNRESTRICTED,
+        min_contrast_db=least,
+        playable=playable,
+    )

@@ -152,10 +152,8 @@ def playing_of(applied: Applied | None) -> dict[str, Any]:
     return {
         "drive": {} if applied is None else played_tones(applied.drive),
         "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
-        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
-        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
-        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
-        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
+        "promised_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
+        "predicted_contrast_db": pattern and _finite(pattern.felt_contrast_db),
         "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
     }
 
@@ -192,7 +190,7 @@ def contact_status(
                     "role": "target",
                     "feels": felt.content,
                     "level_db_sl": _finite(felt.level_db_sl),
-                    "robust_felt_contrast_db": _finite(felt.promised_contrast_db),
+                    "promised_contrast_db": _finite(felt.promised_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
                     "verdict": felt.verdict,
                     "frequency_hz": felt.frequency,

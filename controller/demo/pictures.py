@@ -85,7 +85,7 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
 
 
 def _contrast(row: TouchRow) -> float:
-    contrast = row.measured_felt_contrast_db
+    contrast = row.measured_contrast_db
     return -math.inf if contrast is None else contrast
 
 
@@ -96,7 +96,7 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
     for id, position in row.quiet.items():
         draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
-    contrast, promised = row.measured_felt_contrast_db, row.robust_felt_contrast_db
+    contrast, promised = row.measured_contrast_db, row.promised_contrast_db
     title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
     if promised is not None:
         title += f", promised {promised:.1f}"

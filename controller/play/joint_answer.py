@@ -72,7 +72,8 @@ def query_jointly(
     fingers = fingers_of(quiet, protected)
     kept = _kept(requests, targets, before)
     kept_within = math.inf if is_moving else KEPT_WITHIN
-    found = _answer(table, requests, fingers, kept, kept_within, playable)
+    mode = capabilities.drive_mode
+    found = _answer(table, requests, fingers, kept, kept_within, playable, mode)
     strokes = table.strokes
 
     def within(found: Answer) -> float:
@@ -85,7 +86,7 @@ def query_jointly(
         lowered = with_gains(table, found, gains)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
             softer = [_at_gain(*each) for each in zip(requests, found.layers, gains, strict=True)]
-            lowered = answer(table, softer, fingers, playable=playable)
+            lowered = answer(table, softer, fingers, drive_mode=mode, playable=playable)
         found = lowered
         factor = within(found)
     change = float(decibels(factor))
@@ -188,15 +189,16 @@ def _answer(
     kept: Sequence[Request],
     kept_within: float,
     playable: tuple[float, float],
+    mode: str,
 ) -> Answer:
     """Answer with the kept frequencies, or with any where that is so much better [dB]."""
-    found = answer(table, kept, fingers, playable=playable)
+    found = answer(table, kept, fingers, drive_mode=mode, playable=playable)
     worst, served = found.promised_worst_db, _served(found)
     least = OWN_CONTRAST_DB if math.isfinite(kept_within) else -math.inf
     is_good = served == len(requests) and (worst is None or worst >= least)
     if is_good or list(kept) == list(requests):
         return found
-    other = answer(table, requests, fingers, playable=playable)
+    other = answer(table, requests, fingers, drive_mode=mode, playable=playable)
     gain = _worst(other) - _worst(found)
     is_better = _served(other) > served or (_served(other) == served and gain >= kept_within)
     return other if is_better else found

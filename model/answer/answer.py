@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from model.answer.modulation import SAME_LEVEL, with_modulation
+from model.answer.question import checked_mode
 from model.answer.request import (
     ANY_BAND,
     APART_HZ,
@@ -29,6 +30,7 @@ from model.answer.search import Contents, Stream, Tones
 from model.answer.search_in_c import choose_tones
 from model.arguments import expect_between
 from model.choice import best_by, best_of
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.table.table import LocalizationTable
 
@@ -49,12 +51,14 @@ def answer(
     *,
     apart_hz: float = APART_HZ,
     bands_may_swap: bool = False,
+    drive_mode: str | None = None,
     min_contrast_db: float = MIN_CONTRAST_DB,
     playable: tuple[float, float] = ANY_BAND,
 ) -> Answer:
     """Answer the requests of all fingers at once, each with a tone of its own.
 
-    fingers: those that are to feel nothing; apart_hz: distance of the contents' frequencies, where
+    fingers: those that are to feel nothing; drive_mode: the table's own if None, which must be
+    `phased` for more than one content; apart_hz: distance of the contents' frequencies, where
     their bands allow it; bands_may_swap: whether a content may have the band of another one;
     min_contrast_db: below which the promise at the worst finger is not served as requested;
     playable: lowest and highest frequency of side bands [Hz]. A content whose modulation would
@@ -65,8 +69,11 @@ def answer(
     """
     expect_between(apart_hz, 0.0, what="apart_hz")
     check_requests(requests, fingers, table.plate)
-    answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
-    found = with_modulation(table, answering.solve(min_contrast_db), playable=playable)
+    mode = checked_mode(drive_mode or table.drive_mode)
+    answering = _Answering(table, tuple(requests), tuple(fingers), mode, apart_hz, bands_may_swap)
+    found = answering.solve(min_contrast_db)
+    if mode == UNRESTRICTED:
+        found = with_modulation(table, found, playable=playable)
     played = [each for each in found.layers if each.excitation]
     changed = [
         f"content of {_at(each.request)} is steady"
@@ -105,6 +112,7 @@ class _Answering:
     table: LocalizationTable
     requests: tuple[Request, ...]
     fingers: tuple[Finger, ...]
+    drive_mode: str
     apart_hz: float
     bands_may_swap: bool
 
@@ -113,6 +121,12 @@ class _Answering:
         count = len(self.requests)
         quiet = range(count, count + len(self.fingers))
         plan = self._many_joined(_Plan(tuple(zip(range(count), strict=True)), tuple(quiet)))
+        if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
+            raise InputError(
+                f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
+                f"got {self.drive_mode}, which plays one; give drive_mode={UNRESTRICTED!r} where "
+                "the amplifiers play it"
+            )
         tried = [found := self._measure(plan)]
         while _is_out_of_bounds(found) or (
             found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
@@ -235,6 +249,7 @@ class _Answering:
             plan.quiet,
             self.apart_hz,
             background=background,
+            drive_mode=self.drive_mode,
         )
 
     def _measure(self, plan: _Plan) -> Answer:

@@ -11,14 +11,9 @@ from functools import partial
 
 import numpy as np
 
-from model.answer.fingers_on_plate import (
-    CENTRE_AND_FOUR,
-    MAX_FINGERS_BY_POINT,
-    FingerForms,
-    FingersOnPlate,
-)
+from model.answer.fingers_on_plate import FingerForms, FingersOnPlate
 from model.answer.pattern import ONSET_RAMP, Pattern
-from model.answer.promised import figures, promised
+from model.answer.promised import promised
 from model.answer.pulse_gains import OverEffect
 from model.answer.question import MIN_LEVEL_DB_SL, Question
 from model.answer.search import Contents, Stream, Tones
@@ -32,8 +27,7 @@ from model.drive_modes.coherent import CoherentResult, search_all, search_to_lev
 from model.drive_modes.forms import Drive, Forms
 from model.drive_modes.switched import find_switched, max_sensation_switched
 from model.drive_modes.tones import excitation_of
-from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import JUDGING_DRAWS
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.table.table import EFFECT_DURATIONS, LocalizationTable
@@ -77,7 +71,8 @@ def find_pattern(
     question.check_on(table.plate)
     drive_mode = question.drive_mode_on(table.drive_mode)
     contents = _contents(table, question)
-    if drive_mode == UNRESTRICTED and over_effect is None:
+    if over_effect is None:
+        contents = replace(contents, drive_mode=drive_mode)
         return _pattern(table, question, drive_mode, contents, choose_tones(table, contents))
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     if drive_mode == UNRESTRICTED:
@@ -87,18 +82,7 @@ def find_pattern(
     drive = found[_best(fingers, contents, found, over_effect)][1]
     rows, weights, owners = _tones([drive])
     tones = promised(fingers, contents, rows, weights, owners)
-    pattern = _pattern(table, question, drive_mode, contents, tones)
-    if len(drive) == 1 or not question.quiet:
-        return pattern
-    # Peaks of two tones add.
-    peak = np.sqrt(fingers.powers(PROMISED_DRAWS, rows, weights))
-    peak *= table.thresholds[rows, None, None, None]
-    together = np.square(peak.sum(axis=0)).reshape(1, -1, peak.shape[-1])
-    means, loudest = over_fingertips(together, fingers.tips.fine_weights)
-    count = len(question.targets)
-    ratio = means[0, :count].min(axis=0) / np.sqrt(loudest[0, count:].max(axis=0))
-    nominal, _, least = decibels(np.array(figures(ratio))).tolist()
-    return replace(pattern, contrast_db=nominal, robust_contrast_db=least)
+    return _pattern(table, question, drive_mode, contents, tones)
 
 
 def prepare_patterns(
@@ -145,12 +129,9 @@ def _switched_drives(
     over_effect: OverEffect | None,
 ) -> list[tuple[float, Drive]]:
     """The best patterns of mode `switched`."""
-    quiet, rows = contents.quiet, contents.rows
-    by_point = over_effect is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
-    formed = fingers.forms(rows, with_fine=by_point)
+    rows = contents.rows
+    formed = fingers.forms(rows, with_fine=False)
     forms = _over_effect(_steady_forms(formed, contents), formed, contents, over_effect)
-    if by_point:
-        forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
     found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))
     if not found:
         raise UnreachableLevel(question, "switched", float(decibels(max_sensation_switched(forms))))

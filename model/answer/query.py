@@ -186,7 +186,14 @@ def answer_as_json(
 ) -> dict[str, Any]:
     """Answer requests as `model.answer.answer` and return the JSON object of `--own`."""
     started = time.perf_counter()
-    found = answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
+    found = answer(
+        table,
+        requests,
+        fingers,
+        apart_hz=apart_hz,
+        bands_may_swap=bands_may_swap,
+        drive_mode=UNRESTRICTED,
+    )
     elapsed = time.perf_counter() - started
     layers = []
     for layer in found.layers:

@@ -63,10 +63,8 @@ class Question:
             for x, y in contacts:
                 if contacts.count((x, y)) > 1:
                     raise InputError(f"{what} ({x:g}, {y:g}) m must be given once, got two")
-        if self.drive_mode is not None and self.drive_mode not in DRIVE_MODES:
-            raise InputError(
-                f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {self.drive_mode!r}"
-            )
+        if self.drive_mode is not None:
+            checked_mode(self.drive_mode)
         for target in self.targets:
             for position in self.quiet:
                 if math.dist(position, target) < FINGERTIP_RADIUS:
@@ -95,6 +93,13 @@ class Question:
                 f"got {drive_mode}; build a table for them: era table build --mode"
             )
         return drive_mode
+
+
+def checked_mode(name: str) -> str:
+    """Return the name of a drive mode; raises InputError for any other."""
+    if name not in DRIVE_MODES:
+        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {name!r}")
+    return name
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:

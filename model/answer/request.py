@@ -13,6 +13,7 @@ from model.answer.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, check_on_pla
 from model.answer.search import Contents, Tones
 from model.arguments import expect_number, shown
 from model.arrays import FloatArray, Point
+from model.drive_modes import UNRESTRICTED
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.files.csv_file import as_frame
@@ -268,11 +269,11 @@ class Answer:
         """The tones of a content, its carrier first."""
         tones, on = self.tones, (self.eras, self.frequencies)
         every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
-        return [
-            excitation_of([(row, weights)], *on, gain=gain)
-            for row, weights, gain, owner in every
-            if owner == content
-        ]
+        own = [(row, weights, gain) for row, weights, gain, owner in every if owner == content]
+        if self.contents.drive_mode != UNRESTRICTED:  # tones that make one vibration
+            drive = [(row, weights) for row, weights, _ in own]
+            return [excitation_of(drive, *on, gain=own[0][2])]
+        return [excitation_of([(row, weights)], *on, gain=gain) for row, weights, gain in own]
 
     def to_frame(self) -> Any:
         """What each request's finger feels as a pandas DataFrame, a row a finger; needs pandas."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
+from model.drive_modes import UNRESTRICTED
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.
@@ -68,7 +69,8 @@ class Contents:
 
     places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
     by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
-    of the rest of the plate at all of the table's frequencies, for no other finger.
+    of the rest of the plate at all of the table's frequencies, for no other finger; drive_mode: any
+    but UNRESTRICTED has one content.
     """
 
     places: tuple[Point, ...]
@@ -77,6 +79,7 @@ class Contents:
     quiet: tuple[int, ...]
     apart_hz: float = 0.0
     background: Complex64Array | None = None
+    drive_mode: str = UNRESTRICTED
 
     @property
     def is_ranked(self) -> bool:

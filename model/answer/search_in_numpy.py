@@ -1,17 +1,19 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.answer.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
+from model.answer.fingers_on_plate import CENTRE_AND_FOUR, MAX_FINGERS_BY_POINT, FingersOnPlate
 from model.answer.promised import promised
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_few, best_first, best_of
-from model.drive_modes.coherent import search, search_all, search_to_level
-from model.drive_modes.forms import Forms
+from model.drive_modes import UNRESTRICTED
+from model.drive_modes.coherent import NEARLY_HIGHEST, search, search_all, search_to_level
+from model.drive_modes.forms import Drive, Forms
+from model.drive_modes.switched import find_switched, max_sensation_switched
 from model.ensemble.draws import JUDGING_DRAWS
 from model.ensemble.measures import percentile
 from model.finger.perception import decibels
@@ -23,33 +25,52 @@ _BATCH = 64  # candidates that are judged at once
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidates (m,) of all contents: of which stream and band, row, score, weights (m, n)."""
+    """Candidates (m,) of all contents: of which stream and band, score, and the tones of each."""
 
     streams: IntArray
     bands: IntArray
-    rows: IntArray
     scores: FloatArray
-    weights: Complex64Array
+    drives: Sequence[Drive]
+
+    @property
+    def rows(self) -> IntArray:
+        """The row of the first tone of each."""
+        return np.array([drive[0][0] for drive in self.drives], dtype=int)
 
 
-def choose_by_numpy(table: LocalizationTable, contents: Contents) -> Tones:
-    """Choose a tone for each content, and find what it promises."""
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
+def choose_by_numpy(
+    table: LocalizationTable, contents: Contents, *, by_kernel: bool = False
+) -> Tones:
+    """Choose tones for each content, and find what they promise.
+
+    by_kernel: whether the fingers' weight on the plate is solved in C.
+    """
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     rows = contents.rows
-    kept = ranked(fingers, contents) if contents.is_ranked else rows
-    found, is_limited = _candidates(fingers, contents, kept)
-    if len(kept) < len(rows) and (not len(found.rows) or is_limited):
-        found, is_limited = _candidates(fingers, contents, rows)
+    if contents.drive_mode == UNRESTRICTED:
+        kept = ranked(fingers, contents) if contents.is_ranked else rows
+        found, is_limited = _candidates(fingers, contents, kept)
+        if len(kept) < len(rows) and (not found.drives or is_limited):
+            found, is_limited = _candidates(fingers, contents, rows)
+    else:
+        found = _switched_candidates(fingers, contents)
     own, loudest = _judged(fingers, contents, found)
     best, is_apart = np.zeros(1, dtype=int), True
     if len(contents.streams) > 1:
         best, is_apart = best_combination(table, contents, found, own, loudest)
-    elif len(found.rows) > 1:
+    elif len(found.drives) > 1:
         quiet = loudest[:, [*contents.quiet]]
         level = float(contents.levels[0])
         best[0] = best_tone(level, found.scores, own, quiet)
-    rows, weights = found.rows[best], found.weights[best]
-    return promised(fingers, contents, rows, weights, np.arange(len(rows)), is_apart=is_apart)
+    tones = tones_of([found.drives[each] for each in best.tolist()])
+    return promised(fingers, contents, *tones, is_apart=is_apart)
+
+
+def tones_of(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]:
+    """Rows (m,), weights (m, n) of the tones of drives, and the number of each one's drive (m,)."""
+    tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
+    rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
+    return rows, weights, owners
 
 
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
@@ -84,7 +105,7 @@ def _candidates(
     count, hertz = len(contents.streams), fingers.table.frequencies
     formed = fingers.forms(rows, with_fine=True)
     apart_hz = contents.apart_hz if count > 1 else 0.0
-    found: list[tuple[int, int, int, float, Complex64Array]] = []
+    found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
@@ -100,10 +121,31 @@ def _candidates(
                 ways.append(search(here.by_point(forms, others)))
             for way in ways:
                 for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
-                    score, weights = float(way.score[each]), way.weights[each]
-                    found.append((number, band, int(here.rows[each]), score, weights))
-    parts = zip(*found, strict=True) if found else ((),) * 5
-    return Candidates(*(np.array(part) for part in parts)), is_limited
+                    drive = [(int(here.rows[each]), way.weights[each])]
+                    found.append((number, band, float(way.score[each]), drive))
+    streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
+    return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _switched_candidates(fingers: FingersOnPlate, contents: Contents) -> Candidates:
+    """The best patterns of the mode `switched` for an only content.
+
+    Near the highest level where none reaches it.
+    """
+    (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
+    by_point = 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
+    formed = fingers.forms(rows, with_fine=by_point)
+    rest = None if contents.background is None else contents.background[rows]
+    forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
+    if by_point:
+        forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
+    found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))
+    if not found:
+        highest = NEARLY_HIGHEST * max_sensation_switched(forms)
+        found = find_switched(replace(forms, level_margin=0.0, wanted=highest))
+    drives = [[(int(rows[row]), weights) for row, weights in drive] for _, drive in found]
+    none = np.zeros(len(found), dtype=int)
+    return Candidates(none, none, np.array([score for score, _ in found]), drives)
 
 
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
@@ -126,11 +168,11 @@ def _judged(
     Those of several contents at the contents' levels.
     """
     parts = [
-        fingers.drawn(JUDGING_DRAWS, found.rows[first:][:_BATCH], found.weights[first:][:_BATCH])
-        for first in range(0, len(found.rows), _BATCH)
+        fingers.felt(JUDGING_DRAWS, *tones_of(found.drives[first:][:_BATCH]))
+        for first in range(0, len(found.drives), _BATCH)
     ]
-    means = np.concatenate([part.means for part in parts])
-    loudest = np.concatenate([part.loudest[:, :, 1:] for part in parts], dtype=float)
+    means = np.concatenate([part for part, _ in parts])
+    loudest = np.concatenate([part[:, :, 1:] for _, part in parts], dtype=float)
     own = np.empty((len(loudest), loudest.shape[2]))
     for number, stream in enumerate(contents.streams):
         of = found.streams == number

@@ -176,9 +176,9 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     contrast = [
         (
             f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {with_error(f'robust_felt_contrast_{others}_quiet_median')}, one in ten "
-            f"below {with_error(f'robust_felt_contrast_{others}_quiet_tenth_percentile')}; "
-            f"nominal {with_error(f'felt_contrast_{others}_quiet_median')}",
+            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, one in ten "
+            f"below {with_error(f'promised_contrast_{others}_quiet_tenth_percentile')}; "
+            f"nominal {with_error(f'contrast_{others}_quiet_median')}",
         )
         for others in (1, 2, 3)
     ]

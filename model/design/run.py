@@ -18,6 +18,7 @@ from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_first
 from model.design.problem import DesignProblem, NamedLayouts
 from model.design.search import Found, LayoutSearch
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.processes import on_processes
@@ -98,7 +99,7 @@ def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tu
     places = [(float(x), float(y)) for x, y in contacts]
     requests = [Request(at) for at in places[:contents]]
     fingers = [Finger(at) for at in places[contents:]]
-    found = answer(table, requests, fingers, min_contrast_db=-math.inf)
+    found = answer(table, requests, fingers, drive_mode=UNRESTRICTED, min_contrast_db=-math.inf)
     assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers
     level = min(layer.promised_level_db_sl for layer in found.layers)
     return found.promised_worst_db, level

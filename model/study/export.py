@@ -94,7 +94,7 @@ def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
 def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
     parts = [f"{era.name}_{part}" for era in table.eras for part in ("hz", "level", "phase_deg")]
     contacts = [f"{finger}_{axis}_m" for finger in ("target", "quiet") for axis in "xy"]
-    yield [*contacts, *parts, "robust_level_db_sl", "robust_felt_contrast_db"]
+    yield [*contacts, *parts, "promised_level_db_sl", "promised_contrast_db"]
     for question in chain.from_iterable(pair_questions(table)):
         at = chain.from_iterable(question.contacts)
         try:

@@ -98,12 +98,12 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
         "weak_share": float(weak.weak[known].mean()) if known.any() else None,
     }
     for others, found in enumerate(overview.contrasts, start=1):
-        for kind, contrasts in zip(("robust_felt", "felt"), found, strict=True):
+        for kind, contrasts in zip(("promised_contrast", "contrast"), found, strict=True):
             for name, percentile in (("median", 50), ("tenth_percentile", 10)):
                 value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
                 error = sampling_error(contrasts, percentile) if len(contrasts) else None
-                summary[f"{kind}_contrast_{others}_quiet_{name}_db"] = value
-                summary[f"{kind}_contrast_{others}_quiet_{name}_error_db"] = error
+                summary[f"{kind}_{others}_quiet_{name}_db"] = value
+                summary[f"{kind}_{others}_quiet_{name}_error_db"] = error
     summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
     summary["reference_mesh"] = str(table.reference_mesh)

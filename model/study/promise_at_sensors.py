@@ -83,9 +83,9 @@ class MeasuredVerification:
                     "drive_frequencies_hz": sorted(
                         {tone.frequency for tone in each.promise.pattern.excitation.values()}
                     ),
-                    "promised_felt_contrast_db": each.promise.contrast_db,
-                    "median_felt_contrast_db": each.promise.median_db,
-                    "measured_felt_contrast_db": each.contrast_db,
+                    "promised_contrast_db": each.promise.contrast_db,
+                    "median_contrast_db": each.promise.median_db,
+                    "measured_contrast_db": each.contrast_db,
                     "promised_level_db_sl": each.promise.level_db_sl,
                     "measured_level_db_sl": each.level_db_sl,
                     "kept": each.is_kept,

@@ -170,10 +170,10 @@ class Verification:
                     "predicted_level_db_sl": answer.pattern.level_db_sl,
                     "direct_level_db_sl": answer.direct_level_db_sl,
                     "level_tolerance_db": answer.level_tolerance_db,
-                    "predicted_felt_contrast_db": answer.predicted_contrast_db,
-                    "direct_felt_contrast_db": answer.direct_contrast_db,
+                    "predicted_contrast_db": answer.predicted_contrast_db,
+                    "direct_contrast_db": answer.direct_contrast_db,
                     "contrast_tolerance_db": answer.contrast_tolerance_db,
-                    "felt_contrast_in_time_db": answer.contrast_in_time_db,
+                    "contrast_in_time_db": answer.contrast_in_time_db,
                     "time_tolerance_db": answer.time_tolerance_db,
                     "passed": answer.is_passed,
                 }

@@ -27,7 +27,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
 from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import Excitation, base_amplitudes, peak_acceleration
+from model.vibration.excitation import Excitation, base_amplitudes
 from sim.plant.fingers import Felt, Record, felt_peaks, measure_vibration
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -86,16 +86,10 @@ class Playback:
         return float(max(loudest)) if loudest else None
 
     @property
-    def felt_contrast_db(self) -> float | None:
+    def contrast_db(self) -> float | None:
         """Steady level of the target above that of the loudest quiet point [dB]; None if alone."""
         quiet = self.quiet_level_db_sl
         return None if quiet is None else self.level_db_sl - quiet
-
-    @property
-    def contrast_db(self) -> float | None:
-        """Steady contrast [dB], the target's mean to the loudest quiet point; None if alone."""
-        peaks = [peak_acceleration(felt.amplitude) for felt in self._felt]
-        return self._contrast(peaks)
 
     @property
     def transient_contrast_db(self) -> float | None:

@@ -68,7 +68,7 @@ def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
 
 def test_results_become_frames(table: era.LocalizationTable) -> None:
     """A row a finger of an answer, a row a point of a map, a row a moment of a playback."""
-    answer = era.answer(table, [era.Request(TARGET), era.Request(QUIET[0])])
+    answer = era.answer(table, [era.Request(TARGET), era.Request(QUIET[0])], drive_mode="phased")
     frame = answer.to_frame()
     assert list(frame["verdict"]) == [layer.verdict for layer in answer.layers]
     assert frame.loc[1, "x_m"] == QUIET[0][0]

@@ -161,7 +161,7 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         )
         judged = min(by_model, JUDGED_UP_TO)
         assert abs(min(measured, JUDGED_UP_TO) - judged) <= 1, (measured, by_model)
-        promised = heard.patterns[-1]["robust_felt_contrast_db"]
+        promised = heard.patterns[-1]["promised_contrast_db"]
         assert 3 < promised <= measured, (promised, measured)
 
 

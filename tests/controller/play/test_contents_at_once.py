@@ -588,7 +588,7 @@ async def test_status_says_what_each_finger_feels() -> None:
         assert len(event.layers) == 3
         for contact, (number, one) in zip(event.contacts, applied.contents.items(), strict=True):
             assert (contact.role, contact.held_back) == ("target", None)
-            promised = contact.robust_felt_contrast_db
+            promised = contact.promised_contrast_db
             assert promised is not None
             assert contact.verdict == ("own" if promised >= 12 else "mixed")
             assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)

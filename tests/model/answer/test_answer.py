@@ -2,12 +2,13 @@
 
 import json
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model.answer.answer import answer
+from model.answer.answer import answer as answer_by_table
 from model.answer.pattern_query import find_pattern, prepare_patterns
 from model.answer.promised import felt_amplitudes, loudest_power
 from model.answer.query import answer_as_json
@@ -24,6 +25,8 @@ from paper_table import contact_sets, smooth_table
 
 NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06)
 QUIET = (0.16, 0.20)
+
+answer = partial(answer_by_table, drive_mode="phased")
 
 
 def given(table, found, quiet, plates):
@@ -117,6 +120,23 @@ def test_one_content_is_the_answer_of_the_table():
     for name, tone in layer.excitation.items():
         assert tone.frequency == pattern.excitation[name].frequency
         assert tone.amplitude == pytest.approx(pattern.excitation[name].amplitude, rel=0.02)
+
+
+def test_drive_mode_of_the_table_is_obeyed():
+    """Amplifiers that only switch get ERAs at full stroke, as one finger's query; or a refusal."""
+    table = smooth_table()
+    assert table.drive_mode == "switched"
+    requests, others = [Request(NEAR, level_db_sl=15.0)], [Finger(FAR)]
+    question = Question((NEAR,), (FAR,), level_db_sl=15.0)
+    (layer,) = answer_by_table(table, requests, others).layers
+    (phased,) = answer(table, requests, others).layers
+    assert layer.excitation == find_pattern(table, question).excitation
+    assert len(layer.excitation) <= 2 < len(phased.excitation)
+    assert len({tone.amplitude for tone in layer.excitation.values()}) == 1
+    with pytest.raises(InputError, match="phased"):
+        answer_by_table(table, [Request(NEAR), Request(FAR)])
+    shared = [Request(at, content="a") for at in TWENTY[:6]]  # one from the start
+    assert answer_by_table(table, shared).layers[-1].verdict == "shared"
 
 
 def test_frequencies_are_apart_and_within_their_bands():

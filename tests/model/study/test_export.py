@@ -122,8 +122,8 @@ def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(dri
             for finger in ("target", "quiet")
         )
         answer = find_pattern(table, Question((target,), (quiet,)))
-        assert float(row["robust_felt_contrast_db"]) == answer.robust_felt_contrast_db
-        assert float(row["robust_level_db_sl"]) >= 20 - 1e-3
+        assert float(row["promised_contrast_db"]) == answer.robust_felt_contrast_db
+        assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
     weak = replace(with_strokes(table, 1e-6), grid=Grid(1, 2))
     export_csv(weak, tmp_path / "weak.csv", content="patterns")
     assert all(not row["SW_level"] for row in read_csv(tmp_path / "weak.csv"))

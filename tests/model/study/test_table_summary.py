@@ -161,7 +161,7 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
     )
     built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
     summary = summarize(built, find_overview(built))
-    assert summary["robust_felt_contrast_1_quiet_median_db"] is None
+    assert summary["promised_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None
 
 
@@ -195,9 +195,9 @@ def test_summary_counts_levels_and_shares(table):
         "weak_share": 0.75,
         "frequency_count": 3,
         "patterns": 4 * 3 + 6 * 3**2,
-        "robust_felt_contrast_2_quiet_median_db": 50.0,
-        "robust_felt_contrast_2_quiet_tenth_percentile_db": 10.0,
-        "felt_contrast_2_quiet_median_db": 55.0,
+        "promised_contrast_2_quiet_median_db": 50.0,
+        "promised_contrast_2_quiet_tenth_percentile_db": 10.0,
+        "contrast_2_quiet_median_db": 55.0,
         "discretisation_error_percent": 100 * max(quieter.discretisation_error),
     }
     assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)

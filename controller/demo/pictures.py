@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from controller.demo.touch_row import FingerRow, TouchRow
-from model.answer.pattern import Pattern
-from model.answer.request import OWN_CONTRAST_DB
+from model.answer.answer import OWN_CONTRAST_DB, Layer
 from model.arrays import FloatArray, lattice
 from model.choice import ranked_by
 from model.figures import save_figure
@@ -130,12 +129,12 @@ def contents_figure(table: LocalizationTable, row: TouchRow) -> Figure:
     return figure
 
 
-def _frequency(content: Pattern) -> float:
+def _frequency(content: Layer) -> float:
     """The frequency [Hz] of a content, which has one where there are several."""
     return next(iter(content.excitation.values())).frequency
 
 
-def _levels(table: LocalizationTable, content: Pattern) -> FloatArray:
+def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
     """Level [dB SL] of a content over the raster of the plate."""
     plate = table.plate
     nx, ny = raster(plate)

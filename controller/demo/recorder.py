@@ -249,7 +249,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
-        predicted_contrast_db=pattern.felt_contrast_db,
+        predicted_contrast_db=predicted.contrast_db,
         promised_contrast_db=predicted.promised_contrast_db,
         predicted_level_db_sl=predicted.level_db_sl,
         pattern=pattern,

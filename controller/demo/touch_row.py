@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from model.answer.pattern import Pattern
+from model.answer.answer import Layer
 from model.arrays import FloatArray
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
@@ -105,10 +105,10 @@ class TouchRow:
     measured_transient_contrast_db: float | None = None
     predicted_level_db_sl: float | None = None
     measured_level_db_sl: float | None = None
-    pattern: Pattern | None = None
+    pattern: Layer | None = None
     levels_db_sl: Mapping[str, float] = field(default_factory=dict)
     fingers: Sequence[FingerRow] = ()
-    contents: Sequence[Pattern] = ()
+    contents: Sequence[Layer] = ()
 
     @property
     def keeps_promise(self) -> bool | None:

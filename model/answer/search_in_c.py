@@ -49,7 +49,8 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
             bands += band
         priorities.append(stream.priority)
         levels.append(10 ** (stream.level_db_sl / 20))
-    if by is None or contents.drive_mode != UNRESTRICTED:
+    is_here = contents.drive_mode == UNRESTRICTED
+    if by is None or not is_here or any(stream.duration for stream in streams):
         return choose_by_numpy(table, contents, by_kernel=by is not None)
     count, n, k = len(streams), len(table.eras), len(places)
     kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))

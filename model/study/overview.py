@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, highest_measured
@@ -61,13 +61,13 @@ def find_overview(
 
 def set_questions(
     table: LocalizationTable, *, others: int, rng: np.random.Generator
-) -> list[Question]:
+) -> list[Placement]:
     """Questions with fingers at random, one the target; none on a plate too small for them."""
-    found: list[Question] = []
+    found: list[Placement] = []
     with suppress(InputError):
         for _ in range(CONTACT_SETS):
             contacts = random_contacts(rng, others + 1, table.plate, tries=50 * CONTACT_SETS)
-            found.append(Question(contacts[:1], contacts[1:]))
+            found.append(Placement(contacts[:1], contacts[1:]))
     return found
 
 

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import Laminate, Layer
@@ -103,10 +103,9 @@ def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
 def test_questions_that_mirror_each_other_are_one_sample(table):
     """On a symmetric plate both have the answer of one of them, to the bit; not on another one."""
     (target,), (other,) = (pair := pair_questions(table)[0][0]).targets, pair.quiet
-    image = Question(
+    image = Placement(
         ((table.plate.length - target[0], target[1]),),
         ((table.plate.length - other[0], other[1]),),
-        level_db_sl=pair.level_db_sl,
     )
     ask = ask_once(table)
     assert ask(pair) == ask(image)

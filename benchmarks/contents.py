@@ -30,13 +30,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import random_contacts, use_one_thread
-from model.answer.pattern_query import prepare_patterns
+from model.answer.plan import prepare_answers
 from model.table.raster_kernel import read_fingertips
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from model.answer.request import Answer
+    from model.answer.answer import Answer
     from model.arrays import FloatArray
     from model.table.table import LocalizationTable
 
@@ -85,7 +85,7 @@ def main() -> None:
                 drive_mode="phased",
                 frequencies=np.arange(40.0, 501.0 if options.distortion else 321.0, 10.0),
             )
-            prepare_patterns(table, with_ringing=False)
+            prepare_answers(table, with_ringing=False)
             if options.sharing:
                 _print_sharing((name, label), table, count=options.sets)
                 continue
@@ -125,22 +125,25 @@ def _print_row(
 ) -> None:
     import numpy as np
 
-    from model.answer.answer import answer
-    from model.answer.request import ANY_BAND, Finger, Request
+    from model.answer.fingers import ANY_BAND, Finger, Stimulus
+    from model.answer.plan import answer
 
     choices = list(combinations(BANDS, contents)) if has_bands else [(ANY_BAND,) * contents]
 
     worst, kept, times, asked = [], [], [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
-        fingers = [Finger(at) for at in places[contents:]]
         started = time.process_time()
         tried = [
             answer(
                 table,
-                list(map(Request, places, bands)),
-                fingers,
+                [
+                    Finger(at, Stimulus(band_hz=band))
+                    for at, band in zip(places, bands, strict=False)
+                ],
+                quiet=places[contents:],
                 apart_hz=20,
                 bands_may_swap=has_bands,
+                drive_mode="phased",
                 min_contrast_db=-np.inf,
             )
             for bands in choices
@@ -175,7 +178,7 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
     patient = replace(table)
-    prepare_patterns(patient, with_ringing=False)  # kernels read the numbers once for a table
+    prepare_answers(patient, with_ringing=False)  # kernels read the numbers once for a table
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = chosen
     for targets in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20):
         lost: dict[float, list[float]] = {20.0: [], 90.0: []}
@@ -228,16 +231,15 @@ def _print_modulated(
     """Print what side bands cost the worst finger."""
     import numpy as np
 
-    from model.answer.answer import answer
-    from model.answer.request import Finger, Request
+    from model.answer.fingers import Finger, Stimulus
+    from model.answer.plan import answer
 
     steady, cost = [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
-        requests = [Request(at) for at in places[:contents]]
-        fingers = [Finger(at) for at in places[contents:]]
-        plain = answer(table, requests, fingers)
-        requests[0] = replace(requests[0], modulation_hz=modulation)
-        found = answer(table, requests, fingers)
+        fingers, others = [Finger(at, Stimulus()) for at in places[:contents]], places[contents:]
+        plain = answer(table, fingers, quiet=others, drive_mode="phased")
+        fingers[0] = replace(fingers[0], stimulus=Stimulus(modulation_hz=modulation))
+        found = answer(table, fingers, quiet=others, drive_mode="phased")
         before, after = plain.promised_worst_db, found.promised_worst_db
         if found.layers[0].side_bands and before is not None and after is not None:
             steady.append(before)
@@ -263,16 +265,22 @@ def _print_distorted(
     """Print how far each content is above the second harmonics, sums and differences there."""
     import numpy as np
 
-    from model.answer.answer import answer
-    from model.answer.request import APART_HZ, Finger, Request
+    from model.answer.fingers import Finger, Stimulus
+    from model.answer.plan import answer
+    from model.answer.search import APART_HZ
     from model.vibration.excitation import base_amplitudes
 
     above, near = [], []
     strokes = np.array([era.stroke for era in table.eras])
     for places in _sets(table, contents, quiet, count=count, apart=apart):
-        requests = [Request(at, (40.0, 320.0)) for at in places[:contents]]
-        fingers = [Finger(at) for at in places[contents:]]
-        found = answer(table, requests, fingers, min_contrast_db=-np.inf)
+        stimulus = Stimulus(band_hz=(40.0, 320.0))
+        found = answer(
+            table,
+            [Finger(at, stimulus) for at in places[:contents]],
+            quiet=places[contents:],
+            drive_mode="phased",
+            min_contrast_db=-np.inf,
+        )
         tones = []
         for layer in found.layers:
             frequencies, bases = base_amplitudes(layer.excitation, table.eras)
@@ -284,13 +292,13 @@ def _print_distorted(
                 difference = weights * other.conj() if f >= low else other * weights.conj()
                 products += [(f + low, 2 * weights * other), (abs(f - low), 2 * difference)]
         fields = table.unit_fields(np.array(places), contacts=places)
-        for finger, layer in enumerate(found.layers):
-            own, total = 10 ** (layer.promised_level_db_sl / 20), 1e-20
+        for finger, felt in enumerate(found.fingers[:contents]):
+            own, total = 10 ** (felt.promised_level_db_sl / 20), 1e-20
             for f, weights in products:
                 (rows,) = np.nonzero(np.isclose(table.frequencies, f))
                 for row in rows:
-                    felt = abs((percent / 100 * weights * fields[row, :, finger]).sum())
-                    sensed = float(felt / table.thresholds[row])
+                    made = abs((percent / 100 * weights * fields[row, :, finger]).sum())
+                    sensed = float(made / table.thresholds[row])
                     total += sensed**2
                     if abs(f - tones[finger][0]) < APART_HZ:
                         near.append(20 * np.log10(own / sensed))
@@ -309,7 +317,7 @@ def _kept(
     """Share of held-out plates on which the worst finger has what is promised."""
     import numpy as np
 
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
     from model.study.exact_plates import draw_plates, powers_on
 
     count = len(found.layers) + len(quiet)
@@ -321,11 +329,12 @@ def _kept(
         contact_count=count,
     )
     contents = range(len(found.layers))
-    question = Question(tuple(each.request.at for each in found.layers), tuple(quiet))
-    weights = read_fingertips(table, question.contacts).fine_weights
+    targets = tuple(each.at for each in found.asked if each.stimulus)
+    placed = Placement(targets, tuple(quiet))
+    weights = read_fingertips(table, placed.contacts).fine_weights
     powers = []
     for layer in found.layers:
-        rows, power = powers_on(table, question, layer.excitation, plates)
+        rows, power = powers_on(table, placed, layer.excitation, plates)
         above = power[0] / table.thresholds[rows[0]] ** 2
         powers.append(above.reshape(*weights.shape, -1))
     power = np.array(powers)

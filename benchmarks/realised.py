@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.answer.pattern_query import find_pattern
 
 if TYPE_CHECKING:
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
     from model.arrays import FloatArray
     from model.rig.rig import Rig
     from model.vibration.excitation import Excitation
@@ -81,7 +80,8 @@ def _line(row: Row, sets: int) -> str:
 
     from benchmarks.identification.answers import DRIVES
     from benchmarks.identification.plates import FREQUENCIES
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
+    from model.answer.plan import query
     from model.rig.file import load_rig
     from model.table.build import build_table
 
@@ -97,11 +97,11 @@ def _line(row: Row, sets: int) -> str:
         for number in range(sets):
             size = (rig.plate.length, rig.plate.width)
             target, *others = random_contacts(rng, 1 + quiet, size, margin=MARGIN).tolist()
-            asked = Question((tuple(target),), tuple(map(tuple, others)), envelopes=True)
-            pattern = find_pattern(table, asked)
-            contrast, level = realised(rig, asked, pattern.excitation, number)
+            asked = Placement((tuple(target),), tuple(map(tuple, others)))
+            answer = query(table, asked)
+            contrast, level = realised(rig, asked, answer.layers[0].excitation, number)
             found.append([*np.percentile(contrast, [50, 10]), np.percentile(level, 10)])
-            promised = pattern.robust_felt_contrast_db
+            promised = answer.fingers[0].promised_contrast_db
             assert promised is not None
             kept.append((contrast >= promised).mean())
         median, tenth, level = np.transpose(found)
@@ -115,7 +115,7 @@ def _line(row: Row, sets: int) -> str:
 
 
 def realised(
-    rig: "Rig", asked: "Question", excitation: "Excitation", number: int
+    rig: "Rig", asked: "Placement", excitation: "Excitation", number: int
 ) -> "tuple[FloatArray, FloatArray]":
     """Felt contrast [dB] and level [dB SL] on plates (d,), drawn by the number of the set."""
     import numpy as np

@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.answer.pattern_query import find_pattern
+from model.answer.plan import query
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 
@@ -77,16 +77,16 @@ def _tables() -> "Iterator[tuple[str, str, Rig, LocalizationTable]]":
             yield name, words, rig, build_table(rig, frequencies=frequencies, drive_mode="phased")
 
 
-def _question(rig: "Rig", quiet: int, number: int) -> "Question":
-    """The question of a set."""
+def _placement(rig: "Rig", quiet: int, number: int) -> "Placement":
+    """The fingers of a set."""
     import numpy as np
 
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
 
     rng = np.random.default_rng([SEED, quiet, number])
     size = (rig.plate.length, rig.plate.width)
     target, *others = random_contacts(rng, 1 + quiet, size, margin=MARGIN).tolist()
-    return Question((tuple(target),), tuple(map(tuple, others)))
+    return Placement((tuple(target),), tuple(map(tuple, others)))
 
 
 def _answers(sets: int) -> dict[str, list[dict[str, list[float]]]]:
@@ -95,7 +95,7 @@ def _answers(sets: int) -> dict[str, list[dict[str, list[float]]]]:
     for name, words, rig, table in _tables():
         for quiet in QUIET:
             patterns = [
-                find_pattern(table, _question(rig, quiet, number)) for number in range(sets)
+                query(table, _placement(rig, quiet, number)).layers[0] for number in range(sets)
             ]
             found[f"{name}, {words}, {quiet}"] = [
                 {
@@ -157,7 +157,7 @@ def _score(
     from model.study.exact_plates import draw_plates, felt_on
     from model.vibration.excitation import Tone
 
-    question = _question(rig, quiet, number)
+    question = _placement(rig, quiet, number)
     excitation = {era: Tone(*tone) for era, tone in tones.items()}
     if not rig.uncertainty.thickness:  # other plates of it would each take a solution
         contrast, level = realised(rig, question, excitation, number)

@@ -4,8 +4,7 @@ from controller.play.routing import route
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.playing.contents import Tone
 from era_haptics.arguments import expect_rig
-from era_haptics.drive import Drives, excitation_of
-from model.answer.pattern import Pattern
+from era_haptics.drive import Played, excitation_of
 from model.arguments import shown
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -31,11 +30,11 @@ def open_amplifier(
     return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
 
 
-def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[Tone, ...]]:
+def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[Tone, ...]]:
     """Convert to commands by name of the amplifier, for its `play` and `apply`.
 
     Channels by the rig's wiring, levels 0..1 of full stroke, phases in degrees; without the
-    envelopes of a pattern. Raises InputError for an unknown ERA.
+    envelopes of a layer. Raises InputError for an unknown ERA.
     """
     expect_rig(rig)
     layers = route(excitation_of(drive, rig), rig, ramp=0.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import TypeAlias
 
-from model.answer.pattern import Pattern
+from model.answer.answer import Answer, Layer
 from model.arguments import expect_number, shown
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -49,15 +49,30 @@ _UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radia
 Drives: TypeAlias = Mapping[str, "float | Drive | Tone"]
 """By ERA name: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
 
+Played: TypeAlias = Answer | Layer | Drives
+"""What ERAs are to play: an answer of one layer, a layer, or drives."""
 
-def excitation_of(drive: Pattern | Drives, rig: Rig) -> Excitation:
+
+def layer_of(drive: Answer | Layer) -> Layer:
+    """The layer, the only one of an answer; raises InputError for an answer with several."""
+    if isinstance(drive, Layer):
+        return drive
+    if len(drive.layers) != 1:
+        raise InputError(
+            f"an answer must have one layer to be a drive, got {len(drive.layers)}; give one of "
+            "its layers"
+        )
+    return drive.layers[0]
+
+
+def excitation_of(drive: Played, rig: Rig) -> Excitation:
     """A tone for each ERA; raises InputError for an unknown ERA."""
-    if isinstance(drive, Pattern):
-        return drive.excitation
+    if isinstance(drive, Answer | Layer):
+        return layer_of(drive).excitation
     if not isinstance(drive, Mapping):
         raise InputError(
-            'drive must be a pattern or a mapping of names of ERAs, such as {"SW": 110}, got '
-            f"{shown(drive)}"
+            "drive must be an answer, a layer or a mapping of names of ERAs, such as "
+            f'{{"SW": 110}}, got {shown(drive)}'
         )
     tones = {}
     for name, given in drive.items():

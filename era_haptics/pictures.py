@@ -5,10 +5,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
-from era_haptics.arguments import Positions, as_points
-from era_haptics.drive import Drives, excitation_of
+from era_haptics.drive import Played, excitation_of
 from era_haptics.solved_plate import SolvedPlate
-from model.answer.pattern import Pattern
+from model.answer.answer import Answer
 from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
@@ -24,7 +23,7 @@ from sim.plant.excited_plate import Playback
 from sim.plant.fingers import Record
 
 
-def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") -> Figure:
+def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
     """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
 
     The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
@@ -34,26 +33,22 @@ def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") ->
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
 
-def draw_pattern(
-    table: LocalizationTable, pattern: Pattern, target: Positions, *, quiet: Positions = ()
-) -> Figure:
-    """Draw the level of a pattern over the plate [dB SL], and the fingers.
-
-    target, quiet: positions [m] as in the query. Raises InputError for invalid ones.
-    """
+def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> Figure:
+    """Draw the level of a layer of an answer over the plate [dB SL], and the fingers."""
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(pattern, Pattern, what="pattern", made_by="era.query(table, target)")
+    expect(answer, Answer, what="answer", made_by="era.query(table, target)")
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.set_axis_off()
-    draw_levels(axes, table, pattern.excitation)
-    for position in as_points(target, what="target"):
-        draw_fingertip(axes, position, felt=True, level_db_sl=pattern.level_db_sl)
-    for position in as_points(quiet, what="quiet"):
-        draw_fingertip(axes, position, felt=False)
-    if pattern.robust_felt_contrast_db is not None:
-        promised = f"{pattern.robust_felt_contrast_db:.0f} dB"
-        title = f"felt contrast at least {promised} on nine of ten plates"
+    played = answer.layers[layer]
+    draw_levels(axes, table, played.excitation)
+    for number, each in enumerate(answer.fingers):
+        is_felt = number in played.fingers
+        level = each.level_db_sl if is_felt else None
+        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
+    promised = answer.fingers[played.fingers[0]].promised_contrast_db
+    if promised is not None:
+        title = f"contrast at least {promised:.0f} dB on nine of ten plates"
         axes.set_title(title, fontsize=11, pad=20)
     draw_level_scale(figure, [axes], shrink=0.8)
     return figure

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
-from era_haptics.drive import Drives, excitation_of
-from model.answer.pattern import ONSET_RAMP, Pattern
-from model.answer.question import Question
+from era_haptics.drive import Played, excitation_of, layer_of
+from model.answer.answer import ONSET_RAMP, Answer, Layer
+from model.answer.fingers import Placement
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -58,7 +58,7 @@ class SolvedPlate:
             self._reduced, rig.eras, loads=rig.masses, frequency_max=rig.limits.frequency_max
         )
 
-    def map(self, drive: Pattern | Drives, *, raster: tuple[int, int] | None = None) -> PlateMap:
+    def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
@@ -78,7 +78,7 @@ class SolvedPlate:
 
     def play(
         self,
-        drive: Pattern | Drives,
+        drive: Played,
         target: Positions,
         *,
         quiet: Positions = (),
@@ -87,30 +87,31 @@ class SolvedPlate:
     ) -> Playback:
         """Compute what fingers at positions [m] feel during a duration [s], from rest.
 
-        A pattern starts with its envelopes or its ramp, other drives with a ramp of 40 ms. Fingers
+        A layer starts with its onset or its ramp, other drives with a ramp of 40 ms. Fingers
         load the plate as the rig's fingertip; loads: of each relative to it, targets first, 1
         without. The plate in time is solved exactly, without steps
         (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a duration too
         short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
-        fingers = Question(
+        fingers = Placement(
             as_points(target, what="target"),
             as_points(quiet, what="quiet"),
             loads=as_loads(loads),
         )
+        layer = layer_of(drive) if isinstance(drive, Answer | Layer) else None
         return play(
             self.rig,
             self._reduced,
             self._excitation(drive),
             fingers,
             duration=duration,
-            ramp=drive.ramp if isinstance(drive, Pattern) else ONSET_RAMP,
-            onset=drive.onset if isinstance(drive, Pattern) else None,
+            ramp=layer.ramp if layer else ONSET_RAMP,
+            onset=layer.onset if layer else None,
             imperfections=self._drawn,
         )
 
-    def _excitation(self, drive: Pattern | Drives) -> Excitation:
+    def _excitation(self, drive: Played) -> Excitation:
         """The excitation; raises InputError beyond the frequencies that the plate is solved for."""
         excitation, highest = excitation_of(drive, self.rig), self.rig.limits.frequency_max
         for name, tone in excitation.items():

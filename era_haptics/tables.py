@@ -1,14 +1,16 @@
-"""The localization table, and queries of it."""
+"""The localization table, and what fingers are to feel of it."""
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TypeAlias, cast
 
-from era_haptics.arguments import Positions, as_frequencies, as_loads, as_points, expect_rig
-from model.answer.answer import answer as _answer
-from model.answer.pattern import Pattern
-from model.answer.query import query_table
-from model.answer.question import Question
-from model.answer.request import APART_HZ, Answer, Finger, Request
+from era_haptics.arguments import Positions, as_frequencies, as_points, expect_rig
+from model.answer.answer import Answer
+from model.answer.fingers import MUST, Finger, Stimulus
+from model.answer.measures import Measures
+from model.answer.measures import measures as _measures
+from model.answer.plan import answer as _answer
+from model.answer.search import APART_HZ
 from model.answer.timing import Timing
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
@@ -19,6 +21,9 @@ from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.table_cache import cached_table
+
+Fingers: TypeAlias = Positions | Sequence[Finger]
+"""Positions [m] of fingers, or fingers with their loads and bounds."""
 
 
 def table(
@@ -47,64 +52,72 @@ def query(
     table: LocalizationTable,
     target: Positions,
     *,
-    quiet: Positions = (),
+    quiet: Fingers = (),
     level_db_sl: float = STRONG_DB_SL,
+    duration: float | None = None,
     drive_mode: str | None = None,
-    envelopes: bool = False,
-    loads: Sequence[float] = (),
-    measures: bool = True,
-) -> Pattern:
-    """Find the best pattern for fingers at these positions [m], with its predicted measures.
+    shaped: bool = False,
+) -> Answer:
+    """Answer fingers at these positions [m], which feel one vibration together.
 
-    target: fingers to feel it; quiet: fingers not to feel it; each one position or several.
-    level_db_sl: level at the target above its detection threshold, 20 dB is strong; drive_mode:
-    the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
-    loads: of each finger relative to the rig's fingertip, targets first, 1 without;
-    measures: compute transient and promised contrast and concentration, too, some ten milliseconds.
-    Raises InputError for positions off the plate or at the same point, and a level that cannot be
-    reached. The same as `era table query`.
+    target: one position or several; level_db_sl: above the detection threshold, 20 dB is strong;
+    duration [s]: of a short effect, whose level is over it. The rest as of `answer`, of which this
+    is the short form. The same as `era table query --target`.
     """
-    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
-    if drive_mode is not None:
-        _expect_mode(drive_mode)
-    question = Question(
-        as_points(target, what="target"),
-        as_points(quiet, what="quiet"),
-        level_db_sl=float(level_db_sl),
-        drive_mode=drive_mode,
-        envelopes=envelopes,
-        loads=as_loads(loads),
-    )
-    pattern, _ = query_table(table, question, _timing(table), measures=measures)
-    return pattern
+    stimulus = Stimulus(level_db_sl, duration=duration, name="target")
+    fingers = [Finger(at, stimulus, sharing=MUST) for at in as_points(target, what="target")]
+    return answer(table, fingers, quiet=quiet, drive_mode=drive_mode, shaped=shaped)
 
 
 def answer(
     table: LocalizationTable,
-    requests: Sequence[Request],
-    fingers: Sequence[Finger] = (),
+    fingers: Sequence[Finger],
     *,
+    quiet: Fingers = (),
+    drive_mode: str | None = None,
+    shaped: bool = False,
     apart_hz: float = APART_HZ,
     bands_may_swap: bool = False,
 ) -> Answer:
-    """Answer the requests of several fingers at once, each with a vibration of its own.
+    """Answer several fingers at once, each with a vibration of its own.
 
-    fingers: the others, which are to feel nothing; apart_hz: distance of the frequencies;
-    bands_may_swap: whether a finger may have another one's band. Where the worst finger would have
-    less than 6 dB, contents are shared or held back as the requests allow (`Answer.applied`).
-    Raises InputError for fingers off the plate or at one place, and for a band without
-    frequencies. The same as `era table query --own`.
+    quiet: the others, which are to feel nothing, as positions [m] or as fingers; drive_mode: the
+    table's own if None, which must be `phased` for more than one vibration; shaped: for amplifiers
+    that play shaped onsets and endings; apart_hz: distance of the frequencies; bands_may_swap:
+    whether a finger may have another one's band. Where the worst finger would have less than 6 dB,
+    vibrations are shared or held back as the fingers allow, and levels are lowered to what the
+    ERAs' stroke allows (`Answer.applied`). Raises InputError for fingers off the plate or at one
+    place, and for a band without frequencies. The same as `era table query --own`.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
-    expect(requests, Sequence, what="requests", made_by="[era.Request((0.08, 0.06))]")
-    for request in requests:
-        expect(request, Request, what="a request", made_by="era.Request((0.08, 0.06))")
-    expect(fingers, Sequence, what="fingers", made_by="[era.Finger((0.22, 0.16))]")
+    expect(fingers, Sequence, what="fingers", made_by="[era.Finger((0.08, 0.06), era.Stimulus())]")
     for finger in fingers:
-        expect(finger, Finger, what="a finger", made_by="era.Finger((0.22, 0.16))")
+        made_by = "era.Finger((0.08, 0.06), era.Stimulus())"
+        expect(finger, Finger, what="a finger", made_by=made_by)
     expect_number(apart_hz, what="apart_hz", unit="hertz")
-    return _answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
+    if drive_mode is not None:
+        _expect_mode(drive_mode)
+    others = quiet if _are_fingers(quiet) else as_points(cast(Positions, quiet), what="quiet")
+    found = _answer(
+        table,
+        fingers,
+        quiet=cast(Sequence[Finger], others),
+        drive_mode=drive_mode,
+        shaped=shaped,
+        apart_hz=apart_hz,
+        bands_may_swap=bands_may_swap,
+    )
+    return _timing(table).shaped(found) if shaped else found
+
+
+def measures(table: LocalizationTable, answer: Answer) -> Measures:
+    """Compute the transient contrast of an answer's first layer, its residual, its concentration.
+
+    Takes some ten milliseconds.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(answer, Answer, what="answer", made_by="era.query(table, target)")
+    return _measures(table, answer, timing=_timing(table))
 
 
 def contrast_map(
@@ -135,6 +148,11 @@ def contrast_map(
         level_db_sl=float(level_db_sl),
         grid=grid,
     )
+
+
+def _are_fingers(given: object) -> bool:
+    """Whether these are fingers instead of positions."""
+    return isinstance(given, Sequence) and any(isinstance(each, Finger) for each in given)
 
 
 def _expect_mode(given: object) -> None:

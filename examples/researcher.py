@@ -71,14 +71,14 @@ from these it picks amplitudes and phases for the fingers.
 # %%
 table = era.table(rig, drive_mode="phased")
 target, quiet = (0.08, 0.06), [(0.22, 0.16)]
-pattern = era.query(table, target, quiet=quiet)
-for name, tone in table.drive_of(pattern.excitation).items():
+only = era.query(table, target, quiet=quiet)
+for name, tone in table.drive_of(only.layers[0].excitation).items():
     print(name, {key: round(value, 3) for key, value in tone.items()})
 print(
-    f"felt contrast at least {pattern.robust_felt_contrast_db:.1f} dB on nine of ten plates within "
-    f"the rig's uncertainty, {pattern.felt_contrast_db:.1f} dB on the nominal plate"
+    f"felt contrast at least {only.fingers[0].promised_contrast_db:.1f} dB on nine of ten plates "
+    f"within the rig's uncertainty, {only.fingers[0].contrast_db:.1f} dB on the nominal plate"
 )
-show(era.draw_pattern(table, pattern, target, quiet=quiet), "pattern")
+show(era.draw_answer(table, only), "answer")
 
 # %% [markdown]
 """
@@ -88,9 +88,9 @@ the power of all others where that finger is.
 """
 
 # %%
-both = era.answer(table, [era.Request(target), era.Request(quiet[0])])
-for layer in both.layers:
-    print(f"{layer.request.at}: {layer.verdict}, {layer.promised_contrast_db:.1f} dB promised")
+both = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (target, *quiet)])
+for felt in both.fingers:
+    print(f"{felt.finger.at}: {felt.verdict}, {felt.promised_contrast_db:.1f} dB promised")
 
 # %% [markdown]
 """
@@ -100,22 +100,23 @@ time, along a ramp and with shaped onsets, which keep the quiet finger quiet fro
 """
 
 # %%
-shaped = era.query(table, target, quiet=quiet, envelopes=True)
+shaped = era.query(table, target, quiet=quiet, shaped=True)
 played = {
     name: (each, plate.play(each, target, quiet=quiet))
-    for name, each in (("ramp", pattern), ("shaped", shaped))
+    for name, each in (("ramp", only), ("shaped", shaped))
 }
 print("              steady / dB      first 100 ms / dB    target / dB SL")
 print("         predicted   felt    predicted   felt     predicted   felt")
-for name, (predicted, felt) in played.items():
+for name, (answer, felt) in played.items():
+    predicted, more = answer.fingers[0], era.measures(table, answer)
     print(
         f"{name:8} {predicted.contrast_db:7.1f} {felt.contrast_db:8.1f} "
-        f"{predicted.transient_contrast_db:10.1f} {felt.transient_contrast_db:8.1f} "
+        f"{more.transient_contrast_db:10.1f} {felt.transient_contrast_db:8.1f} "
         f"{predicted.level_db_sl:11.1f} {felt.level_db_sl:8.1f}"
     )
-promised = pattern.robust_felt_contrast_db
+promised = only.fingers[0].promised_contrast_db
 drawn = [
-    era.SolvedPlate(rig, seed=seed).play(pattern, target, quiet=quiet).felt_contrast_db
+    era.SolvedPlate(rig, seed=seed).play(only, target, quiet=quiet).contrast_db
     for seed in range(10)
 ]
 print(
@@ -144,8 +145,9 @@ study = {
                 target,
                 quiet=(target[0] + distance, target[1]),
                 drive_mode=drive_mode,
-                measures=False,
-            ).robust_felt_contrast_db
+            )
+            .fingers[0]
+            .promised_contrast_db
             for distance in distances
         ]
     )

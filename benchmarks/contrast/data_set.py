@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.arrays import Point
 from model.config.document import parse_document
 from model.rig.file import rig_of
@@ -36,10 +36,10 @@ class ContactSet:
         """Number of fingers that shall feel nothing."""
         return len(self.contacts) - 1
 
-    def question(self, *, level_db_sl: float, drive_mode: str | None = None) -> Question:
-        """The question of this set to a table."""
-        target, *quiet = self.contacts
-        return Question((target,), tuple(quiet), level_db_sl=level_db_sl, drive_mode=drive_mode)
+    @property
+    def placement(self) -> Placement:
+        """The target, and the others."""
+        return Placement(self.contacts[:1], self.contacts[1:])
 
 
 @dataclass(frozen=True, eq=False)

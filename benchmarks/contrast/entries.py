@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
 from benchmarks.contrast.optimum import optimum
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
@@ -51,7 +51,7 @@ class _Case:
     found: DataSet
     table: LocalizationTable
     contacts: ContactSet
-    question: Question
+    placed: Placement
     rng: np.random.Generator
 
     @property
@@ -66,20 +66,20 @@ class _Case:
         """Fields on plates at rows (f,) of the table's frequencies, (d, f, points, eras)."""
         strokes = np.diag([complex(era.stroke) for era in self.table.eras])
         bases = np.repeat(strokes[None], len(rows), axis=0)
-        at = touched(self.table, self.question)
+        at = touched(self.table, self.placed)
         return accelerations_on(self.table, *at, rows, bases, plates).swapaxes(2, 3)
 
     @property
     def weights(self) -> FloatArray:
         """Of the points in the mean over the target, 0 at the others, (points,)."""
-        weights = read_fingertips(self.table, self.question.contacts).fine_weights.astype(float)
+        weights = read_fingertips(self.table, self.placed.contacts).fine_weights.astype(float)
         weights[1:] = 0
         return weights.ravel()
 
     @property
     def is_target(self) -> NDArray[np.bool_]:
         """Whether a point is under the target, (points,)."""
-        tips = read_fingertips(self.table, self.question.contacts).fine_weights
+        tips = read_fingertips(self.table, self.placed.contacts).fine_weights
         return np.repeat(np.arange(len(tips)) == 0, tips.shape[1])
 
     def excitation(self, frequency: float, weights: ComplexArray) -> Excitation:
@@ -121,13 +121,15 @@ def _inverse_filter(case: _Case) -> Excitation:
 
 def _paper(case: _Case) -> Excitation:
     known = replace(case.table, uncertainty=Uncertainty.none())
-    found = find_pattern(known, replace(case.question, drive_mode="switched")).excitation
+    level = case.found.level_db_sl
+    found = query(known, case.placed, level, drive_mode="switched").layers[0].excitation
     strokes = case.table.strokes
     return {name: replace(tone, amplitude=strokes[name]) for name, tone in found.items()}
 
 
 def _ours(case: _Case) -> Excitation:
-    return find_pattern(case.table, replace(case.question, drive_mode="phased")).excitation
+    level = case.found.level_db_sl
+    return query(case.table, case.placed, level, drive_mode="phased").layers[0].excitation
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +160,11 @@ def _hindsight(case: _Case) -> Excitation:
     table, k = case.table, len(case.contacts.contacts)
     promised = []
     for frequency in table.frequencies.tolist():
-        asked = replace(case.question, drive_mode="phased", frequencies=(frequency, frequency))
-        try:
-            promised.append(find_pattern(table, asked).robust_felt_contrast_db or -math.inf)
-        except InputError:
-            promised.append(-math.inf)
+        band = frequency, frequency
+        level = case.found.level_db_sl
+        found = query(table, case.placed, level, drive_mode="phased", band_hz=band)
+        contrast = found.fingers[0].promised_contrast_db if found.is_reached else None
+        promised.append(-math.inf if contrast is None else contrast)
     rows = np.sort(np.argsort(promised)[-FREQUENCIES_IN_HINDSIGHT:])
     plates = draw_plates(
         np.random.default_rng([case.found.seed, case.contacts.number]),
@@ -201,10 +203,9 @@ def entry(name: str, plates: list[str]) -> dict[str, object]:
         table = build_table(found.plates[plate].rig, drive_mode="phased")
         strokes = table.strokes
         for contacts in found.plates[plate].sets:
-            question = contacts.question(level_db_sl=found.level_db_sl)
             rng = np.random.default_rng([5, contacts.number])
             try:
-                tones = METHODS[name](_Case(found, table, contacts, question, rng))
+                tones = METHODS[name](_Case(found, table, contacts, contacts.placement, rng))
             except InputError:
                 continue
             patterns[contacts.name] = {

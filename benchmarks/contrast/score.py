@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
-from model.answer.pattern import ONSET_RAMP
+from model.answer.answer import ONSET_RAMP
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
@@ -129,8 +129,7 @@ def on_held_out(
         era_count=len(table.eras),
         contact_count=len(contacts.contacts),
     )
-    question = contacts.question(level_db_sl=found.level_db_sl)
-    felt = felt_on(table, question, excitation, plates)
+    felt = felt_on(table, contacts.placement, excitation, plates)
     assert felt.contrast is not None
     return (
         float(np.percentile(decibels(felt.contrast), 10)),
@@ -160,9 +159,9 @@ class _InTime:
             self._rig,
             self._reduced,
             excitation,
-            contacts.question(level_db_sl=found.level_db_sl),
+            contacts.placement,
             duration=DURATION,
             ramp=ONSET_RAMP,
             onset=None,
             imperfections=self._drawn,
-        ).felt_contrast_db
+        ).contrast_db

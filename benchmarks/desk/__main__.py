@@ -132,8 +132,8 @@ def promises_table(found: Sequence[Outcome]) -> str:
     for name in ("1", "2", "3", "all"):
         some = [row for row in everything if name in ("all", str(len(row["quiet"])))]
         if some:
-            promised = np.array([row["promised_felt_contrast_db"] for row in some])
-            measured = np.array([row["measured_felt_contrast_db"] for row in some])
+            promised = np.array([row["promised_contrast_db"] for row in some])
+            measured = np.array([row["measured_contrast_db"] for row in some])
             low, high = np.percentile(measured - promised, [10, 90])
             rows.append(
                 f"| {name} | {len(some)} | {100 * np.mean([row['kept'] for row in some]):.0f} % "

@@ -66,15 +66,15 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
                 time.sleep(0.02)
             heard = recorded.astype(float)
             era.touch([])
-            assert status.robust_felt_contrast_db is not None
-            assert status.predicted_felt_contrast_db is not None
+            assert status.promised_contrast_db is not None
+            assert status.predicted_contrast_db is not None
             frequencies = np.unique([tone.frequency_hz for tone in status.drive.values()])
             samples = heard[:, [inputs[name] for name in names]]
             found.append(
                 Touch(
                     len(names),
-                    status.robust_felt_contrast_db,
-                    status.predicted_felt_contrast_db,
+                    status.promised_contrast_db,
+                    status.predicted_contrast_db,
                     _contrast(samples, frequencies, card.rate),
                 )
             )

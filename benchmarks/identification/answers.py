@@ -8,8 +8,8 @@ import numpy as np
 from benchmarks.identification.hidden import finger_stiffness
 from benchmarks.identification.server import Truth
 from benchmarks.identification.thin_plate import Complexes, Reals
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig
@@ -94,13 +94,12 @@ class Answer:
 def answer(table: LocalizationTable, places: Reals) -> Answer:
     """The table's answer for fingers (k, 2) [m], the first the target."""
     points = [(float(x), float(y)) for x, y in places]
-    question = Question((points[0],), tuple(points[1:]), level_db_sl=0.0, envelopes=True)
-    pattern = find_pattern(table, question)
-    tones = [pattern.excitation.get(era.name) for era in table.eras]
+    found = query(table, Placement((points[0],), tuple(points[1:])), 0.0)
+    tones = [found.layers[0].excitation.get(era.name) for era in table.eras]
     (frequency,) = {tone.frequency for tone in tones if tone is not None}
-    contrast, level = pattern.robust_felt_contrast_db, pattern.robust_level_db_sl
+    contrast = found.fingers[0].promised_contrast_db
+    level = found.fingers[0].promised_level_db_sl
     assert contrast is not None
-    assert level is not None
     return Answer(
         float(frequency),
         np.array([0 if tone is None else tone.phasor for tone in tones], dtype=complex),

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.answer.answer import answer
-from model.answer.request import ANY_BAND, Request
+from model.answer.fingers import ANY_BAND, Finger, Stimulus
+from model.answer.plan import answer
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -66,10 +66,17 @@ class Case:
         """The band of each content, by the best order where they may swap."""
         bands = [*self.bands] or [ANY_BAND] * self.contents
         if self.may_swap:
-            requests = [
-                Request(at, band, LEVEL_DB_SL) for at, band in zip(places, bands, strict=True)
+            fingers = [
+                Finger(at, Stimulus(LEVEL_DB_SL, band))
+                for at, band in zip(places, bands, strict=True)
             ]
-            found = answer(self.table, requests, bands_may_swap=True, min_contrast_db=-np.inf)
+            found = answer(
+                self.table,
+                fingers,
+                bands_may_swap=True,
+                drive_mode="phased",
+                min_contrast_db=-np.inf,
+            )
             played = [next(iter(each.excitation.values())).frequency for each in found.layers]
             bands = [next(b for b in bands if b[0] <= each <= b[1]) for each in played]
         return bands

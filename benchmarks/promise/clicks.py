@@ -14,15 +14,12 @@ promise counts on was fitted to fingers and plates of seed 3; those of any other
 import argparse
 import math
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks.setting import use_one_thread
-from model.answer.pattern_query import find_pattern
 
 if TYPE_CHECKING:
-    from model.answer.effect_level import RaisedPattern
-    from model.answer.question import Question
+    from model.answer.answer import Answer
     from model.arrays import FloatArray
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
@@ -30,7 +27,7 @@ if TYPE_CHECKING:
 RIGS = ("paper_plate", "eight_eras", "car_display", "table")
 DURATION, LEVEL_DB_SL = 0.04, 20.0
 
-Clicks = list[tuple["Question", "RaisedPattern"]]
+Clicks = list["Answer"]
 
 
 def main() -> None:
@@ -59,7 +56,7 @@ def main() -> None:
             rig = replace(written, uncertainty=known)
             table = build_table(rig, drive_mode="phased")
             clicks = clicks_on(table, options.sets, options.seed)
-            promised = np.array([each.promised_contrast_db for _, each in clicks])
+            promised = np.array([each.fingers[0].promised_contrast_db for each in clicks])
             found = given(table, rig, clicks, options.plates, options.seed + 1)
             beyond = promised - np.percentile(found, 10, axis=1)
             print(
@@ -71,25 +68,18 @@ def main() -> None:
 
 
 def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
-    """Questions with one to three quiet fingers in turn, and what is played for a click there."""
+    """What is played for a click with one to three quiet fingers in turn."""
     import numpy as np
 
-    from model.answer.effect_level import DriveLimits, EffectLevels
-    from model.answer.pulse_gains import OverEffect
-    from model.answer.question import Question
+    from model.answer.fingers import Placement
+    from model.answer.plan import query
     from model.study.random_contacts import random_contacts
 
-    rng, levels, found = np.random.default_rng(seed), EffectLevels(table), []
-    full = DriveLimits(table.strokes)
+    rng, found = np.random.default_rng(seed), []
     for number in range(sets):
         places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
-        question = Question(places[:1], places[1:], LEVEL_DB_SL)
-        solve = partial(levels.responses, question=question, duration=DURATION)
-        pattern = find_pattern(table, question, OverEffect(DURATION, solve))
-        raised = levels.raised(
-            pattern, question, level_db_sl=LEVEL_DB_SL, duration=DURATION, limits=full
-        )
-        found.append((question, raised))
+        placed = Placement(places[:1], places[1:])
+        found.append(query(table, placed, LEVEL_DB_SL, duration=DURATION, drive_mode="phased"))
     return found
 
 
@@ -99,11 +89,11 @@ def given(
     """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
     import numpy as np
 
-    from model.answer.effect_level import EffectLevels
+    from model.answer.ringing_under_fingers import RingingUnderFingers
     from model.finger.fingertip import fingertip_points, fingertip_weights
     from model.study.exact_plates import draw_plates
     from model.table.following import table_following
-    from model.vibration.excitation import Tone
+    from model.vibration.excitation import Tone, base_amplitudes
 
     drawn = draw_plates(
         np.random.default_rng(seed),
@@ -129,22 +119,24 @@ def given(
             table,
             replace(rig, plate=plate, eras=eras, fingertip=finger and finger.multiplied(load)),
         )
-        levels = EffectLevels(other)
         gains = dict(zip((era.name for era in eras), drawn.gain[number], strict=True))
-        for row, (question, click) in enumerate(clicks):
+        for row, click in enumerate(clicks):
+            (layer,), contacts = click.layers, click.contents.places
             tones = {
                 name: Tone(tone.frequency, abs(z := tone.phasor * gains[name]), float(np.angle(z)))
-                for name, tone in click.pattern.excitation.items()
+                for name, tone in layer.excitation.items()
             }
-            pulse = levels.gains_db(tones, question, ramp=click.pattern.ramp, duration=DURATION)
-            (target,) = question.targets
+            ringing = RingingUnderFingers(other, contacts, (), DURATION, layer.ramp)
+            hertz, bases = base_amplitudes(tones, eras)
+            pulse = ringing.over(zip(hertz.tolist(), bases, strict=True))
             frequencies, amplitudes = other.amplitudes(
-                tones, fingertip_points(*target, plate), contacts=question.contacts
+                tones, fingertip_points(*contacts[0], plate), contacts=contacts
             )
             threshold = other.thresholds[other.rows_of(frequencies)]
             steady = np.linalg.norm(amplitudes / threshold[:, None], axis=0)
-            level = 20 * math.log10(float(steady @ fingertip_weights(*target, plate)))
-            found[row, number] = level + pulse.targets[0] - (pulse.quiet_db_sl or 0.0)
+            level = 20 * math.log10(float(steady @ fingertip_weights(*contacts[0], plate)))
+            quiet = 10 * math.log10(float(pulse.heard[1:].max()))
+            found[row, number] = level + 20 * math.log10(float(pulse.gains[0])) - quiet
     return found
 
 

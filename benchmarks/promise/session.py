@@ -279,8 +279,7 @@ def _note(
     )
     for one in contents.contents.values():
         if _id(one) == last:
-            pattern = timing.with_transient_measures(one.content.question, one.pattern)
-            contrast = pattern.transient_contrast_db
+            contrast = timing.transient_contrast_db(one.pattern, one.content.question)
             if contrast is not None and promised_level is not None:
                 onset = promised_level - contrast
     for id in event.after.served:

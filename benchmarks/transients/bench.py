@@ -16,8 +16,8 @@ from benchmarks.transients.cases import (
     quantised,
     with_errors,
 )
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import ComplexArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db
@@ -84,12 +84,8 @@ class Bench:
             for name, ramp in (("abrupt", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
                 columns[name].append(self._contrast(case, bases))
-            chosen = find_pattern(
-                self.table,
-                Question(
-                    tuple(case.targets), tuple(case.quiet), drive_mode="phased", level_db_sl=12.0
-                ),
-            )
+            placed = Placement(tuple(case.targets), tuple(case.quiet))
+            (chosen,) = query(self.table, placed, 12.0, drive_mode="phased").layers
             bases = ramped_onset(chosen.excitation, self.rig.eras, ramp=chosen.ramp)
             columns["the table's pattern and ramp"].append(self._contrast(case, bases))
             played = case_of(chosen.excitation, patterns, self.rig)

@@ -177,7 +177,7 @@ class ContactStatus(Message):
     level_db_sl: float | None = Field(
         None, description="predicted sensation level; null if unknown"
     )
-    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
+    promised_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = Field(
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
@@ -232,12 +232,8 @@ class Playing(Message):
         default_factory=dict,
         description="what plays of each content, by layer, then as `drive`; they add up",
     )
-    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_felt_contrast_db: float | None = Field(None, description="the same, nominal")
-    robust_contrast_db: float | None = Field(
-        None, description="promised contrast in peak acceleration"
-    )
-    predicted_contrast_db: float | None
+    promised_contrast_db: float | None = Field(None, description=PROMISED)
+    predicted_contrast_db: float | None = Field(None, description="the same, nominal")
     predicted_level_db_sl: float | None
 
 

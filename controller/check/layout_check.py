@@ -188,7 +188,7 @@ def _resting(plate: Plate, at: Position, number: int) -> Position:
 
 def _silent(target: Target, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
     # As strong as the neighbours allow may be nothing.
-    can_be = target.level_db_sl is None or target.allow_weaker
+    can_be = target.level_db_sl is None
     silent = [each for each in touches if each.reason is not None and not (can_be and each.resting)]
     if silent:
         yield f"nothing is felt {_where(silent, touches, area)}: {silent[0].reason}"

@@ -16,10 +16,10 @@ from controller.effects.region import Region
 from controller.play.chooser import Requested
 from controller.play.content import Selection
 from controller.play.intent import Target
-from controller.play.table_query import fingers_of, requests_of
+from controller.play.table_query import fingers_of
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import answer
-from model.answer.request import MIN_CONTRAST_DB, Answer
+from model.answer.answer import MIN_CONTRAST_DB, Answer
+from model.answer.plan import answer
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
@@ -185,7 +185,7 @@ def _worst(
     tried: list[tuple[float, tuple[Position, ...]]] = []
     for at in product(*spots):
         if all(math.dist(*pair) >= _NEAREST for pair in combinations(at, 2)):
-            worst = _answered(simulator.table, _placed(steady, at), []).promised_worst_db
+            worst = _answered(simulator, _placed(steady, at), []).promised_worst_db
             tried.append((math.inf if worst is None else worst, at))
     if not tried:
         return None
@@ -226,31 +226,38 @@ def _felt(
     worst, leaks = math.inf, [-math.inf for _ in short]
     if lasting:
         quiet = [contact for contact, _ in short]
-        together = _answered(simulator.table, lasting, quiet, protected)
+        together = _answered(simulator, lasting, quiet, protected)
         worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
-        leaks = [each.level_db_sl for each in together.quiet]
-        for (contact, _), layer in zip(lasting, together.layers, strict=True):
-            found[contact.key] = layer.promised_contrast_db or 0.0, layer.verdict
+        felt = together.fingers
+        leaks = [each.foreign_level_db_sl or -math.inf for each in felt[len(lasting) :]]
+        for (contact, _), each in zip(lasting, felt, strict=False):
+            found[contact.key] = each.promised_contrast_db or 0.0, each.verdict
     contacts = tuple(contact for contact, _ in fingers)
-    for each, level in zip(short, leaks, strict=True):
-        key = each[0].key
+    for one, level in zip(short, leaks, strict=True):
+        key = one[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        requested = Requested((each,), contacts, protected or frozenset(), {}, (beside,), math.inf)
-        (felt,) = simulator.chooser.choose(requested, simulator.capabilities).short[key].predictions
-        found[key] = felt.promised_contrast_db or 0.0, felt.verdict
+        requested = Requested((one,), contacts, protected or frozenset(), {}, (beside,), math.inf)
+        chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
+        (predicted,) = chosen.predictions
+        found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
         worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]
 
 
 def _answered(
-    table: LocalizationTable,
+    simulator: TouchSimulator,
     fingers: Sequence[_Finger],
     quiet: Sequence[Contact],
     protected: frozenset[ContactKey] | None = None,
 ) -> Answer:
     """Answer fingers that feel what lasts, with its modulation; protected: as of `_felt`."""
-    playable = float(table.frequencies[0]), float(table.frequencies[-1])
-    requests = requests_of(table, fingers, playable, protected or frozenset())
-    others = fingers_of(quiet, protected or frozenset())
+    table, capabilities = simulator.table, simulator.capabilities
+    every = fingers_of(table, fingers, quiet, capabilities, protected or frozenset())
     least = -math.inf if protected is None else MIN_CONTRAST_DB
-    return answer(table, requests, others, min_contrast_db=least, playable=playable)
+    return answer(
+        table,
+        every,
+        drive_mode=capabilities.drive_mode,
+        min_contrast_db=least,
+        limits=capabilities.limits,
+    )

@@ -16,7 +16,7 @@ from controller.check.layout_check import CheckedEffect
 from controller.check.layout_together import Together, matrix_of
 from controller.check.simulated_touch import Position, SimulatedTouch
 from controller.effects.layout import SurfaceLayout
-from model.answer.request import OWN_CONTRAST_DB
+from model.answer.answer import OWN_CONTRAST_DB
 from model.arrays import FloatArray
 from model.figures.drawing import draw_eras, label_plate
 from model.table.table import LocalizationTable

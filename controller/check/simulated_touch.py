@@ -9,11 +9,11 @@ import numpy as np
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.chooser import Chooser
 from controller.play.intent import Target
-from controller.play.table_query import TableAnswer, query_table
+from controller.play.joint_answer import answered
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.effect_level import EffectLevels
-from model.answer.pulse_gains import promised_over_effect_db
+from model.answer.answer import Answer
 from model.arrays import FloatArray
+from model.choice import NEARLY
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -61,8 +61,7 @@ class TouchSimulator:
 
     def __init__(self, table: LocalizationTable) -> None:
         self.table = table
-        self._levels = EffectLevels(table)
-        self.chooser = Chooser(table, self._levels)
+        self.chooser = Chooser(table)
         """Chooses what is played beside other contents."""
         self.capabilities = PlaybackCapabilities(
             drive_mode=DRIVE_MODES[-1],
@@ -73,7 +72,7 @@ class TouchSimulator:
         )
         """Of amplifiers that play whatever the table has."""
 
-    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> TableAnswer:
+    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> Answer:
         """Answer a target at a position [m] among quiet fingers, along plain ramps.
 
         Raises InputError where nothing can be played.
@@ -83,7 +82,9 @@ class TouchSimulator:
             Contact(ContactKey("quiet", number), *place, since=0.0)
             for number, place in enumerate(quiet)
         ]
-        return query_table(self.table, finger, target, others, self.capabilities, self._levels)
+        return answered(
+            self.table, [(finger, target)], others, self.capabilities, before={}, kept_within=None
+        )
 
     def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
         """Play a target's content at a finger."""
@@ -91,14 +92,14 @@ class TouchSimulator:
             answer = self.answered(target, at, [] if resting is None else [resting])
         except InputError as error:
             return SimulatedTouch(at, resting, reason=str(error))
-        pattern, pulse = answer.pattern, target.pulse
+        layer, pulse, expected = answer.layers[0], target.pulse, answer.fingers[0]
         is_whole = pulse is not None and pulse.is_raised
         since = 0.0 if is_whole else STEADY_AFTER
         duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
         bases = [
-            (frequency, ramped_pulse(part, self.table.eras, ramp=pattern.ramp, duration=end))
+            (frequency, ramped_pulse(part, self.table.eras, ramp=layer.ramp, duration=end))
             for end in (since + duration,)
-            for frequency, part in _by_frequency(pattern.excitation)
+            for frequency, part in _by_frequency(layer.excitation)
         ]
         transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
         end = since + duration
@@ -108,7 +109,7 @@ class TouchSimulator:
         if resting is not None:
             over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
             resting_level = float(over[round(since * SAMPLE_RATE) :].max())
-            promised = promised_over_effect_db(pattern, level - resting_level)
+            promised = expected.promised_contrast_db
         return SimulatedTouch(
             at,
             resting,
@@ -116,7 +117,7 @@ class TouchSimulator:
             level,
             resting_level,
             promised,
-            held_back_db=answer.held_back_db,
+            held_back_db=0.0 if answer.stroke_factor < 1 - NEARLY else expected.lowered_db,
         )
 
     def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:

@@ -146,7 +146,7 @@ def _line(row: "TouchRow") -> str:
         by_frequency.setdefault(tone["frequency_hz"], []).append(era)
     eras = ", ".join(f"{_named(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
     pairs = (
-        (row.robust_felt_contrast_db, row.measured_felt_contrast_db),
+        (row.promised_contrast_db, row.measured_contrast_db),
         (row.predicted_transient_contrast_db, row.measured_transient_contrast_db),
         (row.predicted_level_db_sl, row.measured_level_db_sl),
     )

@@ -111,7 +111,7 @@ def _lines(each: "CheckedEffect") -> list[str]:
 
 def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
     """Format what fingers in every two regions are promised."""
-    from model.answer.request import MIN_CONTRAST_DB, OWN_CONTRAST_DB
+    from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 
     width = max(map(len, names)) + 4
     lines = [

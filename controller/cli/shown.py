@@ -84,7 +84,7 @@ def _contact(contact: ContactStatus) -> str:
     """Format a finger and what it feels."""
     details = _given(
         (" {:.1f} dB SL", contact.level_db_sl),
-        (", at least {:.1f} dB over the others", contact.robust_felt_contrast_db),
+        (", at least {:.1f} dB over the others", contact.promised_contrast_db),
         (", {:g} Hz", contact.frequency_hz),
         (", effect {}", contact.effect),
         (", feels {}", None if contact.feels == contact.effect else contact.feels),

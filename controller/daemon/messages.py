@@ -145,16 +145,14 @@ class PlateView:
 
 def playing_of(applied: Applied | None) -> dict[str, Any]:
     """What of a `Playing` is of a pattern: its tones, what is promised and predicted, if any."""
-    pattern = None if applied is None else applied.pattern
+    felt = None if applied is None else applied.felt
     contents = {} if applied is None else applied.contents
     return {
         "drive": {} if applied is None else played_tones(applied.drive),
         "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
-        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
-        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
-        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
-        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
-        "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
+        "promised_contrast_db": felt and _finite(felt.promised_contrast_db),
+        "predicted_contrast_db": felt and _finite(felt.contrast_db),
+        "predicted_level_db_sl": felt and _finite(felt.level_db_sl),
     }
 
 
@@ -190,7 +188,7 @@ def contact_status(
                     "role": "target",
                     "feels": felt.content,
                     "level_db_sl": _finite(felt.level_db_sl),
-                    "robust_felt_contrast_db": _finite(felt.promised_contrast_db),
+                    "promised_contrast_db": _finite(felt.promised_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
                     "verdict": felt.verdict,
                     "frequency_hz": felt.frequency,
@@ -198,12 +196,8 @@ def contact_status(
                     "held_back": felt.held_back,
                 }
     if isinstance(report, Applied) and any(each.key == contact.key for each in report.quiet):
-        # Of several quiet contacts only the level of the loudest is known.
-        is_known = len(report.quiet) == len(report.contents) == 1
-        level = report.pattern.quiet_level_db_sl if is_known else None
         status |= {
             "role": "quiet",
-            "level_db_sl": _finite(level),
             "foreign_level_db_sl": _finite(report.quiet_levels.get(contact.key)),
         }
     return ContactStatus.model_validate(status)

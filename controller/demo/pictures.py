@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from controller.demo.touch_row import FingerRow, TouchRow
-from model.answer.pattern import Pattern
-from model.answer.request import OWN_CONTRAST_DB
+from model.answer.answer import OWN_CONTRAST_DB, Layer
 from model.arrays import FloatArray, lattice
 from model.choice import ranked_by
 from model.figures import save_figure
@@ -85,7 +84,7 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
 
 
 def _contrast(row: TouchRow) -> float:
-    contrast = row.measured_felt_contrast_db
+    contrast = row.measured_contrast_db
     return -math.inf if contrast is None else contrast
 
 
@@ -96,7 +95,7 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
     for id, position in row.quiet.items():
         draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
-    contrast, promised = row.measured_felt_contrast_db, row.robust_felt_contrast_db
+    contrast, promised = row.measured_contrast_db, row.promised_contrast_db
     title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
     if promised is not None:
         title += f", promised {promised:.1f}"
@@ -130,12 +129,12 @@ def contents_figure(table: LocalizationTable, row: TouchRow) -> Figure:
     return figure
 
 
-def _frequency(content: Pattern) -> float:
+def _frequency(content: Layer) -> float:
     """The frequency [Hz] of a content, which has one where there are several."""
     return next(iter(content.excitation.values())).frequency
 
 
-def _levels(table: LocalizationTable, content: Pattern) -> FloatArray:
+def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
     """Level [dB SL] of a content over the raster of the plate."""
     plate = table.plate
     nx, ny = raster(plate)

@@ -13,7 +13,6 @@ from controller.demo.touch_row import (
     FingerVibration,
     Position,
     TouchRow,
-    felt_contrast_db,
     peak_contrast_db,
     steady_contrast_db,
 )
@@ -250,8 +249,8 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
-        predicted_felt_contrast_db=pattern.felt_contrast_db,
-        robust_felt_contrast_db=predicted.promised_contrast_db,
+        predicted_contrast_db=predicted.contrast_db,
+        promised_contrast_db=predicted.promised_contrast_db,
         predicted_level_db_sl=predicted.level_db_sl,
         pattern=pattern,
         levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
@@ -260,7 +259,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         own = _finger_row(predicted, vibration)
         return replace(
             row,
-            measured_felt_contrast_db=own.measured_contrast_db,
+            measured_contrast_db=own.measured_contrast_db,
             measured_level_db_sl=own.measured_level_db_sl,
             fingers=[_finger_row(each, vibration) for each in applied.targets],
             contents=[each.pattern for each in applied.contents.values()],
@@ -270,9 +269,6 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     onset_target, onset_quiet = _fingers(onset_vibration, predicted, first.applied.quiet)
     return replace(
         row,
-        measured_felt_contrast_db=felt_contrast_db(target, quiet) if target else None,
-        predicted_contrast_db=predicted.contrast_db,
-        robust_contrast_db=pattern.robust_contrast_db,
         measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
         predicted_transient_contrast_db=first.applied.transient_contrast_db,
         measured_transient_contrast_db=(

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from model.answer.pattern import Pattern
+from model.answer.answer import Layer
 from model.arrays import FloatArray
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
@@ -14,7 +14,6 @@ from model.finger.perception import (
     mean_level_db_sl,
     sensation_level,
 )
-from model.vibration.excitation import peak_acceleration
 
 Position: TypeAlias = tuple[float, float]
 
@@ -80,12 +79,11 @@ class TouchRow:
     Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
     fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a
     finger alone, and measured ones if the pattern was too short: predicted ones are of the table's
-    plate, `robust_` ones are promised, what nine of ten plates within the rig's uncertainty give;
-    felt ones are in levels, the others in accelerations; transient ones are over the first 100 ms
-    of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms: from
-    touch frame to last byte on the wire; reason: why nothing played, if so. fingers: of several
-    contents, each; contrasts are then to the contents of others at this finger; contents: their
-    patterns, in the order of layers.
+    plate, promised ones what nine of ten plates within the rig's uncertainty give, in levels;
+    transient ones are in accelerations, over the first 100 ms of the touch's first pattern.
+    drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
+    wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then
+    to the contents of others at this finger; contents: their patterns, in the order of layers.
     """
 
     target_id: str
@@ -100,25 +98,22 @@ class TouchRow:
     latency_ms: float | None = None
     played_s: float = 0.0
     steady: bool = False
-    predicted_felt_contrast_db: float | None = None
-    robust_felt_contrast_db: float | None = None
-    measured_felt_contrast_db: float | None = None
     predicted_contrast_db: float | None = None
-    robust_contrast_db: float | None = None
+    promised_contrast_db: float | None = None
     measured_contrast_db: float | None = None
     predicted_transient_contrast_db: float | None = None
     measured_transient_contrast_db: float | None = None
     predicted_level_db_sl: float | None = None
     measured_level_db_sl: float | None = None
-    pattern: Pattern | None = None
+    pattern: Layer | None = None
     levels_db_sl: Mapping[str, float] = field(default_factory=dict)
     fingers: Sequence[FingerRow] = ()
-    contents: Sequence[Pattern] = ()
+    contents: Sequence[Layer] = ()
 
     @property
     def keeps_promise(self) -> bool | None:
         """Whether the steady felt contrast is at least the promised one; None if not measured."""
-        promised, measured = self.robust_felt_contrast_db, self.measured_felt_contrast_db
+        promised, measured = self.promised_contrast_db, self.measured_contrast_db
         if not self.steady or promised is None or measured is None:
             return None
         return measured >= promised
@@ -136,20 +131,11 @@ class TouchRow:
 _OWN = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
 
 
-def felt_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
+def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
     """Level of the target above that of the loudest quiet point [dB], steady; None if alone."""
     if not quiet:
         return None
     return target.level_db_sl - max(finger.loudest_db_sl for finger in quiet)
-
-
-def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
-    """Contrast of the steady parts [dB], defined as in the table's predictions; None if alone."""
-    if not quiet:
-        return None
-    others = np.concatenate([peak_acceleration(finger.amplitudes) for finger in quiet])
-    felt = peak_acceleration(target.amplitudes)
-    return float(contrast_db([felt], others, [target.weights]))
 
 
 def peak_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float:

@@ -11,7 +11,7 @@ from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
 from controller.play.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.request import MAX_MODULATION, MIN_MODULATION
+from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.finger.perception import STRONG_DB_SL
@@ -51,15 +51,13 @@ class Sensation:
     """Target of one finger from now on.
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
-    the finger does nothing; None for never. allow_weaker: where the plate cannot reach the level,
-    play as strong as the neighbours allow instead of nothing. pulse: for a vibration of limited
-    duration, which the amplifiers end by themselves. modulation_hz: how often a second its strength
-    comes and goes, 10 to 30; None for a steady one, as are pulses below 0.2 s.
+    the finger does nothing; None for never. pulse: for a vibration of limited duration, which the
+    amplifiers end by themselves. modulation_hz: how often a second its strength comes and goes, 10
+    to 30; None for a steady one, as are pulses below 0.2 s.
     """
 
     level_db_sl: float | None
     until: float | None = None
-    allow_weaker: bool = False
     pulse: Pulse | None = None
     modulation_hz: float | None = None
 
@@ -79,7 +77,6 @@ class Sensation:
         return Target(
             key,
             self.level_db_sl,
-            allow_weaker=self.allow_weaker,
             pulse=self.pulse,
             band=band,
             priority=priority,

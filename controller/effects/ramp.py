@@ -71,10 +71,9 @@ class _RampRun(EffectRun):
         """Return the level of the current step."""
         index = max(0, int((now - self.pulse.start) / self.step))
         if index >= len(self.levels) - 1 and self.is_held:
-            return Sensation(self.levels[-1], allow_weaker=True)
+            return Sensation(self.levels[-1])
         if index >= len(self.levels):
             return None
-        # Without allow_weaker a ramp would stop at the highest level of the plate, not saturate.
         until = self.pulse.start + (index + 1) * self.step
         pulse = None if self.is_held else self.pulse
-        return Sensation(self.levels[index], until, allow_weaker=True, pulse=pulse)
+        return Sensation(self.levels[index], until, pulse=pulse)

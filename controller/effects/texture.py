@@ -95,7 +95,6 @@ class _TextureRun(EffectRun):
         return Sensation(
             self._level_at(speed),
             until=rests_from,
-            allow_weaker=True,
             modulation_hz=self._texture.modulation,
         )
 

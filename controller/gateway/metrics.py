@@ -111,13 +111,13 @@ def _gauges(status: StatusResult) -> list[_Row]:
         (
             "promised_contrast_decibels",
             "Felt contrast that nine of ten plates within the rig's uncertainty give.",
-            {(): status.robust_felt_contrast_db},
+            {(): status.promised_contrast_db},
             (),
         ),
         (
             "predicted_contrast_decibels",
             "Felt contrast of the pattern, nominal.",
-            {(): status.predicted_felt_contrast_db},
+            {(): status.predicted_contrast_db},
             (),
         ),
         (

@@ -28,7 +28,7 @@ from controller.learning.messages import (
     packed,
     unpacked,
 )
-from model.answer.pattern_query import prepare_patterns
+from model.answer.plan import prepare_answers
 from model.errors import InputError
 from model.files.array_file import remove_partial
 from model.identification.in_service import PlateEstimate
@@ -134,7 +134,7 @@ class Estimator:
     def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:
         # Of its own, not the one that the next correction starts from.
         table = replace(table)
-        prepare_patterns(table, self._start.drive_mode, with_ringing=whole)
+        prepare_answers(table, self._start.drive_mode, with_ringing=whole)
         _ = table.in_time
         return Answers(self._base, table, whole)
 

@@ -6,19 +6,19 @@ carry in time are arithmetic, done once when the amplifiers are open.
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
+from model.answer.strength import Limits
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.base_motion import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
-from model.vibration.excitation import Excitation
 
 MAX_SET_TIME = 0.010
 """How long [s] a set may take on its wire, so that its onset does not delay a touch."""
@@ -63,13 +63,10 @@ class PlaybackCapabilities:
     ramp_max: float = math.inf
     layers: int = 1
 
-    def factor_within(self, total: Mapping[str, float], strokes: Mapping[str, float]) -> float:
-        """Return the factor, 1 at most, by which amplitudes [m] are within; strokes [m]: by ERA."""
-        share, power = 1.0, 0.0
-        for name, amplitude in total.items():
-            share = max(share, amplitude / self.max_amplitudes[name])
-            power += (amplitude / strokes[name]) ** 2
-        return 1.0 / max(share, math.sqrt(power / self.max_power))
+    @property
+    def limits(self) -> Limits:
+        """Those of a drive."""
+        return Limits(self.frequencies, self.max_amplitudes, self.max_power, self.slew)
 
     def left_by(self, taken: Mapping[str, float], strokes: Mapping[str, float]) -> Self:
         """Return what amplitudes [m] leave of these and of the power, their peaks together."""
@@ -82,15 +79,6 @@ class PlaybackCapabilities:
             },
             max_power=max(math.sqrt(self.max_power) - math.hypot(*levels), 1e-9) ** 2,
         )
-
-
-def amplitudes_of(excitations: Iterable[Excitation]) -> dict[str, float]:
-    """Return the amplitudes [m] of excitations together, by ERA."""
-    total = defaultdict[str, float](float)
-    for tones in excitations:
-        for name, tone in tones.items():
-            total[name] += tone.amplitude
-    return total
 
 
 def playback_capabilities(

@@ -5,37 +5,31 @@ fingers quiet. It is over before an answer for all would help, and never changed
 does not fit beside a pulse that plays has what that leaves, until it has ended.
 """
 
-import contextlib
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from controller.play.capabilities import PlaybackCapabilities, amplitudes_of
-from controller.play.content import Content, Prediction, Selection, Targets, not_served
+from controller.play.capabilities import PlaybackCapabilities
+from controller.play.content import Content, Selection, Targets, not_served
 from controller.play.intent import Target
 from controller.play.joint_answer import (
+    KEPT_WITHIN,
     LIMITS_LEAVE_NOTHING,
     Shape,
-    query_jointly,
+    answered,
+    selection_of,
     unshaped,
 )
-from controller.play.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.effect_level import EffectLevels
-from model.answer.pattern import IMPERCEPTIBLE_DB_SL
-from model.answer.request import verdict_of
+from model.answer.answer import Answer, amplitudes_of, verdict_of
+from model.answer.strength import scaled
 from model.choice import NEARLY
 from model.errors import InputError
-from model.finger.perception import decibels
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text
 
-# A step of a ramp or texture may be this far [dB] below its level before its frequency changes.
-_STEP_SHORT_OF = 1.0
-
 _USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
-_QUIETER = "lower its level, or lift that finger"
 
 _logger = logging.getLogger(__name__)
 
@@ -83,10 +77,9 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Chooser:
-    """Chooses by a table; levels: over durations; shape: adds envelopes to what is joint."""
+    """Chooses by a table; shape: adds envelopes to what is joint."""
 
     table: LocalizationTable
-    levels: EffectLevels
     shape: Shape = unshaped
 
     def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
@@ -116,7 +109,7 @@ class Chooser:
         fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
         left = self._left_by([*pulses, *fading], capabilities)
         total = amplitudes_of([each.pattern.excitation for each in free.contents])
-        if left.factor_within(total, self.table.strokes) >= 1 - NEARLY:
+        if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
         return limited if limited.contents else silent(requested, targets, _USED_UP), True
@@ -141,20 +134,38 @@ class Chooser:
 
         beside: what a pulse is felt beside; None for what lasts.
         """
+        table, quiet, before = self.table, requested.quiet_beside(targets), requested.before
+        is_long = requested.takes_long and beside is None
+        kept_within: float | None = KEPT_WITHIN
+        if not is_long:
+            kept_within = math.inf if _is_step(targets, before) else None
+        elif requested.is_moving:
+            kept_within = math.inf
+        by = requested.protected
         try:
-            if requested.takes_long and beside is None:
-                found = query_jointly(
-                    self.table,
-                    targets,
-                    requested.quiet_beside(targets),
-                    capabilities,
-                    before=requested.before,
-                    shape=self.shape,
-                    protected=requested.protected,
-                    is_moving=requested.is_moving,
-                )
-            else:
-                found = self._alone(requested, targets, capabilities, beside or ())
+            answer = answered(
+                table,
+                targets,
+                quiet,
+                capabilities,
+                before=before,
+                protected=by,
+                kept_within=kept_within,
+            )
+            if not is_long:
+                answer = _alike(answer, targets[0][1])
+            found = selection_of(
+                table,
+                answer,
+                targets,
+                quiet,
+                before=before,
+                shape=self.shape if is_long else unshaped,
+                protected=by,
+                is_in_phase=is_long,
+            )
+            if beside:
+                found = _beside(requested, found, beside)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -162,74 +173,7 @@ class Chooser:
                 _logger.error("loop: table failed, silencing its targets", exc_info=error)
                 reason = failure_text(error)
             found = silent(requested, targets, reason)
-        return replace(found, protected=requested.protected)
-
-    def _alone(
-        self,
-        requested: Requested,
-        targets: Targets,
-        capabilities: PlaybackCapabilities,
-        beside: Sequence[Selection],
-    ) -> Selection:
-        """Choose for the only target beside others; raises InputError."""
-        ((contact, target),) = targets
-        key, quiet = contact.key, requested.quiet_beside(targets)
-        heard = [each.quiet_levels[key] for each in beside if key in each.quiet_levels]
-        before = requested.before.get((key, 0))
-        answer = self._query(contact, target, quiet, capabilities, before)
-        pattern = answer.pattern
-        total = amplitudes_of([pattern.excitation])
-        change = float(decibels(capabilities.factor_within(total, self.table.strokes)))
-        felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db
-        leak = -math.inf if promised is None else felt - promised
-        if requested.protected - {key} and leak > IMPERCEPTIBLE_DB_SL:
-            reason = f"a protected finger would notice it, up to {leak:.1f} dB SL; {_QUIETER}"
-            return silent(requested, targets, reason)
-        if felt < 0:
-            is_beside = bool(_contents(beside))
-            is_heard = target.level_db_sl is not None and target.level_db_sl < 0  # as it shall be
-            if change < 0 or (is_beside and not is_heard):
-                reason = _USED_UP if is_beside else LIMITS_LEAVE_NOTHING
-                return silent(requested, targets, reason)
-        others = sum_db(heard) if heard else None
-        if others is not None:
-            promised = min(math.inf if promised is None else promised, felt - others)
-        content = Content(targets, answer.question, pattern.scaled(change) if change else pattern)
-        predicted = Prediction(
-            contact,
-            felt,
-            pattern.contrast_db,
-            verdict_of(promised),
-            promised_contrast_db=promised,
-            foreign_level_db_sl=others,
-            frequency=content.frequency,
-            content=target.content,
-        )
-        return Selection(
-            targets,
-            quiet,
-            (replace(content, predictions=(predicted,)),),
-            quiet_levels=dict.fromkeys([each.key for each in quiet], leak),
-        )
-
-    def _query(
-        self,
-        contact: Contact,
-        target: Target,
-        quiet: Sequence[Contact],
-        capabilities: PlaybackCapabilities,
-        before: Content | None,
-    ) -> TableAnswer:
-        """Query the table; a level that changes keeps its frequency where that reaches it."""
-        table, levels = self.table, self.levels
-        kept = None if before is None else before.frequency
-        if before is not None and kept is not None and _is_step(target, before.targets[0][1]):
-            tuned = replace(target, band=(kept, kept))
-            with contextlib.suppress(InputError):
-                answer = query_table(table, contact, tuned, quiet, capabilities, levels)
-                if answer.felt_db_sl >= (target.level_db_sl or 0.0) - _STEP_SHORT_OF:
-                    return answer
-        return query_table(table, contact, target, quiet, capabilities, levels)
+        return found
 
 
 def sum_db(levels: Iterable[float]) -> float:
@@ -246,10 +190,49 @@ def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
     return protected <= {contact.key} and target.modulation_hz is None
 
 
-def _is_step(new: Target, old: Target) -> bool:
+def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
     """Whether only the level of a target changes, which is not raised."""
-    is_step = new != old and new == replace(old, level_db_sl=new.level_db_sl)
-    return is_step and new.level_db_sl is not None and not (new.pulse and new.pulse.is_raised)
+    ((contact, new),) = targets
+    then = before.get((contact.key, 0))
+    if then is None or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
+        return False
+    old = then.targets[0][1]
+    return new != old and new == replace(old, level_db_sl=new.level_db_sl)
+
+
+def _alike(found: Answer, target: Target) -> Answer:
+    """Return an answer whose level in a band is alike wherever the finger is.
+
+    The margin for other plates, by which it is more than promised, differs from place to place.
+    """
+    is_level = target.level_db_sl is not None and not (target.pulse and target.pulse.is_raised)
+    if not (is_level and target.band and found.layers):
+        return found
+    excess = found.fingers[0].level_db_sl - (target.level_db_sl or 0.0)
+    return scaled(found, -excess) if excess > 0 else found
+
+
+def _beside(requested: Requested, found: Selection, beside: Sequence[Selection]) -> Selection:
+    """Return what was chosen for a pulse with what its finger feels of others besides."""
+    ((contact, _),) = found.targets
+    heard = [each.quiet_levels[contact.key] for each in beside if contact.key in each.quiet_levels]
+    if not found.contents:
+        is_used_up = bool(_contents(beside)) and found.reason == LIMITS_LEAVE_NOTHING
+        return silent(requested, found.targets, _USED_UP) if is_used_up else found
+    if not heard:
+        return found
+    (content,), others = found.contents, sum_db(heard)
+    (felt,) = content.predictions
+    promised = felt.promised_contrast_db
+    level = -math.inf if felt.level_db_sl is None else felt.level_db_sl
+    promised = min(math.inf if promised is None else promised, level - others)
+    felt = replace(
+        felt,
+        promised_contrast_db=promised,
+        foreign_level_db_sl=others,
+        verdict=verdict_of(promised),
+    )
+    return replace(found, contents=(replace(content, predictions=(felt,)),))
 
 
 def _contents(parts: Iterable[Selection]) -> list[Content]:

@@ -9,15 +9,16 @@ import numpy as np
 
 from controller.play.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer import answer
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
 from model.table.table import LocalizationTable
 
 Targets = tuple[tuple[Contact, Target], ...]
 
-OWN, SHARED, HELD_BACK = "own", "shared", "held back"
+OWN, SHARED, HELD_BACK = answer.OWN, answer.SHARED, answer.HELD_BACK
 
 BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
 
@@ -29,8 +30,8 @@ class Prediction:
     contact: as it was when the content was chosen; verdict: whether it feels its own content, that
     mixed with others', that of another finger, or none; held_back: why not its own, None if it
     does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
-    has none; contrast_db: of the steady vibration to the loudest quiet point, in peak acceleration;
-    promised_contrast_db: of levels, to the loudest quiet finger or to the contents of others here,
+    has none; contrast_db: on the plate as modelled;
+    promised_contrast_db: to the loudest quiet finger or to the contents of others here,
     on nine of ten plates; foreign_level_db_sl: of others' contents here, which nine of ten plates
     do not exceed. None where there is nothing to compare with. frequency [Hz]: None where several
     or none play; content: name of what it feels.
@@ -49,16 +50,16 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Content:
-    """The pattern of one layer, with the contacts as they were when it was chosen.
+    """What one layer plays, with the contacts as they were when it was chosen.
 
-    targets: the finger whose content it is, then those that share it; question: by which its onset
-    and ending are shaped; predictions: one per target; voice: 0, or the number of a side band of
-    the finger's content, which has no predictions.
+    targets: the finger whose content it is, then those that share it; question: where they are, and
+    all others; predictions: one per target; voice: 0, or the number of a side band of the finger's
+    content, which has no predictions.
     """
 
     targets: Targets
-    question: Question
-    pattern: Pattern
+    question: Placement
+    pattern: Layer
     predictions: tuple[Prediction, ...] = ()
     voice: int = 0
 

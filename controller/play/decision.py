@@ -19,8 +19,8 @@ from controller.play.selection import Selector
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
-from model.answer.pattern_query import find_pattern, prepare_patterns
-from model.answer.question import Question
+from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
+from model.answer.plan import prepare_answers, query
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -94,9 +94,7 @@ class Decider:
         self._builder = SetBuilder(
             rig, capabilities.envelope_support, capabilities.ramp_max, timing
         )
-        self._selector = Selector(
-            Chooser(table, timing.levels, self._builder.shape), arrived=self._note_answer
-        )
+        self._selector = Selector(Chooser(table, self._builder.shape), arrived=self._note_answer)
         self._decided: Decision | None = None  # as it was sent
         self.playing = Playing(rig, capabilities.layers, tracker.expiry_of)
         """The layers."""
@@ -113,7 +111,7 @@ class Decider:
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
         self._builder = replace(self._builder, timing=timing)
-        self._selector.chooser = Chooser(table, timing.levels, self._builder.shape)
+        self._selector.chooser = Chooser(table, self._builder.shape)
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; seconds, of a large rig.
@@ -121,25 +119,16 @@ class Decider:
         Raises InputError for a table that has no pattern for these amplifiers.
         """
         table, timing = self._selector.chooser.table, self._builder.timing
-        prepare_patterns(table, self.capabilities.drive_mode)
+        mode = self.capabilities.drive_mode
+        prepare_answers(table, mode)
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
-        question = Question(
-            ((plate.length / 2, plate.width / 2),),
-            ((0.0, 0.0),),
-            level_db_sl=-100.0,
-            drive_mode=self.capabilities.drive_mode,
-            playable=self.capabilities.playable,
-            frequencies=self.capabilities.frequencies,
-            envelopes=support.onset_knots > 0,
-        )
-        pattern = timing.with_envelopes(
-            question,
-            find_pattern(table, question),
-            onset=support.onset_knots > 0,
-            ending=support.ending_knots > 0,
-        )
-        timing.with_transient_measures(question, pattern)
+        placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
+        band = self.capabilities.frequencies
+        (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
+        onset, ending = support.onset_knots > 0, support.ending_knots > 0
+        layer = timing.with_envelopes(layer, placed, onset=onset, ending=ending)
+        timing.transient_contrast_db(layer, placed)
 
     @property
     def due(self) -> float:

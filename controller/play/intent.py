@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.question import SHAPED_FROM
+from model.answer.fingers import SHAPED_FROM
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.perception import STRONG_DB_SL
@@ -62,19 +62,17 @@ class Pulse:
 class Target:
     """A contact that shall feel something of its own.
 
-    level_db_sl: how strongly; None for as strongly as the neighbours allow. allow_weaker: where the
-    plate cannot reach the level, as strongly as the neighbours allow instead of nothing. pulse:
-    None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand for
-    the nearest of the table. priority: lower ones give way first. content: a name; fingers of one
-    name may share one vibration where the plate cannot give each its own. None: of this one alone.
-    is_own: whether it feels its own content or none; may_share: whether it may also feel that of
-    any finger that may share. modulation_hz: how often a second the strength of what lasts comes
-    and goes.
+    level_db_sl: how strongly, where the plate can; None for as strongly as the neighbours allow.
+    pulse: None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand
+    for the nearest of the table. priority: lower ones give way first. content: a name; fingers of
+    one name may share one vibration where the plate cannot give each its own. None: of this one
+    alone. is_own: whether it feels its own content or none; may_share: whether it may also feel
+    that of any finger that may share. modulation_hz: how often a second the strength of what lasts
+    comes and goes.
     """
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
-    allow_weaker: bool = False
     pulse: Pulse | None = None
     band: tuple[float, float] | None = None
     priority: int = 0

@@ -1,4 +1,4 @@
-"""Several contents at once: the requests of all fingers, one answer, and a layer for each content.
+"""Contents of fingers from one answer of the table, a layer for each.
 
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
 one promises 3 dB more to the worst finger, or serves more of them. While a finger moves, only the
@@ -9,131 +9,144 @@ import cmath
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
-from controller.play.capabilities import PlaybackCapabilities, amplitudes_of
+from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
 from controller.play.intent import Target
-from controller.play.table_query import fingers_of, question_of, requests_of
+from controller.play.table_query import fingers_of
 from controller.sources.contacts import Contact, ContactKey
-from model.answer import request
-from model.answer.answer import answer
-from model.answer.modulation import with_gains
-from model.answer.pattern import ONSET_RAMP, Pattern
-from model.answer.promised import share_stroke
-from model.answer.question import MIN_LEVEL_DB_SL, Question
-from model.answer.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
+from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB, Answer, Layer, Sensation
+from model.answer.fingers import Finger, Placement
+from model.answer.plan import answer
 from model.arrays import Complex64Array
-from model.choice import NEARLY
-from model.finger.perception import decibels
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 
 KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
 
+_SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2
-_SILENT_DB = -60.0  # a gain by which a content is not felt
 
 LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
+NEIGHBOURS_LEAVE_NOTHING = (
+    "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
+    "not; lift or move that finger away"
+)
 
-Shape = Callable[[Question, Pattern, bool], Pattern]
-"""Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
+Shape = Callable[[Placement, Layer, bool], Layer]
+"""Adds the envelopes of a layer; whether it continues what plays in it, without an onset."""
 
 
-def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Pattern:
-    """Return a pattern as it is."""
-    return pattern
+def unshaped(placed: Placement, layer: Layer, is_continued: bool) -> Layer:
+    """Return a layer as it is."""
+    return layer
 
 
-def query_jointly(
+def answered(
     table: LocalizationTable,
     targets: Sequence[tuple[Contact, Target]],
     quiet: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     *,
     before: Mapping[tuple[ContactKey, int], Content],
-    shape: Shape,
     protected: frozenset[ContactKey] = frozenset(),
-    is_moving: bool = False,
-) -> Selection:
-    """Answer the requests of several targets with a content for each; takes some 20 ms.
+    kept_within: float | None = KEPT_WITHIN,
+) -> Answer:
+    """Answer the fingers of targets and of quiet contacts.
 
-    before: what fingers feel now; protected: those that must not notice others' contents;
-    is_moving: whether only their places have changed. Raises InputError for fingers that are too
-    close.
+    before: what fingers feel now, whose frequencies are kept unless others promise so much more
+    [dB]; None to keep none. Raises InputError for fingers that are too close.
     """
-    playable = capabilities.frequencies
-    requests = _as_layers_allow(
-        requests_of(table, targets, playable, protected), capabilities.layers
+    is_shaped = capabilities.envelope_support.onset_knots > 0
+    fingers = _as_layers_allow(
+        fingers_of(table, targets, quiet, capabilities, protected), len(targets), capabilities
     )
-    fingers = fingers_of(quiet, protected)
-    kept = _kept(requests, targets, before)
-    kept_within = math.inf if is_moving else KEPT_WITHIN
-    found = _answer(table, requests, fingers, kept, kept_within, playable)
-    strokes = table.strokes
+    ask = partial(
+        answer,
+        table,
+        drive_mode=capabilities.drive_mode,
+        shaped=is_shaped and not any(target.is_short for _, target in targets),
+        limits=capabilities.limits,
+    )
+    kept = fingers if kept_within is None else _kept(fingers, targets, before)
+    if kept == fingers:
+        return ask(fingers)
+    found, within = ask(kept), kept_within or 0.0
+    worst, served, lowered = found.promised_worst_db, _served(found), _lowered_db(found)
+    least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
+    is_loud = lowered < _SHORT_OF
+    if is_loud and served == len(targets) and (worst is None or worst >= least):
+        return found
+    other = ask(fingers)
+    gain = _worst(other) - _worst(found)
+    is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
+    return other if (_served(other), is_better) > (served, False) else found
 
-    def within(found: Answer) -> float:
-        tones = [each for layer in found.layers for each in _tones_of(layer)]
-        return capabilities.factor_within(amplitudes_of(tones), strokes)
 
-    free, factor = found, within(found)
-    if factor < 1 - NEARLY:
-        gains = _gains_db(requests, found, capabilities, strokes)
-        lowered = with_gains(table, found, gains)
-        if lowered is None:  # who is lowered is not served any more: by the rule, then
-            softer = [_at_gain(*each) for each in zip(requests, found.layers, gains, strict=True)]
-            lowered = answer(table, softer, fingers, playable=playable)
-        found = lowered
-        factor = within(found)
-    change = float(decibels(factor))
-    unfelt = {
-        number
-        for number, (then, now) in enumerate(zip(free.layers, found.layers, strict=True))
-        if now.promised_level_db_sl + change < 0 <= then.promised_level_db_sl
-    }
+def selection_of(
+    table: LocalizationTable,
+    found: Answer,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    *,
+    before: Mapping[tuple[ContactKey, int], Content],
+    shape: Shape = unshaped,
+    protected: frozenset[ContactKey] = frozenset(),
+    is_in_phase: bool = True,
+) -> Selection:
+    """Return the contents of an answer to the fingers of targets and quiet contacts.
+
+    before: what fingers feel now, whose phases are kept if is_in_phase.
+    """
 
     @cache
     def fields() -> Complex64Array:
-        places = [each.at for each in requests]
+        places = [each.finger.at for each in found.fingers[: len(targets)]]
         return table.unit_fields(np.array(places), contacts=places)
 
     contents: list[Content] = []
     skipped: list[Prediction] = []
-    for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
-        if layer.verdict == HELD_BACK:
-            skipped.append(_held_back(contact, layer))
-        elif number in unfelt:
-            skipped.append(not_served(contact, LIMITS_LEAVE_NOTHING))
-        elif layer.verdict != SHARED:
-            sharing = [
-                (*targets[other], one)
-                for other, one in enumerate(found.layers)
-                if one.verdict == SHARED
-                and one.excitation == layer.excitation
-                and other not in unfelt
-            ]
-            served = [(contact, target, layer), *sharing]
-            voices = [
-                replace(layer, excitation=tones) for tones in (layer.excitation, *layer.side_bands)
-            ]
-            is_continued = all(
-                (then := before.get((contact.key, voice))) is not None
-                and then.frequency == each.frequency
-                for voice, each in enumerate(voices)
-            )
-            carrier = before.get((contact.key, 0))
-            for voice, each in enumerate(voices):
-                pattern = _pattern(table, each, capabilities)
-                pattern = pattern.scaled(change) if change else pattern
-                if carrier is not None or layer.side_bands:
-                    then = carrier if is_continued else None
-                    pattern = _in_phase(pattern, then, fields(), number, table)
-                contents.append(
-                    _content(served, targets, quiet, pattern, is_continued, factor, shape, voice)
+    felt = [*zip(targets, found.fingers, strict=False)]
+    for (contact, _), each in felt:
+        if each.verdict == HELD_BACK:
+            skipped.append(_held_back(contact, each))
+        elif (reason := _why_unfelt(each)) is not None:
+            skipped.append(not_served(contact, reason))
+    for layer in found.layers:
+        served = [
+            (contact, target, felt[number][1])
+            for number in layer.fingers
+            for contact, target in (felt[number][0],)
+            if _why_unfelt(felt[number][1]) is None
+        ]
+        if not served:
+            continue
+        contact, placed = served[0][0], found.placement(layer)
+        voices = [replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations]
+        is_continued = all(
+            (then := before.get((contact.key, voice))) is not None
+            and then.frequency == played.frequency
+            for voice, played in enumerate(voices)
+        )
+        carrier = before.get((contact.key, 0))
+        for voice, played in enumerate(voices):
+            if layer.side_bands or (is_in_phase and carrier is not None):
+                then = carrier if is_continued else None
+                played = _in_phase(played, then, fields(), layer.fingers[0], table)
+            contents.append(
+                Content(
+                    tuple([(finger, target) for finger, target, _ in served]),
+                    placed,
+                    shape(placed, played, is_continued),
+                    () if voice else _predictions(served, layer),
+                    voice,
                 )
+            )
+    others = found.fingers[len(targets) :]
     return Selection(
         tuple(targets),
         tuple(quiet),
@@ -141,205 +154,119 @@ def query_jointly(
         None if contents else skipped[0].held_back,
         tuple(skipped),
         quiet_levels={
-            contact.key: felt.level_db_sl + change
-            for contact, felt in zip(quiet, found.quiet, strict=True)
+            contact.key: -math.inf if (level := each.foreign_level_db_sl) is None else level
+            for contact, each in zip(quiet, others, strict=True)
         },
         protected=protected,
     )
 
 
-def _as_layers_allow(requests: Sequence[Request], layers: int) -> list[Request]:
-    """The requests, steady where there are no layers for side bands, of low priority first.
+def _as_layers_allow(
+    fingers: Sequence[Finger], targets: int, capabilities: PlaybackCapabilities
+) -> list[Finger]:
+    """The fingers, steady where there are no layers for side bands, of low priority first.
 
     A layer is left to a click.
     """
-    found, spare = [*requests], layers - len(requests) - 1
-    for number in sorted(range(len(found)), key=lambda each: -found[each].priority):
-        if found[number].modulation_hz is not None:
+    found, spare = [*fingers], capabilities.layers - targets - 1
+    for number in sorted(range(targets), key=lambda each: -found[each].priority):
+        stimulus = found[number].stimulus
+        if stimulus is not None and stimulus.modulation_hz is not None:
             if spare >= _SIDE_BANDS:
                 spare -= _SIDE_BANDS
             else:
-                found[number] = replace(found[number], modulation_hz=None)
+                steady = replace(stimulus, modulation_hz=None)
+                found[number] = replace(found[number], stimulus=steady)
     return found
 
 
 def _kept(
-    requests: Sequence[Request],
+    fingers: Sequence[Finger],
     targets: Sequence[tuple[Contact, Target]],
     before: Mapping[tuple[ContactKey, int], Content],
-) -> list[Request]:
-    """The requests with the frequencies that fingers feel now, where their bands allow it."""
-    kept = []
-    for requested, (contact, _) in zip(requests, targets, strict=True):
-        each = requested
-        then = before.get((contact.key, 0))
+) -> list[Finger]:
+    """The fingers with the frequencies that they feel now, where their bands allow it."""
+    kept = [*fingers]
+    for number, (contact, _) in enumerate(targets):
+        then, stimulus = before.get((contact.key, 0)), fingers[number].stimulus
         frequency = None if then is None else then.frequency
-        low, high = each.band_hz
-        if frequency is not None and low <= frequency <= high:
-            each = replace(each, band_hz=(frequency, frequency))
-        kept.append(each)
+        if stimulus is None or frequency is None:
+            continue
+        low, high = stimulus.band_hz
+        if low <= frequency <= high:
+            tuned = replace(stimulus, band_hz=(frequency, frequency))
+            kept[number] = replace(fingers[number], stimulus=tuned)
     return kept
 
 
-def _answer(
-    table: LocalizationTable,
-    requests: Sequence[Request],
-    fingers: Sequence[Finger],
-    kept: Sequence[Request],
-    kept_within: float,
-    playable: tuple[float, float],
-) -> Answer:
-    """Answer with the kept frequencies, or with any where that is so much better [dB]."""
-    found = answer(table, kept, fingers, playable=playable)
-    worst, served = found.promised_worst_db, _served(found)
-    least = OWN_CONTRAST_DB if math.isfinite(kept_within) else -math.inf
-    is_good = served == len(requests) and (worst is None or worst >= least)
-    if is_good or list(kept) == list(requests):
-        return found
-    other = answer(table, requests, fingers, playable=playable)
-    gain = _worst(other) - _worst(found)
-    is_better = _served(other) > served or (_served(other) == served and gain >= kept_within)
-    return other if is_better else found
+def _lowered_db(found: Answer) -> float:
+    """By how much the weakest finger is weaker than asked."""
+    return max([each.lowered_db for each in found.fingers], default=0.0)
 
 
 def _served(found: Answer) -> int:
-    return sum(layer.verdict not in (HELD_BACK, SHARED) for layer in found.layers)
+    return len(found.layers)
 
 
 def _worst(found: Answer) -> float:
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
-def _tones_of(layer: Layer) -> tuple[Excitation, ...]:
-    """What plays of a layer; fingers that share have one."""
-    return () if layer.verdict in (HELD_BACK, SHARED) else (layer.excitation, *layer.side_bands)
+def felt_db_sl(felt: Sensation) -> float:
+    """Return the level of a finger: promised of what lasts, over its duration as modelled."""
+    stimulus = felt.finger.stimulus
+    lasts = stimulus is None or stimulus.duration is None
+    return felt.promised_level_db_sl if lasts else felt.level_db_sl
 
 
-def _gains_db(
-    requests: Sequence[Request],
-    found: Answer,
-    capabilities: PlaybackCapabilities,
-    strokes: Mapping[str, float],
-) -> list[float]:
-    """Gains on the layers of an answer by which they are within the amplifiers' limits.
+def _why_unfelt(felt: Sensation) -> str | None:
+    """Return why a finger would not feel what is played for it; None if it does."""
+    stimulus = felt.finger.stimulus
+    if felt.layer is None or stimulus is None:
+        return None
+    if stimulus.is_limit and felt.level_db_sl <= 0:
+        return NEIGHBOURS_LEAVE_NOTHING
+    return LIMITS_LEAVE_NOTHING if felt_db_sl(felt) < 0 <= stimulus.level_db_sl else None
 
-    As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
-    Power counts in shares of what all together would have.
-    """
-    each_layer = [amplitudes_of(_tones_of(each)) for each in found.layers]
-    amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
-    levels = amplitudes / [*strokes.values()]
-    norms = np.linalg.norm(levels, axis=1)
-    power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
-    full = amplitudes / [capabilities.max_amplitudes[name] for name in strokes]
-    limited = np.column_stack([full, power / math.sqrt(capabilities.max_power)])
-    served = np.flatnonzero(norms).tolist()
-    promised = np.array([found.layers[at].promised_level_db_sl for at in served])
-    factors, _ = share_stroke(
-        np.ones(len(served)),
-        limited[served].astype(np.complex64),
-        10 ** (promised / 20),
-        [requests[at].priority for at in served],
+
+def _predictions(
+    served: Sequence[tuple[Contact, Target, Sensation]], layer: Layer
+) -> tuple[Prediction, ...]:
+    """What is predicted of a layer's finger, and of those that share it."""
+    first, own, _ = served[0]
+    shares = (
+        f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
+        "apart"
     )
-    gains = np.maximum(decibels(np.maximum(factors, 1e-9)), _SILENT_DB)
-    return [
-        next(
-            (
-                float(gain)
-                for at, gain in zip(served, gains, strict=True)
-                if found.layers[at].excitation == layer.excitation
-            ),
-            0.0,
-        )
-        for layer in found.layers
-    ]
-
-
-def _at_gain(request: Request, layer: Layer, gain_db: float) -> Request:
-    """A request at the frequency of its layer, at a lower level."""
-    frequency = layer.frequency
-    band = request.band_hz if frequency is None else (frequency, frequency)
-    level = max(MIN_LEVEL_DB_SL, request.level_db_sl + gain_db)
-    return replace(request, level_db_sl=level, band_hz=band)
-
-
-def _pattern(table: LocalizationTable, layer: Layer, capabilities: PlaybackCapabilities) -> Pattern:
-    """A layer of an answer as a pattern; its quiet level is that which the contrast compares."""
-    nominal, promised = layer.felt_contrast_db, layer.promised_contrast_db
-    level, robust = layer.level_db_sl, layer.promised_level_db_sl
-    return Pattern(
-        layer.excitation,
-        ONSET_RAMP,
-        level,
-        None,
-        None if nominal is None else level - nominal,
-        capabilities.drive_mode,
-        robust_level_db_sl=robust,
-        robust_quiet_level_db_sl=None if promised is None else robust - promised,
-        robust_felt_contrast_db=promised,
-        median_felt_contrast_db=layer.median_felt_contrast_db,
-        threshold=table.threshold,
+    return tuple(
+        [
+            Prediction(
+                contact,
+                felt_db_sl(felt),
+                felt.contrast_db,
+                felt.verdict,
+                shares if felt.verdict == SHARED and contact is not first else None,
+                felt.promised_contrast_db,
+                felt.foreign_level_db_sl,
+                layer.frequency,
+                own.content,
+            )
+            for contact, _, felt in served
+        ]
     )
 
 
-def _content(
-    served: Sequence[tuple[Contact, Target, Layer]],
-    targets: Sequence[tuple[Contact, Target]],
-    quiet: Sequence[Contact],
-    pattern: Pattern,
-    is_continued: bool,
-    factor: float,
-    shape: Shape,
-    voice: int,
-) -> Content:
-    """A voice of the content of one finger and those that share it."""
-    own = {contact.key for contact, _, _ in served}
-    others = [contact for contact, _ in targets if contact.key not in own]
-    first = served[0][0]
-    question = question_of(
-        first, [*others, *quiet], level_db_sl=pattern.level_db_sl, drive_mode=pattern.drive_mode
-    )
-    change = float(decibels(factor))
-    predictions = tuple(
-        Prediction(
-            contact,
-            layer.promised_level_db_sl + change,
-            verdict=layer.verdict,
-            held_back=None
-            if layer is served[0][2]
-            else f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or "
-            "move them apart",
-            promised_contrast_db=layer.promised_contrast_db,
-            foreign_level_db_sl=_changed(layer.foreign_level_db_sl, change),
-            frequency=layer.frequency,
-            content=served[0][1].content,
-        )
-        for contact, _, layer in served
-    )
-    return Content(
-        tuple((contact, target) for contact, target, _ in served),
-        question,
-        shape(question, pattern, is_continued),
-        () if voice else predictions,
-        voice,
-    )
-
-
-def _changed(level_db_sl: float | None, change_db: float) -> float | None:
-    return None if level_db_sl is None else level_db_sl + change_db
-
-
-def _held_back(contact: Contact, layer: Layer) -> Prediction:
-    """What is said of a finger whose content is held back, and by how much."""
-    had = layer.promised_contrast_db
-    least = max(request.MIN_CONTRAST_DB, layer.request.min_contrast_db)
-    if layer.is_disturbing:
+def _held_back(contact: Contact, felt: Sensation) -> Prediction:
+    """What is said of a finger whose vibration is held back, and by how much."""
+    had = felt.promised_contrast_db
+    least = max(MIN_CONTRAST_DB, felt.finger.min_contrast_db)
+    if felt.is_disturbing:
         reason = "a protected finger would notice it; lower its level, or lift that finger"
     elif had is not None and had >= least:
         reason = (
             "too many contents for this plate: beside it another finger would not have had the "
-            f"{request.MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a "
-            "finger, move it away, or widen its band"
+            f"{MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a finger, move "
+            "it away, or widen its band"
         )
     else:
         figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
@@ -350,33 +277,33 @@ def _held_back(contact: Contact, layer: Layer) -> Prediction:
     return replace(
         not_served(contact, reason),
         promised_contrast_db=had,
-        foreign_level_db_sl=layer.foreign_level_db_sl,
+        foreign_level_db_sl=felt.foreign_level_db_sl,
     )
 
 
 def _in_phase(
-    pattern: Pattern,
+    layer: Layer,
     before: Content | None,
     fields: Complex64Array,
     number: int,
     table: LocalizationTable,
-) -> Pattern:
-    """Turn a pattern so that its finger feels it in the phase of the tone before, 0 without any.
+) -> Layer:
+    """Turn a layer so that its finger feels it in the phase of the tone before, 0 without any.
 
     Side bands in phase with their carrier modulate its amplitude, not its frequency: all have the
     phase of the carrier before. fields (f, eras, fingers): of each ERA at full stroke; number: of
     the finger.
     """
     fields = fields[:, :, number]
-    felt = _felt(pattern.excitation, fields, table)
+    felt = _felt(layer.excitation, fields, table)
     felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
     (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
     turned = {}
-    for name, tone in pattern.excitation.items():
+    for name, tone in layer.excitation.items():
         now = felt[tone.frequency]
         change = cmath.phase(then / now) if now and then else 0.0
         turned[name] = replace(tone, phase=tone.phase + change)
-    return replace(pattern, excitation=turned)
+    return replace(layer, excitation=turned)
 
 
 def _felt(

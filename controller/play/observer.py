@@ -9,8 +9,8 @@ from controller.play.decision import Decision
 from controller.play.playing import PlayedContent
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.answer.timing import Timing
 
 
@@ -46,8 +46,8 @@ class Applied:
         return [*self.contents.values()][-1]
 
     @property
-    def pattern(self) -> Pattern:
-        """The pattern of the newest content."""
+    def pattern(self) -> Layer:
+        """What plays of the newest content."""
         return self.newest.pattern
 
     @property
@@ -56,8 +56,8 @@ class Applied:
         return self.newest.drive
 
     @property
-    def question(self) -> Question:
-        """The question of the newest content."""
+    def question(self) -> Placement:
+        """Where the fingers of the newest content are, and all others."""
         return self.newest.content.question
 
     @cached_property
@@ -71,8 +71,13 @@ class Applied:
         is_alone = self.from_rest and len(self.contents) == 1
         if not (is_alone and self.quiet):
             return None
-        measured = self.timing.with_transient_measures(self.question, self.pattern)
-        return measured.transient_contrast_db
+        return self.timing.transient_contrast_db(self.pattern, self.question)
+
+    @property
+    def felt(self) -> Prediction | None:
+        """What the finger of the newest content is predicted to feel; None where none plays."""
+        every = [each for one in self.contents.values() for each in one.content.predictions[:1]]
+        return every[-1] if every else None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
-from model.answer.pattern import Pattern
+from model.answer.answer import Layer
 from model.rig.rig import Rig
 
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
@@ -42,7 +42,7 @@ class PlayedContent:
 
     content: Content
     set: PlateSet
-    pattern: Pattern
+    pattern: Layer
     drive: Drive = field(default_factory=dict)
     settled_at: float = math.inf
     confirmed_until: float = math.inf

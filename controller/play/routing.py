@@ -18,8 +18,8 @@ from controller.play.capabilities import EnvelopeSupport
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer import answer
+from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -63,12 +63,12 @@ class SetBuilder:
 
     def shape(
         self,
-        question: Question,
-        pattern: Pattern,
+        question: Placement,
+        pattern: answer.Layer,
         is_continued: bool,
         *,
         is_ended: bool = True,
-    ) -> Pattern:
+    ) -> answer.Layer:
         """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
 
         is_continued: whether it needs no onset; is_ended: whether it may have an ending.
@@ -84,13 +84,13 @@ class SetBuilder:
         adds_ending = has_ending and pattern.ending is None
         if not (adds_onset or adds_ending):
             return pattern
-        return self.timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
+        return self.timing.with_envelopes(pattern, question, onset=adds_onset, ending=adds_ending)
 
     def build_pattern(
         self,
         number: int,
-        pattern: Pattern,
-        question: Question,
+        pattern: answer.Layer,
+        question: Placement,
         *,
         playing: Drive,
         valid_for: float,
@@ -98,7 +98,7 @@ class SetBuilder:
         is_shaped: bool = True,
         lasts: float = math.inf,
         among: int = 1,
-    ) -> tuple[PlateSet, Pattern]:
+    ) -> tuple[PlateSet, answer.Layer]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
         playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless

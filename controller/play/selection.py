@@ -22,7 +22,7 @@ from controller.play.content import (
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import MAX_SEPARATE
+from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own

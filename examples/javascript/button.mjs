@@ -23,7 +23,7 @@ await era.arm().catch(fail);
 await era.touch(places);
 const pattern = await Promise.race([played, seconds(5)]);
 if (pattern) {
-  const contrast = pattern.predicted_felt_contrast_db;
+  const contrast = pattern.predicted_contrast_db;
   console.log(`ERAs ${Object.keys(pattern.drive).sort().join(", ")}`);
   console.log(contrast === null ? "one finger" : `felt contrast ${contrast.toFixed(1)} dB`);
   await seconds(1);

@@ -1,264 +1,322 @@
-"""One answer to the requests of all fingers, and what is done where not all can be served.
-
-A promise below the least contrast at the worst finger is not served as requested. In this order,
-and each only where the requests allow it: the nearest two fingers that may share feel one content;
-the finger of the lowest priority that need not be protected gives up content and protection; the
-content of the lowest priority is held back. Of many contents several of these steps are one. Where
-nothing reaches it, the best tried is served, but for bounds that requests state themselves: these
-hold, if by silence.
-"""
+"""What is played for fingers, and what each of them feels."""
 
 import math
-from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
-from model.answer.modulation import SAME_LEVEL, with_modulation
-from model.answer.request import (
-    ANY_BAND,
-    APART_HZ,
-    MIN_CONTRAST_DB,
-    Answer,
-    Finger,
-    Request,
-    check_requests,
-)
-from model.answer.search import Contents, Stream, Tones
-from model.answer.search_in_c import choose_tones
-from model.arguments import expect_between
-from model.choice import best_by, best_of
-from model.errors import InputError
-from model.table.table import LocalizationTable
+import numpy as np
 
-MAX_SEPARATE = 5
-"""Fingers that may share, up to which each has a content of its own at first.
+from model.answer.fingers import Finger, Placement
+from model.answer.over_duration import pulse_ramp
+from model.answer.search import Contents, Tones
+from model.arrays import Float32Array, FloatArray
+from model.drive_modes import UNRESTRICTED
+from model.drive_modes.tones import excitation_of
+from model.files.csv_file import as_frame
+from model.finger.perception import decibels
+from model.structure.attachments import Era
+from model.transients.base_motion import Envelopes
+from model.vibration.excitation import Excitation
 
-Of more, one content for all was the end in 34 of 36 sets with two quiet fingers.
+MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
+"""Promised contrast from which a vibration is served, and from which it is a finger's own."""
+
+IMPERCEPTIBLE_DB_SL = -10.0
+"""Level at which a finger stays unaware: ten decibels for the differences between people."""
+
+ONSET_RAMP = 0.040
+"""Duration of a plain ramp [s].
+
+Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
+at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
 """
 
-CONTENTS_A_STEP = 3
-"""Of so many contents one gives way before what is left is measured, at least one in all."""
+SAME_LEVEL = 0.1
+"""Difference of two levels that are one [dB]."""
 
+_SHORT_OF = 0.05  # dB; a level closer to the wanted one is reached
 
-def answer(
-    table: LocalizationTable,
-    requests: Sequence[Request],
-    fingers: Sequence[Finger] = (),
-    *,
-    apart_hz: float = APART_HZ,
-    bands_may_swap: bool = False,
-    min_contrast_db: float = MIN_CONTRAST_DB,
-    playable: tuple[float, float] = ANY_BAND,
-) -> Answer:
-    """Answer the requests of all fingers at once, each with a tone of its own.
-
-    fingers: those that are to feel nothing; apart_hz: distance of the contents' frequencies, where
-    their bands allow it; bands_may_swap: whether a content may have the band of another one;
-    min_contrast_db: below which the promise at the worst finger is not served as requested;
-    playable: lowest and highest frequency of side bands [Hz]. A content whose modulation would
-    leave a finger unserved, or whose side bands do not fit, is steady, as is a shared one. Levels
-    are lowered where the ERAs' stroke does not allow all: of the lower priorities first, of one
-    priority the louder ones first.
-    Raises InputError for requests that contradict each other, and a band without frequencies.
-    """
-    expect_between(apart_hz, 0.0, what="apart_hz")
-    check_requests(requests, fingers, table.plate)
-    answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
-    found = with_modulation(table, answering.solve(min_contrast_db), playable=playable)
-    played = [each for each in found.layers if each.excitation]
-    changed = [
-        f"content of {_at(each.request)} is steady"
-        for each in played
-        if each.request.modulation_hz is not None and not each.side_bands
-    ]
-    changed += [
-        f"content of {_at(each.request)} is lowered to {each.promised_level_db_sl:.1f} dB SL, "
-        "all that the ERAs' stroke allows"
-        for each in played
-        if each.promised_level_db_sl < each.request.level_db_sl - SAME_LEVEL
-        and each.verdict != "shared"
-    ]
-    return replace(found, applied=(*found.applied, *changed)) if changed else found
+OWN, MIXED, SHARED, HELD_BACK, QUIET = "own", "mixed", "shared", "held back", "quiet"
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """Which fingers, by index, feel which content and which are quiet.
+class Sensation:
+    """What a finger gets.
 
-    contents: the fingers of each, its own first; quiet: those that are protected; held: contents
-    given up, with the contrast that they would have had, and whether they would disturb a finger;
-    applied: what was changed, in words.
+    Promised measures are those that nine of ten plates within the rig's uncertainty reach, or do
+    not exceed; the others those of the plate as modelled, with the fingers on it.
+
+    - verdict: `own`, `mixed` (below OWN_CONTRAST_DB), `shared` (the vibration of another finger),
+      `held back`, with the contrast that it would have had, or `quiet`
+    - layer: number of the layer that plays it, None without one
+    - level_db_sl, promised_level_db_sl: of its stimulus, over the duration if that is limited
+    - contrast_db, median_contrast_db, promised_contrast_db: its level above that of all other
+      vibrations here, or of an only one above its own at the loudest quiet finger; of a quiet
+      finger the weakest vibration at its own finger above all of them here. As modelled, of half
+      and of nine of ten plates; None where there is nothing to compare with
+    - foreign_level_db_sl: of all other vibrations here, promised
+    - lowered_db: by how much it is weaker than its stimulus asks
+    - is_disturbing: whether it is held back because of a finger's max_foreign_db_sl
     """
 
-    contents: tuple[tuple[int, ...], ...]
-    quiet: tuple[int, ...]
-    held: tuple[tuple[int, float, bool], ...] = ()
-    applied: tuple[str, ...] = ()
+    finger: Finger
+    verdict: str
+    layer: int | None = None
+    level_db_sl: float = -math.inf
+    promised_level_db_sl: float = -math.inf
+    contrast_db: float | None = None
+    median_contrast_db: float | None = None
+    promised_contrast_db: float | None = None
+    foreign_level_db_sl: float | None = None
+    lowered_db: float = 0.0
+    is_disturbing: bool = False
 
 
 @dataclass(frozen=True)
-class _Answering:
-    """Requests and quiet fingers on a table's plate, numbered in this order."""
+class Layer:
+    """What is played at once for the fingers of one vibration, by number.
 
-    table: LocalizationTable
-    requests: tuple[Request, ...]
-    fingers: tuple[Finger, ...]
-    apart_hz: float
-    bands_may_swap: bool
+    excitation: of all ERAs; side_bands: excitations beside it where its strength comes and goes;
+    ramp [s]; onset, ending: envelopes that replace it; contrast_to_plate_db: level above that of
+    the plate farther than 50 mm, root mean square, where no other finger is there.
+    """
 
-    def solve(self, min_contrast_db: float) -> Answer:
-        """Change the plan until the worst finger has the contrast, else take the best tried."""
-        count = len(self.requests)
-        quiet = range(count, count + len(self.fingers))
-        plan = self._many_joined(_Plan(tuple(zip(range(count), strict=True)), tuple(quiet)))
-        tried = [found := self._measure(plan)]
-        while _is_out_of_bounds(found) or (
-            found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
-        ):
-            for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
-                plan = self._with_less(plan, found)
-            tried.append(found := self._measure(plan))
-        if not found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
-            return found
-        best = best_by([each for each in tried if not _is_out_of_bounds(each)], _worst_of)
-        below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
-        return replace(best, applied=(*best.applied, below))
+    excitation: Excitation
+    fingers: tuple[int, ...] = (0,)
+    side_bands: tuple[Excitation, ...] = ()
+    ramp: float = ONSET_RAMP
+    onset: Envelopes | None = None
+    ending: Envelopes | None = None
+    drive_mode: str = UNRESTRICTED
+    contrast_to_plate_db: float | None = None
 
-    def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
-        """The plan after the next step of the rule."""
-        requests, contents = self.requests, plan.contents
-        pairs = [
-            (one, other)
-            for number, one in enumerate(contents)
-            for other in contents[:number]
-            if all(requests[a].may_feel_one_with(requests[b]) for a in one for b in other)
+    @property
+    def frequency(self) -> float | None:
+        """Its frequency, without those of side bands [Hz]; None of several or where it is empty."""
+        frequencies = {tone.frequency for tone in self.excitation.values()}
+        return frequencies.pop() if len(frequencies) == 1 else None
+
+    @property
+    def excitations(self) -> tuple[Excitation, ...]:
+        """The excitation and its side bands."""
+        return (self.excitation, *self.side_bands)
+
+    def scaled(self, gain_db: float) -> "Layer":
+        """The layer louder by so much [dB]: contrasts stay."""
+        factor = 10 ** (gain_db / 20)
+        louder = [
+            {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
+            for each in self.excitations
         ]
-        if pairs:
-            near = [
-                -min(math.dist(requests[a].at, requests[b].at) for a in one for b in other)
-                for one, other in pairs
-            ]
-            return self._joined(plan, pairs[best_of(near)])
-        disturbed = found.disturbed[:1]
-        others = [each for each in contents if not {*disturbed}.intersection(each)]
-        least = min(requests[each[0]].priority for each in others)
-        lowest = [each for each in others if requests[each[0]].priority == least]
-        open_ = [
-            each for each in lowest if not any(requests[finger].is_protected for finger in each)
-        ]
-        given_up = (open_ or lowest)[-1]
-        had = [found.tones.contrast_db[finger][2] for finger in given_up]
-        verb = "is neither served nor protected" if open_ else "is held back"
-        return _Plan(
-            tuple(each for each in contents if each != given_up),
-            plan.quiet if open_ else (*plan.quiet, *given_up),
-            (
-                *plan.held,
-                *(
-                    (finger, -math.inf if math.isnan(each) else each, bool(disturbed))
-                    for finger, each in zip(given_up, had, strict=True)
-                ),
-            ),
-            (*plan.applied, f"content of {_at(requests[given_up[0]])} {verb}"),
-        )
+        return replace(self, excitation=louder[0], side_bands=tuple(louder[1:]))
 
-    def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
-        """The plan with some of its contents as one, that of the highest priority."""
-        one, *others = sorted(contents, key=lambda each: -self.requests[each[0]].priority)
-        fingers = sum(others, one)
-        at = _at(self.requests[one[0]])
-        return replace(
-            plan,
-            contents=tuple(
-                fingers if each == one else each for each in plan.contents if each not in others
-            ),
-            applied=(
-                *plan.applied,
-                *(f"{_at(self.requests[each[0]])} shares the content of {at}" for each in others),
-            ),
-        )
 
-    def _many_joined(self, plan: _Plan) -> _Plan:
-        """The plan with one content for more than MAX_SEPARATE fingers that may all share."""
-        groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
-        for content in plan.contents:
-            request = self.requests[content[0]]
-            if request.may_feel_one_with(request):
-                groups[request.may_share or str(request.content)].append(content)
-        for group in groups.values():
-            if len(group) > MAX_SEPARATE:
-                plan = self._joined(plan, group)
-        return plan
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What is played for fingers, and what each of them feels.
+
+    asked: the fingers; contents: that are played, and who is kept quiet; tones: of these; held:
+    vibrations given up, by finger, with the contrast that they would have had, and whether they
+    would disturb a finger; applied: what was changed, in words; envelopes: onset and ending of each
+    layer, if shaped; eras, frequencies [Hz], thresholds [m/s²]: of the table.
+    """
+
+    asked: tuple[Finger, ...]
+    contents: Contents
+    tones: Tones
+    held: tuple[tuple[int, float, bool], ...]
+    applied: tuple[str, ...]
+    eras: tuple[Era, ...]
+    frequencies: FloatArray
+    thresholds: Float32Array
+    envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
 
     @cached_property
-    def _every(self) -> list[Request | Finger]:
-        return [*self.requests, *self.fingers]
-
-    @cached_property
-    def _bands(self) -> list[tuple[int, int]]:
-        """The first of the rows that each request may have, and one past the last."""
-        frequencies, bands = self.table.frequencies.tolist(), []
-        for request in self.requests:
-            low, high = request.band_hz
-            first, end = bisect_left(frequencies, low), bisect_right(frequencies, high)
-            if first == end:
-                nearest = min(frequencies, key=lambda each: abs(each - low))
-                raise InputError(
-                    f"band of {_at(request)} must be LOW-HIGH in Hz and hold a frequency of the "
-                    f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
-                    f"is the nearest, got {low:g}-{high:g}"
+    def fingers(self) -> tuple[Sensation, ...]:
+        """What each finger gets, in the order in which they were given."""
+        found, tones = dict[int, Sensation](), self.tones
+        for number, stream in enumerate(self.contents.streams):
+            lowered = self.lowered_db(number)
+            for finger in stream.targets:
+                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                level, promised_level = tones.level_db_sl[finger]
+                found[finger] = Sensation(
+                    self.asked[finger],
+                    SHARED if finger != stream.targets[0] else verdict_of(promised),
+                    number,
+                    level,
+                    promised_level,
+                    contrast,
+                    median,
+                    promised,
+                    _known(tones.foreign_db_sl[finger]),
+                    lowered,
                 )
-            bands.append((first, end))
-        return bands
+        for finger, had, is_disturbing in self.held:
+            found[finger] = Sensation(
+                self.asked[finger],
+                HELD_BACK,
+                promised_contrast_db=had,
+                foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                is_disturbing=is_disturbing,
+            )
+        for finger, each in enumerate(self.asked):
+            if each.stimulus is None:
+                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                found[finger] = Sensation(
+                    each,
+                    QUIET,
+                    contrast_db=contrast,
+                    median_contrast_db=median,
+                    promised_contrast_db=promised,
+                    foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                )
+        return tuple([found[number] for number in range(len(self.asked))])
 
-    def _contents(self, plan: _Plan) -> Contents:
-        """A plan for a kernel."""
-        bands, streams, background = self._bands, [], None
-        for fingers in plan.contents:
-            own = tuple(bands) if self.bands_may_swap else (bands[fingers[0]],)
-            request = self.requests[fingers[0]]
-            level, priority = request.level_db_sl, request.priority
-            for finger in fingers[1:]:
-                request = self.requests[finger]
-                level = max(level, request.level_db_sl)
-                priority = max(priority, request.priority)
-            streams.append(Stream(fingers, level, own, priority))
-        if len(streams) == 1 and not plan.quiet:
-            places = [self.requests[finger].at for finger in streams[0].targets]
-            background = self.table.background(places)
-        return Contents(
-            tuple([each.at for each in self._every]),
-            tuple([each.load for each in self._every]),
-            tuple(streams),
-            plan.quiet,
-            self.apart_hz,
-            background=background,
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """What is played, a layer for each vibration."""
+        layers, least = [], self.contents.least_ramp
+        for number, stream in enumerate(self.contents.streams):
+            excitation, *sides = self._excitations(number)
+            duration = self.contents.durations[number]
+            onset, ending = self.envelopes[number] if self.envelopes else (None, None)
+            layers.append(
+                Layer(
+                    excitation,
+                    stream.targets,
+                    tuple(sides),
+                    ONSET_RAMP if duration is None else max(pulse_ramp(duration), least),
+                    onset,
+                    ending,
+                    self.contents.drive_mode,
+                    self._contrast_to_plate_db,
+                )
+            )
+        return tuple(layers)
+
+    def placement(self, layer: Layer) -> Placement:
+        """Where the fingers of a layer are, and all others."""
+        others = [n for n in range(len(self.asked)) if n not in layer.fingers]
+        asked = self.asked
+        return Placement(
+            tuple([asked[n].at for n in layer.fingers]),
+            tuple([asked[n].at for n in others]),
+            tuple([asked[n].load for n in (*layer.fingers, *others)]),
         )
 
-    def _measure(self, plan: _Plan) -> Answer:
-        """What fingers feel of a plan's contents."""
-        contents, applied = self._contents(plan), plan.applied
-        if contents.streams:
-            tones = choose_tones(self.table, contents)
-        else:
-            tones = Tones.none(len(contents.places))
-        if not tones.is_apart:
-            applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        given = self.requests, self.fingers, contents, tones, plan.held, applied
-        return Answer(*given, self.table.eras, self.table.frequencies)
+    def lowered_db(self, number: int) -> float:
+        """By how much a layer, by its number, is weaker than its stimulus asks [dB]."""
+        stream = self.contents.streams[number]
+        lasts, short = stream.duration is None, -math.inf
+        for finger in stream.targets:
+            stimulus = self.asked[finger].stimulus
+            if stimulus is not None:
+                given = self.tones.level_db_sl[stream.targets[0]][lasts]
+                short = max(short, stimulus.level_db_sl - given)
+        return short if short > SAME_LEVEL else 0.0
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether all vibrations have their levels on the plate as modelled."""
+        return all(
+            self.tones.level_db_sl[finger][0] >= stream.level_db_sl - _SHORT_OF
+            for stream in self.contents.streams
+            for finger in stream.targets
+        )
+
+    @property
+    def amplitudes(self) -> dict[str, float]:
+        """Amplitude of each ERA [m], of all that plays together."""
+        return amplitudes_of([each for layer in self.layers for each in layer.excitations])
+
+    @property
+    def promised_worst_db(self) -> float | None:
+        """The least contrast of all fingers, on nine of ten plates; None for one finger alone."""
+        return _known(self.tones.worst_db)
+
+    @property
+    def lacks_contrast(self) -> bool:
+        """Whether a finger has less contrast to others' vibrations than it asks for."""
+        targets = [finger for stream in self.contents.streams for finger in stream.targets]
+        found, asked = self.tones.contrast_db, self.asked
+        return any(found[each][2] < asked[each].min_contrast_db for each in targets)
+
+    @property
+    def disturbed(self) -> list[int]:
+        """Fingers, by number, that would feel more of others' vibrations than they allow."""
+        levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=True))
+        return [finger for finger, (level, each) in levels if level > each.max_foreign_db_sl]
+
+    @property
+    def stroke_factor(self) -> float:
+        """Of the requested levels what the ERAs' stroke allows, 1 for all."""
+        return self.tones.stroke_factor
+
+    def _excitations(self, content: int) -> list[Excitation]:
+        """The tones of a content, its carrier first; in other modes than `phased` they are one."""
+        tones, on = self.tones, (self.eras, self.frequencies)
+        every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
+        own = [(row, weights, gain) for row, weights, gain, owner in every if owner == content]
+        if self.contents.drive_mode != UNRESTRICTED:
+            drive = [(row, weights) for row, weights, _ in own]
+            return [excitation_of(drive, *on, gain=own[0][2])]
+        return [excitation_of([(row, weights)], *on, gain=gain) for row, weights, gain in own]
+
+    @property
+    def _contrast_to_plate_db(self) -> float | None:
+        """Level of the weakest target above that of the rest of the plate; None beside others."""
+        background, tones = self.contents.background, self.tones
+        if background is None:
+            return None
+        power = 1e-60
+        every = zip(tones.rows, tones.weights, tones.gains, strict=True)
+        for row, weights, gain in every:
+            w = np.multiply(gain, weights)
+            around = max(float(np.vdot(w, background[row] @ w).real), 0.0)
+            power += around / float(self.thresholds[row]) ** 2
+        (stream,) = self.contents.streams
+        level = min([tones.level_db_sl[finger][0] for finger in stream.targets])
+        return level - float(decibels(math.sqrt(power)))
+
+    def to_frame(self) -> Any:
+        """What each finger feels as a pandas DataFrame, a row a finger; needs pandas."""
+        at, found = np.array([each.at for each in self.asked]), self.fingers
+        frequencies = [layer.frequency or math.nan for layer in self.layers]
+        none = math.nan
+        return as_frame(
+            {
+                "x_m": at[:, 0],
+                "y_m": at[:, 1],
+                "verdict": [each.verdict for each in found],
+                "frequency_hz": [
+                    none if each.layer is None else frequencies[each.layer] for each in found
+                ],
+                "promised_level_db_sl": [each.promised_level_db_sl for each in found],
+                "promised_contrast_db": [each.promised_contrast_db for each in found],
+                "foreign_level_db_sl": [each.foreign_level_db_sl for each in found],
+            }
+        )
 
 
-def _is_out_of_bounds(found: Answer) -> bool:
-    """Whether a finger has less contrast, or more of others' contents, than it allows."""
-    is_one_of_many = len(found.contents.streams) > 1  # one alone cannot give way to others
-    return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
+def _known(figure: float) -> float | None:
+    """A figure, None for one that there is not."""
+    return None if math.isnan(figure) else figure
 
 
-def _worst_of(found: Answer) -> float:
-    return math.inf if found.promised_worst_db is None else found.promised_worst_db
+def verdict_of(promised_contrast_db: float | None) -> str:
+    """Return whether a vibration of a contrast is a finger's own or mixed with others."""
+    is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
+    return OWN if is_own else MIXED
 
 
-def _at(request: Request) -> str:
-    return f"({request.at[0]:g}, {request.at[1]:g}) m"
+def amplitudes_of(excitations: Iterable[Excitation]) -> dict[str, float]:
+    """Return the amplitudes [m] of excitations together, by ERA."""
+    total = defaultdict[str, float](float)
+    for tones in excitations:
+        for name, tone in tones.items():
+            total[name] += tone.amplitude
+    return total

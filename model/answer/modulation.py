@@ -12,12 +12,11 @@ from functools import cache
 
 import numpy as np
 
-from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.promised import promised, share_stroke
-from model.answer.request import APART_HZ, MIN_CONTRAST_DB, Answer
-from model.answer.search import Stream, Tones
+from model.answer.answer import MIN_CONTRAST_DB, SAME_LEVEL, Answer
+from model.answer.promised import share_stroke, with_tones
+from model.answer.search import APART_HZ, Stream, Tones
 from model.answer.search_in_c import choose_tones
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray
 from model.choice import NEARLY, best_of
 from model.finger.perception import decibels
 from model.table.table import LocalizationTable
@@ -26,7 +25,6 @@ _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
 _ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # of all three above the carrier
 _NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table
 _SAME = 0.5  # Hz; by which both side bands may differ in distance from the carrier
-SAME_LEVEL = 0.1  # dB
 _ROUNDING_DB = 1e-3  # of a promise that stays the same
 
 
@@ -36,16 +34,16 @@ def with_modulation(
     *,
     playable: tuple[float, float],
 ) -> Answer:
-    """Return an answer modulated as its requests say, where that leaves all fingers served.
+    """Return an answer modulated as its fingers ask, where that leaves all fingers served.
 
     playable: lowest and highest frequency [Hz] of side bands. These are as far below as above the
     carrier, where the table has a frequency nearest to the modulation, and APART_HZ from all tones
     of other contents. A shared content is steady. Levels are lowered to what the stroke allows.
     """
     for number, stream in enumerate(found.contents.streams):
-        request, tones = found.requests[stream.targets[0]], found.tones
-        modulation = request.modulation_hz
-        if modulation is None or len(stream.targets) > 1:
+        stimulus, tones = found.asked[stream.targets[0]].stimulus, found.tones
+        modulation = None if stimulus is None else stimulus.modulation_hz
+        if stimulus is None or modulation is None or len(stream.targets) > 1:
             continue
         alone = cache(_alone_at(table, found, number))
         limits = max(playable[0], table.frequencies[0]), min(playable[1], table.frequencies[-1])
@@ -54,14 +52,14 @@ def with_modulation(
         tried = [
             each
             for each in _carriers(table, int(rows[owners == number][0]), modulation)
-            if _fits(table.frequencies[each], modulation, request.band_hz, limits, taken)
+            if _fits(table.frequencies[each], modulation, stimulus.band_hz, limits, taken)
         ]
         if not tried:
             continue
         best = tried[best_of([_contrast_db([alone(row) for row in each]) for each in tried])]
         own, kept = [alone(row) for row in best], np.flatnonzero(owners != number)
         shares = _SHARES * 10 ** (-_ALL_DB / 20) * [each.gains[0] for each in own]
-        modulated = _with_tones(
+        modulated = with_tones(
             table,
             found,
             np.append(rows[kept], best),
@@ -70,25 +68,12 @@ def with_modulation(
             np.append(np.array(tones.gains)[kept], shares),
         )
         modulated = _within_stroke(table, modulated)
-        if _is_served(modulated, found):
+        if is_served(modulated, found):
             found = modulated
     return found
 
 
-def with_gains(table: LocalizationTable, found: Answer, gains_db: Sequence[float]) -> Answer | None:
-    """Return an answer with a gain on each layer, None where a finger would not be served.
-
-    Fingers that share a content have one gain.
-    """
-    tones = found.tones
-    gains = 10 ** (np.array([gains_db[each.targets[0]] for each in found.contents.streams]) / 20)
-    owners = np.array(tones.owners, dtype=int)
-    every = np.array(tones.rows, dtype=int), tones.weights, owners, gains[owners] * tones.gains
-    lowered = _with_tones(table, found, *every)
-    return lowered if _is_served(lowered, found) else None
-
-
-def _is_served(found: Answer, steady: Answer) -> bool:
+def is_served(found: Answer, steady: Answer) -> bool:
     """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
     worst, before = found.promised_worst_db, steady.promised_worst_db
     if (
@@ -127,13 +112,14 @@ def _fits(
 
 def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
     """Finds a content's tone at a row of the table's frequencies, all other fingers quiet."""
-    (finger,), contents = found.contents.streams[number].targets, found.contents
+    stream, contents = found.contents.streams[number], found.contents
+    (finger,) = stream.targets
     others = tuple(n for n in range(len(contents.places)) if n != finger)
     background = None if others else table.background([contents.places[finger]])
 
     def alone(row: int) -> Tones:
-        stream = Stream((finger,), found.requests[finger].level_db_sl, ((row, row + 1),))
-        asked = replace(contents, streams=(stream,), quiet=others, background=background)
+        one = Stream((finger,), stream.level_db_sl, ((row, row + 1),))
+        asked = replace(contents, streams=(one,), quiet=others, background=background)
         return choose_tones(table, asked)
 
     return alone
@@ -157,23 +143,7 @@ def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
     priorities = [each.priority for each in streams]
     factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
     if factor < 1 - NEARLY:
-        found = _with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
+        found = with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
     least_db = float(decibels(levels * factors / found.contents.levels).min())
     of_all = 1.0 if least_db > -SAME_LEVEL else 10 ** (least_db / 20)
     return replace(found, tones=replace(found.tones, stroke_factor=of_all))
-
-
-def _with_tones(
-    table: LocalizationTable,
-    found: Answer,
-    rows: IntArray,
-    weights: Sequence[Sequence[complex]],
-    owners: IntArray,
-    gains: FloatArray,
-) -> Answer:
-    """The answer with other tones, and what these promise together, on the same plates."""
-    contents = found.contents
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
-    of_tones = rows, np.array(weights, dtype=np.complex64), owners
-    tones = promised(fingers, contents, *of_tones, gains=gains)
-    return replace(found, tones=replace(tones, stroke_factor=found.stroke_factor))

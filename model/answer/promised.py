@@ -1,20 +1,49 @@
 """What fingers feel of the tones of all contents on drawn plates, and what is promised of it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer
 from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.over_duration import on_drawn_plates, shaped_gain
+from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.search import PROMISED_PERCENTILE, Contents, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import NEARLY
 from model.ensemble.draws import PROMISED_DRAWS
 from model.ensemble.measures import percentile
 from model.finger.perception import decibels
+from model.table.table import LocalizationTable
+
+MIN_RAISED_CONTRAST_DB = 6.0
+"""Contrast over an effect down to which its drive is raised: quiet fingers feel half of it."""
 
 _TINY = 1e-20
+
+
+def with_tones(
+    table: LocalizationTable,
+    found: Answer,
+    rows: IntArray,
+    weights: Sequence[Sequence[complex]],
+    owners: IntArray,
+    gains: FloatArray | None,
+) -> Answer:
+    """The answer with other tones, and what these promise together, on the same plates.
+
+    gains: None for those to the contents' levels.
+    """
+    contents = found.contents
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
+    of_tones = rows, np.array(weights, dtype=np.complex64), owners
+    ringing = RingingUnderFingers.of_streams(table, contents)
+    tones = promised(fingers, contents, *of_tones, gains=gains, ringing=ringing)
+    factor = tones.stroke_factor if gains is None else found.stroke_factor
+    return replace(found, tones=replace(tones, stroke_factor=factor))
 
 
 def promised(
@@ -26,16 +55,22 @@ def promised(
     *,
     is_apart: bool = True,
     gains: FloatArray | None = None,
+    ringing: Sequence[RingingUnderFingers | None] = (),
 ) -> Tones:
     """What fingers feel of tones at rows (m,) of weights (m, n), at gains (m,).
 
-    owners (m,): the content of each tone; gains: None for those to the contents' levels.
+    owners (m,): the content of each tone; gains: None for those to the contents' levels; ringing:
+    of the contents that have a duration.
     """
     shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
-    power = fingers.powers(PROMISED_DRAWS, rows, weights)
+    steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
+    if any(stream.duration is not None for stream in streams):
+        power = _over_durations(fingers, contents, steady, rows, weights, owners, ringing)
     by_tone, factor = gains, 1.0
     if by_tone is None:
-        of_contents, factor = _gains_to_levels(contents, power, shares, weights, owners)
+        of_contents, factor = _gains_to_levels(
+            contents, power, steady, shares, rows, weights, owners
+        )
         by_tone = of_contents[owners]
     power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
     contrast, level, of_others = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
@@ -79,24 +114,71 @@ def promised(
     )
 
 
+def _over_durations(
+    fingers: FingersOnPlate,
+    contents: Contents,
+    steady: Float32Array,
+    rows: IntArray,
+    weights: Complex64Array,
+    owners: IntArray,
+    ringing: Sequence[RingingUnderFingers | None],
+) -> Float32Array:
+    """Power (m, k, p, d) of tones over the durations of their contents."""
+    power, table = steady.copy(), fingers.table
+    strokes = np.array([era.stroke for era in table.eras])
+    for tone, owner in enumerate(owners.tolist()):
+        stream, over = contents.streams[owner], ringing[owner]
+        if stream.duration is None:
+            continue
+        if over is None:  # along a shaped onset
+            power[tone] *= np.float32(shaped_gain(stream.duration) ** 2)
+            continue
+        frequency = float(table.frequencies[rows[tone]])
+        felt, own = over.over([(frequency, weights[tone] * strokes)]), [*stream.targets]
+        at_targets = power[tone, own] * np.square(felt.gains[own])[:, None, None]
+        power[tone] = on_drawn_plates(steady[tone], felt.heard, felt.gains[own].min())
+        power[tone, own] = at_targets
+    return power
+
+
 def _gains_to_levels(
     contents: Contents,
     power: Float32Array,
+    steady: Float32Array,
     shares: Float32Array,
+    rows: IntArray,
     weights: Complex64Array,
     owners: IntArray,
 ) -> tuple[FloatArray, float]:
     """Gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`."""
-    streams, levels = contents.streams, contents.levels
+    streams, levels = contents.streams, contents.levels.astype(float)
     alone = np.arange(len(owners))  # as if each had a frequency of its own
-    own = [
-        promise(felt_amplitudes(power, shares, alone, owners == j, s.targets))
-        for j, s in enumerate(streams)
-    ]
+    gains = np.empty(len(streams))
+    for j, stream in enumerate(streams):
+        felt = felt_amplitudes(power, shares, alone, owners == j, stream.targets)
+        if stream.duration is None:
+            gains[j] = levels[j] / max(promise(felt), 1e-30)
+            continue
+        lasting = felt_amplitudes(steady, shares, alone, owners == j, stream.targets)
+        gains[j] = levels[j] / max(felt[0], 1e-30)
+        if others := contents.others(j):
+            at = [loudest_power(power[owners == j], rows[owners == j], each) for each in others]
+            contrast = promise(felt / np.sqrt(np.maximum(np.max(at, axis=0), _TINY)))
+            allowed = _allowed_gain(levels[j], float(felt[0]), contrast)
+            gains[j] = min(gains[j], max(allowed, levels[j] / max(promise(lasting), 1e-30)))
     drives = np.zeros((len(streams), weights.shape[1]))
     np.add.at(drives, owners, np.abs(weights))
     priorities = [stream.priority for stream in streams]
-    return share_stroke(levels / np.maximum(own, 1e-30), drives, levels.astype(float), priorities)
+    return share_stroke(gains, drives, levels, priorities)
+
+
+def _allowed_gain(level: float, felt: float, contrast: float) -> float:
+    """Gain up to which quiet fingers allow a short stimulus: they feel half of it at most.
+
+    Or nothing. level: of it, felt: of its drive, as amplitudes to threshold, contrast: promised.
+    """
+    highest = max(level * 10 ** (-MIN_RAISED_CONTRAST_DB / 20), 10 ** (IMPERCEPTIBLE_DB_SL / 20))
+    return highest * contrast / max(felt, 1e-30)
 
 
 def share_stroke(

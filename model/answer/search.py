@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
+from model.drive_modes import UNRESTRICTED
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.
@@ -44,6 +45,9 @@ MAX_COMBINATIONS, PRUNING_STEP = 200, 4
 """Combinations of candidates that are kept for the next content and the choice, by some draws; of
 more than four contents fewer, so that time grows with the square of their number."""
 
+APART_HZ = 30.0
+"""Distance of the frequencies of two contents: nearer ones would be felt to beat."""
+
 REACHED = 1 - 1e-5
 """Of a level, what counts as reached."""
 
@@ -53,13 +57,17 @@ class Stream:
     """A content for fingers, by index, at a level; higher priorities take the stroke first.
 
     bands: of the table's frequencies that it may have the first and one past the last, by row, for
-    each band (one unless bands may be exchanged).
+    each band (one unless bands may be exchanged); duration [s]: over which the level is felt, None
+    for one that lasts; limit_db_sl: up to which it is as strong as the others allow, None for the
+    level itself.
     """
 
     targets: tuple[int, ...]
     level_db_sl: float
     bands: tuple[tuple[int, int], ...]
     priority: int = 0
+    duration: float | None = None
+    limit_db_sl: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,9 @@ class Contents:
 
     places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
     by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
-    of the rest of the plate at all of the table's frequencies, for no other finger.
+    of the rest of the plate at all of the table's frequencies, for no other finger; drive_mode: any
+    but UNRESTRICTED has one content; is_shaped: whether onsets are shaped, along which nothing
+    rings; least_ramp [s]: of short ones, which are a quarter of their duration else.
     """
 
     places: tuple[Point, ...]
@@ -77,12 +87,20 @@ class Contents:
     quiet: tuple[int, ...]
     apart_hz: float = 0.0
     background: Complex64Array | None = None
+    drive_mode: str = UNRESTRICTED
+    is_shaped: bool = False
+    least_ramp: float = 0.0
 
     @property
     def is_ranked(self) -> bool:
         """Whether the KEPT frequencies are searched first: of one content for one finger."""
         first = self.streams[0]
         return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
+
+    @property
+    def durations(self) -> list[float | None]:
+        """Of each content along a plain ramp [s], None for those that last or are shaped."""
+        return [None if self.is_shaped else stream.duration for stream in self.streams]
 
     @property
     def candidates(self) -> int:

@@ -28,7 +28,7 @@ from model.compiled.structures import (
     TouchedPlates,
     WeightSearch,
 )
-from model.drive_modes import coherent
+from model.drive_modes import UNRESTRICTED, coherent
 from model.drive_modes.forms import LEVEL_MARGIN
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
 from model.ensemble.measures import PERCENTILE
@@ -49,8 +49,9 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
             bands += band
         priorities.append(stream.priority)
         levels.append(10 ** (stream.level_db_sl / 20))
-    if by is None:
-        return choose_by_numpy(table, contents)
+    is_here = contents.drive_mode == UNRESTRICTED
+    if by is None or not is_here or any(stream.duration for stream in streams):
+        return choose_by_numpy(table, contents, by_kernel=by is not None)
     count, n, k = len(streams), len(table.eras), len(places)
     kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
     plates, raster, rules, by_count = kept

@@ -1,21 +1,39 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.answer.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
+from model.answer.fingers_on_plate import (
+    CENTRE_AND_FOUR,
+    MAX_FINGERS_BY_POINT,
+    FingerForms,
+    FingersOnPlate,
+)
+from model.answer.over_duration import forms_of, forms_over, on_drawn_plates
 from model.answer.promised import promised
+from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_few, best_first, best_of
-from model.drive_modes.coherent import search, search_all, search_to_level
-from model.drive_modes.forms import Forms
+from model.drive_modes import UNRESTRICTED
+from model.drive_modes.coherent import (
+    NEARLY_HIGHEST,
+    CoherentResult,
+    search,
+    search_all,
+    search_to_level,
+)
+from model.drive_modes.forms import Drive, Forms
+from model.drive_modes.switched import find_switched, max_sensation_switched
 from model.ensemble.draws import JUDGING_DRAWS
 from model.ensemble.measures import percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
+
+MAX_DURING_EFFECT, MAX_ALONE = 3, 4
+"""Candidates of a short effect, and as many at their frequencies; without a quiet finger."""
 
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
@@ -23,33 +41,52 @@ _BATCH = 64  # candidates that are judged at once
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidates (m,) of all contents: of which stream and band, row, score, weights (m, n)."""
+    """Candidates (m,) of all contents: of which stream and band, score, and the tones of each."""
 
     streams: IntArray
     bands: IntArray
-    rows: IntArray
     scores: FloatArray
-    weights: Complex64Array
+    drives: Sequence[Drive]
+
+    @property
+    def rows(self) -> IntArray:
+        """The row of the first tone of each."""
+        return np.array([drive[0][0] for drive in self.drives], dtype=int)
 
 
-def choose_by_numpy(table: LocalizationTable, contents: Contents) -> Tones:
-    """Choose a tone for each content, and find what it promises."""
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
-    rows = contents.rows
-    kept = ranked(fingers, contents) if contents.is_ranked else rows
-    found, is_limited = _candidates(fingers, contents, kept)
-    if len(kept) < len(rows) and (not len(found.rows) or is_limited):
-        found, is_limited = _candidates(fingers, contents, rows)
-    own, loudest = _judged(fingers, contents, found)
+def choose_by_numpy(
+    table: LocalizationTable, contents: Contents, *, by_kernel: bool = False
+) -> Tones:
+    """Choose tones for each content, and find what they promise.
+
+    by_kernel: whether the fingers' weight on the plate is solved in C.
+    """
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
+    ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
+    if contents.drive_mode == UNRESTRICTED:
+        kept = ranked(fingers, contents) if contents.is_ranked and not any(ringing) else rows
+        found, is_limited = _candidates(fingers, contents, kept, ringing)
+        if len(kept) < len(rows) and (not found.drives or is_limited):
+            found, is_limited = _candidates(fingers, contents, rows, ringing)
+    else:
+        found = _switched_candidates(fingers, contents, ringing[0])
+    least, own, loudest = _judged(fingers, contents, found, ringing)
     best, is_apart = np.zeros(1, dtype=int), True
     if len(contents.streams) > 1:
         best, is_apart = best_combination(table, contents, found, own, loudest)
-    elif len(found.rows) > 1:
+    elif len(found.drives) > 1:
         quiet = loudest[:, [*contents.quiet]]
         level = float(contents.levels[0])
-        best[0] = best_tone(level, found.scores, own, quiet)
-    rows, weights = found.rows[best], found.weights[best]
-    return promised(fingers, contents, rows, weights, np.arange(len(rows)), is_apart=is_apart)
+        best[0] = best_tone(level, found.scores, own, quiet, least)
+    tones = tones_of([found.drives[each] for each in best.tolist()])
+    return promised(fingers, contents, *tones, is_apart=is_apart, ringing=ringing)
+
+
+def tones_of(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]:
+    """Rows (m,), weights (m, n) of the tones of drives, and the number of each one's drive (m,)."""
+    tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
+    rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
+    return rows, weights, owners
 
 
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
@@ -78,13 +115,16 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
 
 
 def _candidates(
-    fingers: FingersOnPlate, contents: Contents, rows: IntArray
+    fingers: FingersOnPlate,
+    contents: Contents,
+    rows: IntArray,
+    ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Candidates, bool]:
     """The best tones of each content in each band, and whether a level was hard to reach."""
     count, hertz = len(contents.streams), fingers.table.frequencies
-    formed = fingers.forms(rows, with_fine=True)
+    formed = fingers.forms(rows, with_fine=None in ringing)
     apart_hz = contents.apart_hz if count > 1 else 0.0
-    found: list[tuple[int, int, int, float, Complex64Array]] = []
+    found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
@@ -93,6 +133,10 @@ def _candidates(
             here = formed.at(np.flatnonzero((rows >= low) & (rows < end)))
             rest = None if contents.background is None or others else contents.background[here.rows]
             asked = here.of(stream.targets, others, level, rest)
+            if (over := ringing[number]) is not None:
+                short = _short_candidates(asked, here, stream.targets, others, over)
+                found += [(number, band, score, drive) for score, drive in short]
+                continue
             searched, forms = search_to_level(asked)
             is_limited |= len(searched.level_limited) > 0 or forms is not asked
             ways = [searched]
@@ -100,10 +144,82 @@ def _candidates(
                 ways.append(search(here.by_point(forms, others)))
             for way in ways:
                 for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
-                    score, weights = float(way.score[each]), way.weights[each]
-                    found.append((number, band, int(here.rows[each]), score, weights))
-    parts = zip(*found, strict=True) if found else ((),) * 5
-    return Candidates(*(np.array(part) for part in parts)), is_limited
+                    drive = [(int(here.rows[each]), way.weights[each])]
+                    found.append((number, band, float(way.score[each]), drive))
+    streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
+    return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _short_candidates(
+    steady: Forms,
+    formed: FingerForms,
+    targets: Sequence[int],
+    others: Sequence[int],
+    over: RingingUnderFingers,
+) -> list[tuple[float, Drive]]:
+    """The best tones over a duration, and at their frequencies those with the fingers' weight.
+
+    Ringing under the fingers takes too long to solve at every frequency. steady: forms to search
+    for a vibration that lasts.
+    """
+    count = MAX_DURING_EFFECT if others else MAX_ALONE
+    found, _ = search_to_level(_forms_over(steady, formed, targets, others, over))
+    best = _drives_of(found, formed.rows, best_first(found.score)[:count])
+    if not others:
+        return best
+    rows = np.unique([row for _, ((row, _),) in best])
+    some, responses = np.searchsorted(formed.rows, rows), over.responses(rows)
+    during = forms_of(
+        steady.at(some), formed.at(some), targets, others, responses.fields(), responses.count
+    )
+    return best + _drives_of(search_all(during), rows, np.arange(len(rows)))
+
+
+def _forms_over(
+    steady: Forms,
+    formed: FingerForms,
+    targets: Sequence[int],
+    others: Sequence[int],
+    over: RingingUnderFingers | None,
+) -> Forms:
+    """Forms over a duration where there is one, and a finger that is to be quiet."""
+    if over is None or not others:
+        return steady
+    ringing = formed.fingers.table.ringing(over.duration)
+    return steady if ringing is None else forms_over(steady, formed, targets, others, ringing)
+
+
+def _drives_of(found: CoherentResult, rows: IntArray, some: IntArray) -> list[tuple[float, Drive]]:
+    """Tones at rows (f,) that reach the level, of some by index, with their scores."""
+    return [
+        (float(found.score[each]), [(int(rows[each]), found.weights[each])])
+        for each in some.tolist()
+        if found.score[each] > 0
+    ]
+
+
+def _switched_candidates(
+    fingers: FingersOnPlate, contents: Contents, over: RingingUnderFingers | None
+) -> Candidates:
+    """The best patterns of the mode `switched` for an only content.
+
+    Near the highest level where none reaches it.
+    """
+    (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
+    by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
+    formed = fingers.forms(rows, with_fine=by_point)
+    rest = None if contents.background is None else contents.background[rows]
+    forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
+    forms = _forms_over(forms, formed, stream.targets, quiet, over)
+    if by_point:
+        forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
+    found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))
+    if not found:
+        highest = NEARLY_HIGHEST * max_sensation_switched(forms)
+        found = find_switched(replace(forms, level_margin=0.0, wanted=highest))
+    drives = [[(int(rows[row]), weights) for row, weights in drive] for _, drive in found]
+    none = np.zeros(len(found), dtype=int)
+    return Candidates(none, none, np.array([score for score, _ in found]), drives)
 
 
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
@@ -119,36 +235,53 @@ def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: f
 
 
 def _judged(
-    fingers: FingersOnPlate, contents: Contents, found: Candidates
-) -> tuple[FloatArray, FloatArray]:
-    """Amplitude (m, d) at the targets of each candidate, squared one (m, k, d) at loudest points.
+    fingers: FingersOnPlate,
+    contents: Contents,
+    found: Candidates,
+    ringing: Sequence[RingingUnderFingers | None],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Level (m,) of each candidate as an amplitude, on nine of ten plates.
 
-    Those of several contents at the contents' levels.
+    Over a duration that on the nominal plate. Also the amplitude (m, d) at its targets, and the
+    squared one (m, k, d) at loudest points, those of several contents at the contents' levels.
     """
     parts = [
-        fingers.drawn(JUDGING_DRAWS, found.rows[first:][:_BATCH], found.weights[first:][:_BATCH])
-        for first in range(0, len(found.rows), _BATCH)
+        fingers.felt(JUDGING_DRAWS, *tones_of(found.drives[first:][:_BATCH]))
+        for first in range(0, len(found.drives), _BATCH)
     ]
-    means = np.concatenate([part.means for part in parts])
-    loudest = np.concatenate([part.loudest[:, :, 1:] for part in parts], dtype=float)
-    own = np.empty((len(loudest), loudest.shape[2]))
+    means = np.concatenate([part for part, _ in parts])
+    loudest = np.concatenate([part for _, part in parts], dtype=float)
+    own, least = np.empty((len(loudest), loudest.shape[2])), np.empty(len(loudest))
     for number, stream in enumerate(contents.streams):
-        of = found.streams == number
-        own[of] = means[of][:, [*stream.targets], 1:].min(axis=1)
+        of, targets = np.flatnonzero(found.streams == number), [*stream.targets]
+        own[of] = means[of][:, targets].min(axis=1)
+        if (over := ringing[number]) is None:
+            least[of] = percentile(own[of, 1:])
+        elif len(of):
+            drives = [found.drives[each] for each in of.tolist()]
+            responses = over.responses(np.unique([row for drive in drives for row, _ in drive]))
+            during = [responses.over(drive) for drive in drives]
+            gains = np.array([each.gains[targets].min() for each in during])
+            heard = np.array([each.heard.max(axis=1) for each in during])
+            loudest[of] = on_drawn_plates(loudest[of], heard, gains[:, None, None])
+            own[of] *= gains[:, None]
+            least[of] = own[of, 0]
         if len(contents.streams) > 1:
-            gain = contents.levels[number] / np.maximum(percentile(own[of]), _TINY)
+            gain = contents.levels[number] / np.maximum(least[of], _TINY)
             own[of] *= gain[:, None]
             loudest[of] *= gain[:, None, None] ** 2
-    return own, loudest
+    return least, own[:, 1:], loudest[:, :, 1:]
 
 
-def best_tone(wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray) -> int:
+def best_tone(
+    wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray, least: FloatArray
+) -> int:
     """The candidate of an only content: level first, then contrast.
 
     Without other fingers the score counts, and as much a level that is much the same on all plates.
-    wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d) as of `_judged`.
+    wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d), least (m,) as of
+    `_judged`.
     """
-    least = percentile(own)
     reaches = least >= wanted * REACHED
     if not reaches.any():
         reaches[:] = True

@@ -1,30 +1,27 @@
-"""Onset, ending and transient measures of patterns."""
+"""Onset, ending and transient measures of layers."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from model.answer.effect_level import EffectLevels
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer.answer import Answer, Layer
+from model.answer.fingers import Placement
 from model.arrays import FloatArray, Point
 from model.table.raster_kernel import read_fingertips
 from model.table.table import LocalizationTable
-from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 
 
 class Timing:
-    """Shapes and rates patterns on the plate of a table in time.
+    """Shapes and rates layers on the plate of a table in time.
 
     Takes about ten milliseconds to make, and one more at the first use of each frequency.
-    levels: of vibrations of limited duration.
     """
 
     def __init__(self, table: LocalizationTable, *, shaper: Shaper | None = None) -> None:
         self._table, self._eras = table, table.eras
-        self.levels = EffectLevels(table)
         variance = table.uncertainty.gain_variance
         self._shaper = shaper or Shaper(
             table.in_time, gain_variance=variance, fingertips=partial(_few_points, table)
@@ -43,48 +40,53 @@ class Timing:
             self._shaper.prepare(frequency)
 
     def with_envelopes(
-        self, question: Question, pattern: Pattern, *, onset: bool = True, ending: bool = True
-    ) -> Pattern:
+        self, layer: Layer, placement: Placement, *, onset: bool = True, ending: bool = True
+    ) -> Layer:
         """Add a shaped onset and ending, or one of them; takes some milliseconds.
 
-        Without quiet fingers the onset keeps the rest of the plate quiet. Envelopes are those of
+        Without other fingers the onset keeps the rest of the plate quiet. Envelopes are those of
         the plate without fingers: solved with them they would win 1 to 1.5 dB of the contrast over
         the first 100 ms, and take 6 ms longer.
         """
-        targets, quiet, tones = question.targets, question.quiet, pattern.excitation
+        targets, quiet, tones = placement.targets, placement.quiet, layer.excitation
         if onset:
             envelopes = self._shaper.onset(tones, targets=targets, quiet=quiet)
-            pattern = replace(pattern, onset=envelopes)
+            layer = replace(layer, onset=envelopes)
         if ending:
             envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet)
-            pattern = replace(pattern, ending=envelopes)
-        return pattern
+            layer = replace(layer, ending=envelopes)
+        return layer
 
-    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
-        """Add contrast over the first 100 ms and residual vibration after the end.
+    def shaped(self, found: Answer) -> Answer:
+        """Add onsets and endings to all layers of an answer that was asked for them."""
+        layers = [self.with_envelopes(each, found.placement(each)) for each in found.layers]
+        both = [(each.onset, each.ending) for each in layers]
+        return replace(found, envelopes=tuple(both))
 
-        Onset and ending are the pattern's envelopes, or its ramp without any; the fingers are on
-        the plate.
+    def transient_contrast_db(self, layer: Layer, placement: Placement) -> float | None:
+        """Contrast over the first 100 ms [dB], along the onset or the ramp; None without others.
+
+        The fingers are on the plate.
         """
-        plate = self._table.in_time_under(question.contacts, question.loads)
-        transients = Transients(plate)
-        contrast = None
-        if question.quiet:
-            contrast = transients.contrast_db(
-                self._onset(pattern), targets=question.targets, quiet=question.quiet
-            )
-        left = transients.residual_db(pattern.excitation, self._ending(pattern))
-        return replace(pattern, transient_contrast_db=contrast, residual_db=left)
+        if not placement.quiet:
+            return None
+        if layer.onset is None:
+            onset = ramped_onset(layer.excitation, self._eras, ramp=layer.ramp)
+        else:
+            onset = shaped(layer.onset, self._eras)
+        targets, quiet = placement.targets, placement.quiet
+        return self._under(placement).contrast_db(onset, targets=targets, quiet=quiet)
 
-    def _onset(self, pattern: Pattern) -> Bases:
-        if pattern.onset is None:
-            return ramped_onset(pattern.excitation, self._eras, ramp=pattern.ramp)
-        return shaped(pattern.onset, self._eras)
+    def residual_db(self, layer: Layer, placement: Placement) -> float:
+        """Residual vibration in the 100 ms after the end, relative to the steady one [dB]."""
+        if layer.ending is None:
+            ending = ramped_ending(layer.excitation, self._eras, ramp=layer.ramp)
+        else:
+            ending = shaped(layer.ending, self._eras)
+        return self._under(placement).residual_db(layer.excitation, ending)
 
-    def _ending(self, pattern: Pattern) -> Bases:
-        if pattern.ending is None:
-            return ramped_ending(pattern.excitation, self._eras, ramp=pattern.ramp)
-        return shaped(pattern.ending, self._eras)
+    def _under(self, placement: Placement) -> Transients:
+        return Transients(self._table.in_time_under(placement.contacts, placement.loads))
 
 
 def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[FloatArray, FloatArray]:

@@ -66,7 +66,7 @@ def query(
     Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
     ERA, and predicted levels and contrast.
     """
-    from model.answer.query import query_one
+    from model.answer.as_json import query_one
     from model.table.file import load_table
 
     if batch is not None:
@@ -83,8 +83,8 @@ def query(
         return
     if swap_bands and not own:
         raise InputError("--swap-bands must be given with --own")
-    if own and (target or drive_mode or envelopes):
-        raise InputError("--own must be given without --target, --mode and --envelopes")
+    if own and target:
+        raise InputError("--own must be given without --target")
     if not (target or own):
         raise InputError(
             "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
@@ -102,7 +102,9 @@ def query(
     table = load_table(table_file)
     answer = query_one(table, line)
     rows = [
-        *(_rows_of_contents if own else _rows_of_answer)(answer),
+        *_rows_of_layers(answer),
+        *_rows_of_fingers(answer),
+        *_rows_of_measures(answer),
         "promised: what nine of ten plates within the rig's uncertainty give "
         f"({table.uncertainty})",
         f"solved in {1000 * answer['solve_time_s']:.1f} ms",
@@ -110,65 +112,60 @@ def query(
     print_report(rows, answer, as_json=as_json)
 
 
-def _rows_of_answer(answer: dict[str, Any]) -> Iterator[str]:
-    """Yield the drive of an answer, and what it promises."""
-    for era, tone in answer["drive"].items():
+def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
+    """Yield the drive of each layer; beside others it is given by its frequency alone."""
+    if len(found["layers"]) != 1:
+        return
+    (layer,) = found["layers"]
+    for era, tone in layer["drive"].items():
         yield (
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
             f"phase {tone['phase_deg']:.1f}°"
         )
-    basis = ", threshold extrapolated" if answer["is_level_extrapolated"] else ""
-    rows = [
-        ("level at the target", answer["robust_level_db_sl"], f"dB SL promised{basis}"),
-        ("  nominal", answer["level_db_sl"], "dB SL"),
-    ]
-    if answer["contrast_db"] is not None:
-        awareness = "not felt" if answer["is_imperceptible_to_quiet"] else "may be felt"
-        rows += [
-            ("felt contrast to quiet fingers", answer["robust_felt_contrast_db"], "dB promised"),
-            ("  median", answer["median_felt_contrast_db"], "dB"),
-            ("  nominal", answer["felt_contrast_db"], "dB"),
-            ("  as acceleration", answer["robust_contrast_db"], "dB promised"),
-            ("  in the first 100 ms", answer["transient_contrast_db"], "dB nominal"),
-            (
-                "loudest quiet finger",
-                answer["robust_quiet_level_db_sl"],
-                f"dB SL promised, {awareness}",
-            ),
-            ("level that leaves it at -10", answer["usable_level_db_sl"], _usable(answer)),
-        ]
-    else:
-        rows += [
-            ("contrast to rest of the plate", answer["surroundings_contrast_db"], "dB nominal"),
-            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB nominal"),
-            ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
-            ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
-        ]
-    rows.append(("residual after the end", answer["residual_db"], "dB nominal"))
-    for name, value, unit in rows:
-        yield f"{name:30s} {value:z6.1f} {unit}"
+    if layer["is_level_extrapolated"]:
+        yield "level: the threshold is extrapolated at this frequency"
 
 
-def _rows_of_contents(found: dict[str, Any]) -> Iterator[str]:
-    """Yield what each finger feels by an answer with several contents."""
-    yield "finger [m]         frequency       level  contrast  foreign level"
-    for layer in found["layers"]:
+def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
+    """Yield what each finger feels, and what was changed."""
+    yield "finger [m]         frequency       level    contrast  nominal  foreign level"
+    for finger in found["fingers"]:
+        layer = finger["layer"]
+        frequency = None if layer is None else found["layers"][layer]["frequency_hz"]
         yield (
-            f"{_place(layer):18s} {_cell(layer['frequency_hz'], 'Hz'):>9s} "
-            f"{_cell(layer['promised_level_db_sl'], 'dB SL'):>11s} "
-            f"{_cell(layer['robust_felt_contrast_db'], 'dB'):>9s} "
-            f"{_cell(layer['foreign_level_db_sl'], 'dB SL'):>14s}  {layer['verdict']}"
+            f"{_place(finger):18s} {_cell(frequency, 'Hz'):>9s} "
+            f"{_cell(finger['promised_level_db_sl'], 'dB SL'):>11s} "
+            f"{_cell(finger['promised_contrast_db'], 'dB'):>11s} "
+            f"{_cell(finger['contrast_db'], 'dB'):>8s} "
+            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  {finger['verdict']}"
         )
-    for finger in found["quiet"]:
-        yield (
-            f"{_place(finger):18s} {'':9s} {'':10s} "
-            f"{_cell(finger['robust_felt_contrast_db'], 'dB'):>9s} "
-            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  quiet"
-        )
-    if found["robust_worst_db"] is not None:
-        yield f"worst finger: {found['robust_worst_db']:.1f} dB promised"
+    if found["promised_worst_db"] is not None:
+        yield f"worst finger: {found['promised_worst_db']:.1f} dB promised"
     for line in found["applied"]:
         yield f"changed: {line}"
+
+
+def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
+    """Yield what is computed of one vibration besides."""
+    if "residual_db" not in found:
+        return
+    rows = [("residual after the end", found["residual_db"], "dB nominal")]
+    if (awareness := found["is_imperceptible_to_quiet"]) is not None:
+        rows.append(("contrast in the first 100 ms", found["transient_contrast_db"], "dB nominal"))
+        yield f"quiet fingers: {'not felt' if awareness else 'may be felt'}"
+    else:
+        rows += [
+            (
+                "contrast to rest of the plate",
+                found["layers"][0]["contrast_to_plate_db"],
+                "dB nominal",
+            ),
+            ("  to its 95th percentile", found["surroundings_contrast_95_db"], "dB nominal"),
+            ("area above half the target", 1e4 * found["area_above_half_m2"], "cm²"),
+            ("energy within 5 cm", 100 * found["energy_share_near"], "%"),
+        ]
+    for name, value, unit in rows:
+        yield f"{name:30s} {value:z6.1f} {unit}"
 
 
 def _own(text: str) -> dict[str, Any]:
@@ -200,18 +197,12 @@ def _cell(value: float | None, unit: str = "") -> str:
     return "-" if value is None else f"{value:.1f} {unit}".rstrip()
 
 
-def _usable(answer: dict[str, Any]) -> str:
-    """The unit of the level that leaves quiet fingers at -10, judged up to the level that plays."""
-    is_bound = answer["usable_level_db_sl"] >= answer["level_db_sl"]
-    return "dB SL nominal or more" if is_bound else "dB SL nominal"
-
-
 def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:
     """Answer line by line; exit with 1 at the end if a line had no answer.
 
     defaults: of keys that lines leave out.
     """
-    from model.answer.query import query_batch
+    from model.answer.as_json import query_batch
     from model.table.file import load_table
     from registry.regular_file import regular_file
 

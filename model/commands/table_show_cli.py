@@ -176,9 +176,9 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     contrast = [
         (
             f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {with_error(f'robust_felt_contrast_{others}_quiet_median')}, one in ten "
-            f"below {with_error(f'robust_felt_contrast_{others}_quiet_tenth_percentile')}; "
-            f"nominal {with_error(f'felt_contrast_{others}_quiet_median')}",
+            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, one in ten "
+            f"below {with_error(f'promised_contrast_{others}_quiet_tenth_percentile')}; "
+            f"nominal {with_error(f'contrast_{others}_quiet_median')}",
         )
         for others in (1, 2, 3)
     ]
@@ -247,10 +247,10 @@ def _verification_rows(found: "Verification") -> Iterator[str]:
     yield "\n                       level, dB SL         felt contrast, dB"
     yield "target, m        quiet  predicted  direct  predicted  direct  in time   tolerances"
     for answer in found.answer_checks:
-        x, y = answer.question.targets[0]
+        x, y = answer.placed.targets[0]
         yield (
-            f"({x:.3f}, {y:.3f})  {len(answer.question.quiet):5d}  "
-            f"{answer.pattern.level_db_sl:9.2f} {answer.direct_level_db_sl:7.2f}  "
+            f"({x:.3f}, {y:.3f})  {len(answer.placed.quiet):5d}  "
+            f"{answer.predicted_level_db_sl:9.2f} {answer.direct_level_db_sl:7.2f}  "
             f"{answer.predicted_contrast_db:9.2f} {answer.direct_contrast_db:7.2f}  "
             f"{answer.contrast_in_time_db:7.2f}   "
             f"{answer.level_tolerance_db:.2f} {answer.contrast_tolerance_db:.2f} "

@@ -12,12 +12,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from model.answer.answer import answer
-from model.answer.request import Finger, Request
+from model.answer.fingers import Finger, Stimulus
+from model.answer.plan import answer
 from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_first
 from model.design.problem import DesignProblem, NamedLayouts
 from model.design.search import LayoutSearch, ScoredLayout
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.processes import on_processes
@@ -96,11 +97,16 @@ def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessm
 
 def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tuple[float, float]:
     places = [(float(x), float(y)) for x, y in contacts]
-    requests = [Request(at) for at in places[:contents]]
-    fingers = [Finger(at) for at in places[contents:]]
-    found = answer(table, requests, fingers, min_contrast_db=-math.inf)
+    fingers = [Finger(at, Stimulus()) for at in places[:contents]]
+    found = answer(
+        table,
+        fingers,
+        quiet=places[contents:],
+        drive_mode=UNRESTRICTED,
+        min_contrast_db=-math.inf,
+    )
     assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers
-    level = min(layer.promised_level_db_sl for layer in found.layers)
+    level = min(each.promised_level_db_sl for each in found.fingers[:contents])
     return found.promised_worst_db, level
 
 

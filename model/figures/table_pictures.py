@@ -1,6 +1,7 @@
 """Pictures of a table: weak cells, levels, contrast, and a pattern with its fingertips."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,9 +12,9 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import FloatArray, Point, lattice
 from model.errors import InputError
 from model.figures.drawing import COLORS, draw_eras, label_plate
@@ -137,36 +138,37 @@ def answer_figure(table: LocalizationTable) -> Figure:
     """Draw sensation levels and fingers for an example query."""
     plate = table.plate
     target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
-    question = Question((target,), tuple(quiet))
     figure = Figure(figsize=(6.6, 5), layout="compressed")
     axes = figure.subplots()
-    try:
-        pattern = find_pattern(table, question)
-    except InputError:  # weak rig or small plate
+    answer = None
+    with suppress(InputError):  # small plate
+        answer = query(table, Placement((target,), tuple(quiet)))
+    if answer is None or not answer.is_reached:  # weak rig
         axes.set_title("The table has no answer to the three fingers of this picture")
         axes.axis("off")
         return figure
+    felt, layer = answer.fingers[0], answer.layers[0]
     axes.set_axis_off()
-    draw_levels(axes, table, pattern.excitation)
-    draw_fingertip(axes, target, felt=True, level_db_sl=pattern.level_db_sl)
+    draw_levels(axes, table, layer.excitation)
+    draw_fingertip(axes, target, felt=True, level_db_sl=felt.level_db_sl)
     for place in quiet:
         draw_fingertip(axes, place, felt=False)
     draw_level_scale(figure, [axes], shrink=0.8)
     axes.set_title(
-        f"Felt contrast {pattern.robust_felt_contrast_db:.0f} dB promised, "
-        f"{pattern.felt_contrast_db:.0f} dB nominal\n"
-        f"{_in_words(table, pattern)}",
+        f"Felt contrast {felt.promised_contrast_db:.0f} dB promised, "
+        f"{felt.contrast_db:.0f} dB nominal\n"
+        f"{_in_words(table, layer)}",
         fontsize=10,
         pad=20,
     )
     return figure
 
 
-def _in_words(table: LocalizationTable, pattern: Pattern) -> str:
+def _in_words(table: LocalizationTable, layer: Layer) -> str:
     """Format up to twelve tones, two per line."""
     tones = [
         f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
-        for name, tone in table.drive_of(pattern.excitation).items()
+        for name, tone in table.drive_of(layer.excitation).items()
     ]
     return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.answer.pattern_query import find_pattern
-from model.answer.question import MIN_LEVEL_DB_SL, Question
+from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
+from model.answer.plan import query
 from model.arrays import FloatArray
 from model.ensemble.measures import PERCENTILE
 from model.identification.identify import Identification
@@ -54,7 +54,7 @@ def expected_contrast(
         rows = []
         for _ in range(sets):
             places = random_contacts(rng, quiet + 1, plate, margin=margin, apart=apart)
-            question = Question(places[:1], places[1:], level_db_sl=MIN_LEVEL_DB_SL)
+            placed = Placement(places[:1], places[1:])
             plates = draw_plates(
                 rng,
                 identified.uncertainty,
@@ -64,8 +64,8 @@ def expected_contrast(
             )
             each = []
             for table in (written, identified):
-                drive = find_pattern(table, question).excitation
-                contrast = felt_on(identified, question, drive, plates).contrast
+                drive = query(table, placed, MIN_LEVEL_DB_SL).layers[0].excitation
+                contrast = felt_on(identified, placed, drive, plates).contrast
                 assert contrast is not None  # noqa: S101  there are quiet fingers
                 each.append(20 * np.log10(contrast))
             before, after = each

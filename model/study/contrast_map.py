@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.question import Question
+from model.answer.fingers import Placement, check_on_plate, checked_mode
 from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
 from model.files.csv_file import Columns, as_frame
@@ -81,18 +81,18 @@ def map_contrast(
     if not quiet:
         raise InputError("a map of contrast must have at least one quiet finger, got none")
     fingers = tuple(quiet)
-    grid, modes = grid or table.grid, tuple(drive_modes) or (table.drive_mode,)
+    grid, modes = grid or table.grid, tuple(map(checked_mode, drive_modes)) or (table.drive_mode,)
     centres = grid.centres(table.plate)
     questions = {
-        (row, cell): Question((at,), fingers, level_db_sl, drive_mode=mode)
+        (row, cell): Placement((at,), fingers)
         for cell, at in enumerate((float(x), float(y)) for x, y in centres)
         if min(math.dist(at, finger) for finger in fingers) >= FINGERTIP_RADIUS
-        for row, mode in enumerate(modes)
+        for row in range(len(modes))
     }
+    check_on_plate("quiet finger", fingers, table.plate)
     found = np.full((len(modes), 2, grid.cell_count), np.nan)
-    for done, ((row, cell), question) in enumerate(questions.items(), start=1):
-        question.check_on(table.plate)
-        found[row, :, cell] = contrasts_of(table, question) or np.nan
+    for done, ((row, cell), placed) in enumerate(questions.items(), start=1):
+        found[row, :, cell] = contrasts_of(table, placed, level_db_sl, modes[row]) or np.nan
         progress(done, len(questions))
     fields = found.reshape(len(modes), 2, grid.ny, grid.nx)
     return ContrastMap(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.measures import over_fingertips
 from model.rig.uncertainty import Uncertainty
@@ -87,28 +87,28 @@ class Felt:
 
 
 def felt_on(
-    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+    table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> Felt:
-    """What the fingers of a question feel of an excitation on plates; powers of its tones add."""
-    rows, power = powers_on(table, question, excitation, plates)
+    """What fingers feel of an excitation on plates; powers of its tones add."""
+    rows, power = powers_on(table, placed, excitation, plates)
     sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
-    weights = read_fingertips(table, question.contacts).fine_weights
+    weights = read_fingertips(table, placed.contacts).fine_weights
     (means,), (loudest,) = over_fingertips(sensed[None], weights)
-    count = len(question.targets)
+    count = len(placed.targets)
     level = means[:count].min(axis=0)
-    if not question.quiet:
+    if not placed.quiet:
         return Felt(level, None)
     return Felt(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
 
 
 def powers_on(
-    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+    table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> tuple[IntArray, FloatArray]:
     """Rows of an excitation's frequencies (m,), and squared amplitudes on plates (m, points, d).
 
-    At the fine points of `read_fingertips` of a question, finger by finger.
+    At the fine points of `read_fingertips`, finger by finger.
     """
-    rows, found = _responses(table, *touched(table, question), excitation, plates)
+    rows, found = _responses(table, *touched(table, placed), excitation, plates)
     return rows, np.abs(found) ** 2
 
 
@@ -125,11 +125,11 @@ def amplitudes_on(
 
 
 def touched(
-    table: LocalizationTable, question: Question
+    table: LocalizationTable, placed: Placement
 ) -> tuple[FloatArray, Sequence[FingertipLoad]]:
-    """Shapes at the fine points of a question's fingers (k, p, r), and their loads."""
-    fine = read_fingertips(table, question.contacts).fine.astype(float)
-    return fine, fingertip_loads(table.fingertip, question.contacts, question.loads)
+    """Shapes at the fine points of fingers (k, p, r), and their loads."""
+    fine = read_fingertips(table, placed.contacts).fine.astype(float)
+    return fine, fingertip_loads(table.fingertip, placed.contacts, placed.loads)
 
 
 def _responses(

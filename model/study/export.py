@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.pattern_query import find_pattern
+from model.answer.plan import query
 from model.arrays import Complex64Array
 from model.config.sections import Quantity
 from model.errors import InputError
@@ -94,17 +94,16 @@ def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
 def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
     parts = [f"{era.name}_{part}" for era in table.eras for part in ("hz", "level", "phase_deg")]
     contacts = [f"{finger}_{axis}_m" for finger in ("target", "quiet") for axis in "xy"]
-    yield [*contacts, *parts, "robust_level_db_sl", "robust_felt_contrast_db"]
-    for question in chain.from_iterable(pair_questions(table)):
-        at = chain.from_iterable(question.contacts)
-        try:
-            pattern = find_pattern(table, question)
-        except InputError:
+    yield [*contacts, *parts, "promised_level_db_sl", "promised_contrast_db"]
+    for placed in chain.from_iterable(pair_questions(table)):
+        at = chain.from_iterable(placed.contacts)
+        found = query(table, placed)
+        if not found.is_reached:
             yield [*at, *[""] * (len(parts) + 2)]
             continue
-        drive = table.drive_of(pattern.excitation)
+        drive, target = table.drive_of(found.layers[0].excitation), found.fingers[0]
         tones = (drive[era.name].values() if era.name in drive else [""] * 3 for era in table.eras)
-        promised = (pattern.robust_level_db_sl, pattern.robust_felt_contrast_db)
+        promised = (target.promised_level_db_sl, target.promised_contrast_db)
         yield [*at, *chain.from_iterable(tones), *promised]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, highest_measured
@@ -61,13 +61,13 @@ def find_overview(
 
 def set_questions(
     table: LocalizationTable, *, others: int, rng: np.random.Generator
-) -> list[Question]:
+) -> list[Placement]:
     """Questions with fingers at random, one the target; none on a plate too small for them."""
-    found: list[Question] = []
+    found: list[Placement] = []
     with suppress(InputError):
         for _ in range(CONTACT_SETS):
             contacts = random_contacts(rng, others + 1, table.plate, tries=50 * CONTACT_SETS)
-            found.append(Question(contacts[:1], contacts[1:]))
+            found.append(Placement(contacts[:1], contacts[1:]))
     return found
 
 
@@ -98,12 +98,12 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
         "weak_share": float(weak.weak[known].mean()) if known.any() else None,
     }
     for others, found in enumerate(overview.contrasts, start=1):
-        for kind, contrasts in zip(("robust_felt", "felt"), found, strict=True):
+        for kind, contrasts in zip(("promised_contrast", "contrast"), found, strict=True):
             for name, percentile in (("median", 50), ("tenth_percentile", 10)):
                 value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
                 error = sampling_error(contrasts, percentile) if len(contrasts) else None
-                summary[f"{kind}_contrast_{others}_quiet_{name}_db"] = value
-                summary[f"{kind}_contrast_{others}_quiet_{name}_error_db"] = error
+                summary[f"{kind}_{others}_quiet_{name}_db"] = value
+                summary[f"{kind}_{others}_quiet_{name}_error_db"] = error
     summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
     summary["reference_mesh"] = str(table.reference_mesh)

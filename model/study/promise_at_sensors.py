@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import FloatArray, Point
 from model.ensemble.measures import percentile
 from model.errors import InputError
@@ -30,14 +30,14 @@ _MAX_OTHERS = 3
 
 @dataclass(frozen=True)
 class Promise:
-    """A pattern for a target and quiet places among sensors, and what it promises there.
+    """A layer for a target and quiet places among sensors, and what it promises there.
 
     sensors: names, the target's first; contrast_db: felt contrast that nine of ten plates give;
     median_db: that every other one gives; level_db_sl: at the target on nine of ten plates.
     """
 
     sensors: tuple[str, ...]
-    pattern: Pattern
+    layer: Layer
     contrast_db: float
     median_db: float
     level_db_sl: float
@@ -81,11 +81,11 @@ class MeasuredVerification:
                     "target": each.promise.sensors[0],
                     "quiet": list(each.promise.sensors[1:]),
                     "drive_frequencies_hz": sorted(
-                        {tone.frequency for tone in each.promise.pattern.excitation.values()}
+                        {tone.frequency for tone in each.promise.layer.excitation.values()}
                     ),
-                    "promised_felt_contrast_db": each.promise.contrast_db,
-                    "median_felt_contrast_db": each.promise.median_db,
-                    "measured_felt_contrast_db": each.contrast_db,
+                    "promised_contrast_db": each.promise.contrast_db,
+                    "median_contrast_db": each.promise.median_db,
+                    "measured_contrast_db": each.contrast_db,
                     "promised_level_db_sl": each.promise.level_db_sl,
                     "measured_level_db_sl": each.level_db_sl,
                     "kept": each.is_kept,
@@ -117,9 +117,9 @@ def promises(
     for number in range(count):
         names = _drawn(rng, sensors, others=1 + number % _MAX_OTHERS)
         target, *quiet = (sensors[name] for name in names)
-        question = Question((target,), tuple(quiet))
-        pattern = _at_level(find_pattern(weightless, question), table, level)
-        yield _promise(weightless, names, question, pattern, rng)
+        placed = Placement((target,), tuple(quiet))
+        layer = _at_level(query(weightless, placed).layers[0], table, level)
+        yield _promise(weightless, names, placed, layer, rng)
 
 
 def measured_promise(
@@ -143,17 +143,17 @@ def _drawn(
     raise InputError("sensors must be 5 cm apart, two of them at least, got none so; move them")
 
 
-def _at_level(pattern: Pattern, table: LocalizationTable, level: float) -> Pattern:
-    """The pattern with its loudest ERA at a level: contrasts stay."""
-    loudest = max(each["level"] for each in table.drive_of(pattern.excitation).values())
-    return pattern.scaled(float(decibels(np.array(level / loudest))))
+def _at_level(layer: Layer, table: LocalizationTable, level: float) -> Layer:
+    """The layer with its loudest ERA at a level: contrasts stay."""
+    loudest = max(each["level"] for each in table.drive_of(layer.excitation).values())
+    return layer.scaled(float(decibels(np.array(level / loudest))))
 
 
 def _promise(
     table: LocalizationTable,
     names: Sequence[str],
-    question: Question,
-    pattern: Pattern,
+    placed: Placement,
+    layer: Layer,
     rng: np.random.Generator,
 ) -> Promise:
     plates = draw_plates(
@@ -163,12 +163,12 @@ def _promise(
         era_count=len(table.eras),
         contact_count=len(names),
     )
-    tones = amplitudes_on(table, question.contacts, pattern.excitation, plates)
+    tones = amplitudes_on(table, placed.contacts, layer.excitation, plates)
     level = sensation_level(*tones, table.threshold)
     contrast = level[0] - level[1:].max(axis=0)
     return Promise(
         tuple(names),
-        pattern,
+        layer,
         contrast_db=float(percentile(contrast)),
         median_db=float(percentile(contrast, 50)),
         level_db_sl=float(percentile(level[0])),

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.answer import Answer
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -95,8 +95,8 @@ class AnswerCheck:
     The tolerances [dB] follow from `field_error`: more where less is left of the vibration.
     """
 
-    question: Question
-    pattern: Pattern
+    placed: Placement
+    predicted_level_db_sl: float
     predicted_contrast_db: float
     direct_level_db_sl: float
     direct_contrast_db: float
@@ -107,7 +107,7 @@ class AnswerCheck:
     @property
     def is_passed(self) -> bool:
         """Whether all are within their tolerances; NaN is not."""
-        level = abs(self.direct_level_db_sl - self.pattern.level_db_sl)
+        level = abs(self.direct_level_db_sl - self.predicted_level_db_sl)
         contrast = abs(self.direct_contrast_db - self.predicted_contrast_db)
         predicted, in_time = (
             min(each, MAX_CONTRAST_IN_TIME_DB)
@@ -165,15 +165,15 @@ class Verification:
             ],
             "answers": [
                 {
-                    "target_m": list(answer.question.targets[0]),
-                    "quiet_m": [list(place) for place in answer.question.quiet],
-                    "predicted_level_db_sl": answer.pattern.level_db_sl,
+                    "target_m": list(answer.placed.targets[0]),
+                    "quiet_m": [list(place) for place in answer.placed.quiet],
+                    "predicted_level_db_sl": answer.predicted_level_db_sl,
                     "direct_level_db_sl": answer.direct_level_db_sl,
                     "level_tolerance_db": answer.level_tolerance_db,
-                    "predicted_felt_contrast_db": answer.predicted_contrast_db,
-                    "direct_felt_contrast_db": answer.direct_contrast_db,
+                    "predicted_contrast_db": answer.predicted_contrast_db,
+                    "direct_contrast_db": answer.direct_contrast_db,
                     "contrast_tolerance_db": answer.contrast_tolerance_db,
-                    "felt_contrast_in_time_db": answer.contrast_in_time_db,
+                    "contrast_in_time_db": answer.contrast_in_time_db,
                     "time_tolerance_db": answer.time_tolerance_db,
                     "passed": answer.is_passed,
                 }
@@ -236,29 +236,28 @@ def verify_table(
     check = _AnswerChecker(table, rig, free, respond)
     answer_checks, kept = [], []
     for number in range(samples):
-        question, pattern = _random_answer(table, rng, others=1 + number % 3)
-        answer_checks.append(check(question, pattern))
-        kept.append(_kept_share(table, question, pattern, rng))
+        answer = _random_answer(table, rng, others=1 + number % 3)
+        answer_checks.append(check(answer))
+        kept.append(_kept_share(table, answer, rng))
         progress(number + 1, samples)
     promise = PromiseCheck(float(np.mean(kept)), samples * PLATES)
     return Verification(content, tuple(answer_checks), promise)
 
 
-def _kept_share(
-    table: LocalizationTable, question: Question, pattern: Pattern, rng: np.random.Generator
-) -> float:
+def _kept_share(table: LocalizationTable, answer: Answer, rng: np.random.Generator) -> float:
     """Share of exact plates on which an answer keeps its promised felt contrast."""
+    layer, promise = answer.layers[0], answer.fingers[0].promised_contrast_db
     plates = draw_plates(
         rng,
         table.uncertainty,
         count=PLATES,
         era_count=len(table.eras),
-        contact_count=len(question.targets) + len(question.quiet),
+        contact_count=len(answer.fingers),
     )
-    contrast = felt_on(table, question, pattern.excitation, plates).contrast
-    if contrast is None or pattern.robust_felt_contrast_db is None:
+    contrast = felt_on(table, answer.placement(layer), layer.excitation, plates).contrast
+    if contrast is None or promise is None:
         return math.nan
-    return float((decibels(contrast) >= pattern.robust_felt_contrast_db - ROUNDING_DB).mean())
+    return float((decibels(contrast) >= promise - ROUNDING_DB).mean())
 
 
 def _check_content(
@@ -292,17 +291,18 @@ class _AnswerChecker:
     ) -> None:
         self._table, self._rig, self._free, self._respond = table, rig, free, respond
 
-    def __call__(self, question: Question, pattern: Pattern) -> AnswerCheck:
+    def __call__(self, answer: Answer) -> AnswerCheck:
         """One answer recomputed."""
-        rig = self._rig
-        contacts = question.contacts
+        rig, layer, target = self._rig, answer.layers[0], answer.fingers[0]
+        placed = answer.placement(layer)
+        contacts = placed.contacts
         discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
         weights = fingertip_weights(*contacts[0], rig.plate)
         count = len(weights)
         points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
-        fingers = fingertip_loads(rig.fingertip, contacts, question.loads)
+        fingers = fingertip_loads(rig.fingertip, contacts, placed.loads)
         frequencies, everywhere = tone_amplitudes(
-            pattern.excitation,
+            layer.excitation,
             rig.eras,
             lambda f: self._respond(rig.eras, f, points, loads=[*rig.masses, *fingers]),
         )
@@ -311,7 +311,7 @@ class _AnswerChecker:
         plate = plate_in_time(
             reduce_free_plate(self._free, attached), rig.eras, loads=rig.masses, contacts=fingers
         )
-        in_time = steady_in_time(plate, Transients(plate), pattern.excitation, discs)
+        in_time = steady_in_time(plate, Transients(plate), layer.excitation, discs)
         threshold = detection_threshold(frequencies, self._table.threshold)[:, None]
         felt, felt_in_time, felt_elsewhere = (
             np.linalg.norm(tones / threshold, axis=0) for tones in (direct, in_time, rest)
@@ -320,10 +320,10 @@ class _AnswerChecker:
         error *= math.sqrt(float((felt_elsewhere**2).mean()))
         at_target = float(decibels(1 + error / (felt[:count] @ weights)))
         at_quiet = float(decibels(1 + error / felt[count:].max()))
-        contrast = pattern.felt_contrast_db
+        contrast = target.contrast_db
         return AnswerCheck(
-            question,
-            pattern,
+            placed,
+            target.level_db_sl,
             predicted_contrast_db=math.nan if contrast is None else contrast,
             direct_level_db_sl=float(decibels(felt[:count] @ weights)),
             direct_contrast_db=_contrast(felt, weights),
@@ -356,16 +356,15 @@ def _contrast(felt: FloatArray, weights: FloatArray) -> float:
     return float(contrast_db([target], quiet, [weights]))
 
 
-def _random_answer(
-    table: LocalizationTable, rng: np.random.Generator, *, others: int
-) -> tuple[Question, Pattern]:
+def _random_answer(table: LocalizationTable, rng: np.random.Generator, *, others: int) -> Answer:
     """Contacts at least 5 cm apart, and the table's answer; where they do not fit, fewer."""
     for tries in range(1000):
         count = 1 + max(1, others - tries // 200)
         with contextlib.suppress(InputError):
             contacts = random_contacts(rng, count, table.plate, tries=1)
-            question = Question(contacts[:1], contacts[1:])
-            return question, find_pattern(table, question)
+            answer = query(table, Placement(contacts[:1], contacts[1:]))
+            if answer.is_reached:
+                return answer
     length, width = table.plate.length, table.plate.width
     raise InputError(
         f"no random contacts on this plate of {length:g} x {width:g} m have an answer at 20 dB "

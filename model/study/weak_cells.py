@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
 from model.finger.grid import Grid
@@ -40,8 +40,8 @@ less variance than from places drawn freely.
 Contrasts: TypeAlias = tuple[float, float]
 """Felt contrast [dB] of nine of ten plates, and that of the nominal plate."""
 
-Ask: TypeAlias = Callable[[Question], Contrasts | None]
-"""Answers a question with quiet fingers, None where the level is not reached."""
+Ask: TypeAlias = Callable[[Placement], Contrasts | None]
+"""Answers a finger beside quiet ones, None where the level is not reached."""
 
 _DECIMALS = 9  # of places [m]: below that is rounding
 
@@ -133,7 +133,7 @@ def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
     return np.array([*filter(None, answered)], dtype=float).reshape(-1, 2).T
 
 
-def pair_questions(table: LocalizationTable) -> list[list[Question]]:
+def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
     """For each cell of `map_grid` as the target, those with each other finger at a distance.
 
     Places of the other finger are drawn for each cell, the same for cells that mirror each other
@@ -163,10 +163,10 @@ def ask_once(table: LocalizationTable) -> Ask:
     Questions that mirror each other, where plate, ERAs and masses do, have one answer, so that the
     noise of the drawn plates does not make several samples of one.
     """
-    images, known = mirror_images(table), dict[Question, Contrasts | None]()
+    images, known = mirror_images(table), dict[Placement, Contrasts | None]()
 
-    def ask(question: Question) -> Contrasts | None:
-        first = _first_image(question, table, images)
+    def ask(placed: Placement) -> Contrasts | None:
+        first = _first_image(placed, table, images)
         if first not in known:
             known[first] = contrasts_of(table, first)
         return known[first]
@@ -174,14 +174,21 @@ def ask_once(table: LocalizationTable) -> Ask:
     return ask
 
 
-def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
+def contrasts_of(
+    table: LocalizationTable,
+    placed: Placement,
+    level_db_sl: float = WANTED_LEVEL_DB_SL,
+    drive_mode: str | None = None,
+) -> Contrasts | None:
     """Promised and nominal felt contrast [dB], None where the level is not reached."""
     try:
-        found = find_pattern(table, question)
+        found = query(table, placed, level_db_sl, drive_mode=drive_mode)
     except InputError:
         return None
-    promised, nominal = found.robust_felt_contrast_db, found.felt_contrast_db
-    return None if promised is None or nominal is None else (promised, nominal)
+    promised, nominal = found.fingers[0].promised_contrast_db, found.fingers[0].contrast_db
+    if promised is None or nominal is None or not found.is_reached:
+        return None
+    return promised, nominal
 
 
 def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
@@ -201,16 +208,16 @@ def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
 
 
 def _first_image(
-    question: Question, table: LocalizationTable, images: Sequence[tuple[bool, bool]]
-) -> Question:
-    """The image of a question that is the same for all its images."""
+    placed: Placement, table: LocalizationTable, images: Sequence[tuple[bool, bool]]
+) -> Placement:
+    """The image of fingers that is the same for all their images."""
     if len(images) == 1:
-        return question
-    count = len(question.targets)
+        return placed
+    count = len(placed.targets)
     contacts = min(
-        tuple(_reflected(at, table, along) for at in question.contacts) for along in images
+        tuple(_reflected(at, table, along) for at in placed.contacts) for along in images
     )
-    return replace(question, targets=contacts[:count], quiet=contacts[count:])
+    return Placement(contacts[:count], contacts[count:])
 
 
 def _reflected(at: Point, table: LocalizationTable, along: tuple[bool, bool]) -> Point:
@@ -254,11 +261,8 @@ def _places(plate: Plate, seed: list[int]) -> FloatArray:
     return np.asarray(size * mirrored.reshape(-1, 2))
 
 
-def _questions(target: FloatArray, places: FloatArray) -> list[Question]:
-    """At the wanted level at a target [m], for each other finger at a distance."""
+def _questions(target: FloatArray, places: FloatArray) -> list[Placement]:
+    """A target [m], for each other finger at a distance."""
     far = np.linalg.norm(places - target, axis=1) >= MIN_DISTANCE
     at = (float(target[0]), float(target[1]))
-    return [
-        Question((at,), ((float(x), float(y)),), level_db_sl=WANTED_LEVEL_DB_SL)
-        for x, y in places[far]
-    ]
+    return [Placement((at,), ((float(x), float(y)),)) for x, y in places[far]]

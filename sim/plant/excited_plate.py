@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.pattern import ONSET_RAMP
-from model.answer.question import Question
+from model.answer.answer import ONSET_RAMP
+from model.answer.fingers import Placement, Stimulus, check_fingers, together
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
@@ -27,7 +27,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
 from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import Excitation, base_amplitudes, peak_acceleration
+from model.vibration.excitation import Excitation, base_amplitudes
 from sim.plant.fingers import Felt, Record, felt_peaks, measure_vibration
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -45,8 +45,8 @@ class Playback:
 
     frequencies (f,) [Hz]: driven; targets, quiet: records of the fingers; settled [s]: end of the
     onset; threshold: name of the set that levels are above. Measures are named as those of a
-    `Pattern`; steady ones are fitted to the last STEADY seconds, after the plate has settled (50 ms
-    to 1 s).
+    `Sensation`; steady ones are fitted to the last STEADY seconds, after the plate has settled
+    (50 ms to 1 s).
     """
 
     frequencies: tuple[float, ...]
@@ -86,16 +86,10 @@ class Playback:
         return float(max(loudest)) if loudest else None
 
     @property
-    def felt_contrast_db(self) -> float | None:
+    def contrast_db(self) -> float | None:
         """Steady level of the target above that of the loudest quiet point [dB]; None if alone."""
         quiet = self.quiet_level_db_sl
         return None if quiet is None else self.level_db_sl - quiet
-
-    @property
-    def contrast_db(self) -> float | None:
-        """Steady contrast [dB], the target's mean to the loudest quiet point; None if alone."""
-        peaks = [peak_acceleration(felt.amplitude) for felt in self._felt]
-        return self._contrast(peaks)
 
     @property
     def transient_contrast_db(self) -> float | None:
@@ -133,7 +127,7 @@ def play(
     rig: Rig,
     reduced: ReducedPlate,
     excitation: Excitation,
-    fingers: Question,
+    fingers: Placement,
     *,
     duration: float,
     ramp: float = ONSET_RAMP,
@@ -147,7 +141,7 @@ def play(
     place. Latency, skew and noise are left out. Raises InputError for fingers off the plate, an
     excitation that the rig cannot play, and a duration out of range.
     """
-    fingers.check_on(rig.plate)
+    check_fingers(together(fingers, Stimulus()), rig.plate)
     frequencies, _ = base_amplitudes(excitation, rig.eras)
     settled = max(envelope.duration for envelope in onset.values()) if onset else ramp
     if not settled < duration <= MAX_DURATION:  # false for NaN, too

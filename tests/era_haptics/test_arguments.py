@@ -12,7 +12,7 @@ from small_table import small_table
 
 RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
 PLATE, DRIVE, TARGET = era.SolvedPlate(RIG), {"SW": 110}, (0.08, 0.06)
-PATTERN = era.Pattern({"SW": era.Tone(110.0, 1e-5)}, 0.04, 20.0, None, None)
+ANSWER = era.query(small_table(), TARGET)
 
 GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.load_rig: {"path": era.example_rig_path(), "mesh": "12x9"},
@@ -22,15 +22,16 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
     era.query: {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "phased",
-        "loads": (1.5,),
+        "duration": 0.04,
     },
+    era.measures: {"table": None, "answer": ANSWER},
     era.contrast_map: {
         "table": None, "quiet": TARGET, "drive_modes": ["phased"], "level_db_sl": 20.0,
         "grid": era.Grid(2, 2),
     },
     era.answer: {
-        "table": None, "requests": [era.Request(TARGET)], "fingers": [era.Finger((0.2, 0.1))],
-        "apart_hz": 30.0,
+        "table": None, "fingers": [era.Finger(TARGET, era.Stimulus())],
+        "quiet": [era.Finger((0.2, 0.1))], "drive_mode": "phased", "apart_hz": 30.0,
     },
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
     era.design: {
@@ -48,28 +49,29 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "table": None,
         "found": era.ContrastMap(*np.zeros((2, 1)), (TARGET,), {"phased": np.zeros((1, 1))}, {}),
     },
-    era.draw_pattern: {"table": None, "pattern": PATTERN, "target": TARGET, "quiet": ()},
+    era.draw_answer: {"table": None, "answer": ANSWER, "layer": 0},
     era.draw_playback: {"playback": None},
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
     era.commands_for: {"rig": RIG, "drive": DRIVE},
     era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
     era.Grid: {"nx": 4, "ny": 3},
-    era.Request: {
-        "at": TARGET, "band_hz": (40.0, 90.0), "level_db_sl": 20.0, "priority": 0, "load": 1.0,
-        "content": "click", "min_contrast_db": 12.0, "max_foreign_db_sl": -10.0,
-        "modulation_hz": 20.0,
+    era.Stimulus: {
+        "level_db_sl": 20.0, "band_hz": (40.0, 90.0), "duration": 0.04, "modulation_hz": None,
+        "name": "click",
     },
-    era.Finger: {"at": TARGET, "load": 1.0, "max_foreign_db_sl": -10.0},
+    era.Finger: {
+        "at": TARGET, "stimulus": era.Stimulus(), "load": 1.0, "priority": 0, "sharing": "never",
+        "min_contrast_db": 12.0, "max_foreign_db_sl": -10.0,
+    },
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""
 
 TAKES_ANYTHING = {
     "bands_may_swap",
-    "may_share",
+    "is_limit",
     "is_protected",
     "title",
-    "envelopes",
-    "measures",
+    "shaped",
     "all_scales",
 }
 

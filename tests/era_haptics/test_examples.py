@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import era_haptics as era
 from python_page import named
 
 ROOT = Path(__file__).parents[2]
@@ -60,10 +61,11 @@ def test_researcher_example_reproduces_the_paper(
     monkeypatch.setenv("ERA_PICTURES", str(tmp_path))
     ran: dict[str, Any] = runpy.run_path(str(EXAMPLES / "researcher.py"))
     assert [f"{frequency:.2f}" for frequency in ran["paper_frequencies"]] == TABLE_2
-    assert all(layer.promised_contrast_db > 12 for layer in ran["both"].layers)
-    for predicted, felt in ran["played"].values():
+    assert all(felt.promised_contrast_db > 12 for felt in ran["both"].fingers)
+    for answer, felt in ran["played"].values():
+        predicted, more = answer.fingers[0], era.measures(ran["table"], answer)
         assert felt.contrast_db == pytest.approx(predicted.contrast_db, abs=0.2)
-        assert felt.transient_contrast_db == pytest.approx(predicted.transient_contrast_db, abs=0.4)
+        assert felt.transient_contrast_db == pytest.approx(more.transient_contrast_db, abs=0.4)
         assert felt.level_db_sl == pytest.approx(predicted.level_db_sl, abs=0.05)
     ramp, shaped = (
         felt.contrast_db - felt.transient_contrast_db for _, felt in ran["played"].values()
@@ -73,7 +75,7 @@ def test_researcher_example_reproduces_the_paper(
     assert (ran["study"]["phased"] >= ran["study"]["switched"] - 0.5).all()
     assert np.diff(ran["study"]["phased"]).min() > 0  # the farther, the easier
     pictures = sorted(path.name for path in tmp_path.iterdir())
-    assert pictures == ["map.png", "pattern.png", "ramp.png", "shaped.png"]
+    assert pictures == ["answer.png", "map.png", "ramp.png", "shaped.png"]
 
 
 @pytest.mark.long
@@ -101,13 +103,12 @@ def test_page_example_feels_what_was_predicted(
     assert len(lines.split("\n\n")[1].splitlines()) == 12
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")
-    assert ran["felt"].contrast_db == pytest.approx(ran["pattern"].contrast_db, abs=0.2)
-    assert (tmp_path / "pattern.png").stat().st_size > 10_000
+    assert ran["felt"].contrast_db == pytest.approx(ran["only"].fingers[0].contrast_db, abs=0.2)
+    assert (tmp_path / "answer.png").stat().st_size > 10_000
 
 
 def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
-    import era_haptics as era
 
     documented = named(PAGE)
     errors = set(re.findall(r"`(\w+)`", PAGE.partition("| exception")[2].partition("\n## ")[0]))

@@ -34,21 +34,39 @@ def test_query_equals_the_command(
     """Every measure of `era table query --json`, from the table's file."""
     path = str(tmp_path / "t.npz")
     era.save_table(table, path)
-    pattern = era.query(
-        era.load_table(path), TARGET, quiet=QUIET, level_db_sl=15, envelopes=envelopes
-    )
+    loaded = era.load_table(path)
+    found = era.query(loaded, TARGET, quiet=QUIET, level_db_sl=15, shaped=envelopes)
     options = ["--target", "0.08,0.06", "--quiet", "0.22,0.16", "--quiet", "0.25,0.04"]
     options += ["--level", "15", *(["--envelopes"] if envelopes else [])]
     answer = json.loads(
         CliRunner().invoke(app, ["table", "query", path, *options, "--json"]).stdout
     )
-    for measure in (
-        *("level_db_sl", "contrast_db", "felt_contrast_db", "robust_contrast_db"),
-        *("transient_contrast_db", "residual_db", "quiet_level_db_sl", "usable_level_db_sl"),
-    ):
-        assert getattr(pattern, measure) == pytest.approx(answer[measure], abs=1e-6), measure
-    assert table.drive_of(pattern.excitation) == answer["drive"]
-    assert bool(pattern.onset) is envelopes
+    for finger, felt in zip(answer["fingers"], found.fingers, strict=True):
+        assert finger["at_m"] == list(felt.finger.at)
+        for key in ("verdict", "layer", "contrast_db", "promised_contrast_db", "lowered_db"):
+            assert finger[key] == pytest.approx(getattr(felt, key), abs=1e-6), key
+    more = era.measures(loaded, found)
+    for key in ("transient_contrast_db", "residual_db", "is_imperceptible_to_quiet"):
+        assert answer[key] == pytest.approx(getattr(more, key), abs=1e-6), key
+    (layer,), (played,) = found.layers, answer["layers"]
+    assert table.drive_of(layer.excitation) == played["drive"]
+    assert bool(layer.onset) is bool(played["onset"]) is envelopes
+
+
+def test_query_is_the_answer_to_fingers_that_must_feel_one(table: era.LocalizationTable) -> None:
+    """With quiet fingers as positions or with their loads, and for a time."""
+    stimulus = era.Stimulus(15.0, duration=0.04, name="any")
+    fingers = [era.Finger(at, stimulus, sharing="must") for at in (TARGET, QUIET[1])]
+    for quiet in (QUIET[:1], [era.Finger(QUIET[0])]):
+        found = era.answer(table, fingers, quiet=quiet)
+        same = era.query(
+            table, [TARGET, QUIET[1]], quiet=QUIET[:1], level_db_sl=15.0, duration=0.04
+        )
+        assert found.layers == same.layers
+        assert [each.verdict for each in found.fingers][1:] == ["shared", "quiet"]
+        assert found.layers[0].ramp == 0.01
+    heavy = era.answer(table, fingers, quiet=[era.Finger(QUIET[0], load=3.0)])
+    assert heavy.layers != same.layers
 
 
 def test_table_has_the_requested_mode_frequencies_and_grid(table: era.LocalizationTable) -> None:
@@ -61,16 +79,19 @@ def test_table_has_the_requested_mode_frequencies_and_grid(table: era.Localizati
 def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
     """Single precision becomes float, so that results can be written as JSON."""
     plain, given = (era.query(table, TARGET, level_db_sl=kind(12)) for kind in (float, np.float32))
-    assert json.dumps(given.level_db_sl) == json.dumps(plain.level_db_sl)
-    amplitudes = {type(tone.amplitude) for tone in given.excitation.values()}
-    assert (given.excitation, amplitudes) == (plain.excitation, {float})
+    levels = [each.fingers[0].level_db_sl for each in (given, plain)]
+    assert json.dumps(levels[0]) == json.dumps(levels[1])
+    drive = given.layers[0].excitation
+    assert {type(tone.amplitude) for tone in drive.values()} == {float}
+    assert drive == plain.layers[0].excitation
 
 
 def test_results_become_frames(table: era.LocalizationTable) -> None:
     """A row a finger of an answer, a row a point of a map, a row a moment of a playback."""
-    answer = era.answer(table, [era.Request(TARGET), era.Request(QUIET[0])])
+    fingers = [era.Finger(at, era.Stimulus()) for at in (TARGET, QUIET[0])]
+    answer = era.answer(table, fingers, drive_mode="phased")
     frame = answer.to_frame()
-    assert list(frame["verdict"]) == [layer.verdict for layer in answer.layers]
+    assert list(frame["verdict"]) == [each.verdict for each in answer.fingers]
     assert frame.loc[1, "x_m"] == QUIET[0][0]
     plate = era.SolvedPlate(era.load_rig(str(era.example_rig_path()), mesh="12x9"))
     field = plate.map({"SW": 110}, raster=(4, 3)).to_frame()
@@ -107,7 +128,7 @@ def test_draw_map_marks_driven_eras() -> None:
     assert figure.axes[1].get_ylim()[1] == pytest.approx(peak)
 
 
-def test_draw_pattern_shows_fingers_and_levels() -> None:
+def test_draw_answer_shows_fingers_and_levels() -> None:
     """Circles of 13 mm at the fingers, the promise in the title, levels in decibels."""
     table = build_table(
         PLATE.rig,
@@ -115,21 +136,21 @@ def test_draw_pattern_shows_fingers_and_levels() -> None:
         grid=era.Grid(4, 3),
         drive_mode="phased",
     )
-    pattern = era.query(table, TARGET, quiet=QUIET)
-    figure = era.draw_pattern(table, pattern, TARGET, quiet=QUIET)
+    answer = era.query(table, TARGET, quiet=QUIET)
+    felt, figure = answer.fingers[0], era.draw_answer(table, answer)
     axes = figure.axes[0]
     circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
     assert [np.round(circle.center, 6).tolist() for circle in circles] == [
         [8.0, 6.0], [22.0, 16.0], [25.0, 4.0],
     ]  # fmt: skip
     assert {circle.radius for circle in circles} == {1.3}
-    assert f"{pattern.robust_felt_contrast_db:.0f} dB" in axes.get_title()
+    assert f"{felt.promised_contrast_db:.0f} dB" in axes.get_title()
     texts = [text.get_text() for text in axes.texts]
     assert texts.count("quiet") == 2
-    assert f"felt\n{pattern.level_db_sl:.0f} dB SL" in texts
+    assert f"felt\n{felt.level_db_sl:.0f} dB SL" in texts
     drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
     row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
-    assert drawn[row, column] == pytest.approx(pattern.level_db_sl, abs=1.0)
+    assert drawn[row, column] == pytest.approx(felt.level_db_sl, abs=1.0)
 
 
 def test_draw_playback_shows_peaks_over_time() -> None:

@@ -599,7 +599,7 @@ async def test_texts_on_the_plate_do_not_overlap(page: Page) -> None:
         " const regions = [{ ...box, name: 'keypad', x_m: 0.02, y_m: 0.1 },"
         "  { ...box, name: 'slider', x_m: 0.18, y_m: 0.1 }];"
         " overlay.setUp({ rig: { length_m: 0.3, width_m: 0.2, eras }, layout: { regions } });"
-        " const target = { role: 'target', level_db_sl: 22, robust_felt_contrast_db: 40 };"
+        " const target = { role: 'target', level_db_sl: 22, promised_contrast_db: 40 };"
         " const drive = { mid: { frequency_hz: 110, level: 0.5 } };"
         " const found = [];"
         " const places = [[0.15, 0.1], [0.02, 0.03], [0.28, 0.02], [0.29, 0.17], [0.07, 0.17]];"

@@ -97,7 +97,7 @@ def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
     assert sum(row["kept"] for row in found.promises) >= 3
     for row in found.promises:
         assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=1)
-        assert row["measured_felt_contrast_db"] > row["promised_felt_contrast_db"] - 6
+        assert row["measured_contrast_db"] > row["promised_contrast_db"] - 6
     for error in found.identified.errors:
         limit = 1e-3 if error.kind == "place" else 0.1
         assert abs(error.relative) < limit, error

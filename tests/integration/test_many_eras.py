@@ -54,9 +54,9 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     x, y = SCHEDULE[1][3:]
     assert row.targets_m == [pytest.approx((x * rig.plate.length, (1 - y) * rig.plate.width))]
     assert row.steady
-    assert row.measured_felt_contrast_db is not None
-    assert row.robust_felt_contrast_db is not None
-    assert row.measured_felt_contrast_db >= row.robust_felt_contrast_db > 6
+    assert row.measured_contrast_db is not None
+    assert row.promised_contrast_db is not None
+    assert row.measured_contrast_db >= row.promised_contrast_db > 6
     assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
 
 

@@ -77,8 +77,8 @@ async def test_everyone_at_an_example_feels_their_own(
         frequencies = []
         for contact, (low, high) in zip(contacts, people.values(), strict=True):
             assert contact.verdict in ("own", "mixed")
-            assert contact.robust_felt_contrast_db is not None
-            assert contact.robust_felt_contrast_db > 6
+            assert contact.promised_contrast_db is not None
+            assert contact.promised_contrast_db > 6
             assert contact.frequency_hz is not None
             assert low <= contact.frequency_hz <= high
             frequencies.append(contact.frequency_hz)

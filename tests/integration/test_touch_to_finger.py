@@ -16,9 +16,8 @@ import pytest
 from benchmarks.direct_plate import direct_responder
 from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
 from long_form import shortly
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -31,6 +30,7 @@ from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.transients.base_motion import BaseEnvelope, shaped
+from only import only
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -50,16 +50,18 @@ class Truth:
     drive_mode: str = "phased"
     onset_knots: int | None = None
 
-    def asked(self, situation: Situation) -> Question:
-        """The query of a situation."""
-        return Question(
+    def placed(self, situation: Situation) -> Placement:
+        """The fingers of a situation."""
+        return Placement(
             (self.stream.places[situation.felt_at],),
             tuple(self.stream.places[place] for place in situation.quiet),
-            level_db_sl=LEVEL_DB_SL,
-            drive_mode=self.drive_mode,
-            frequencies=(40.0, 500.0),
-            envelopes=True,
         )
+
+    def layer(self, situation: Situation) -> Layer:
+        """What is to play in a situation."""
+        placed, mode = self.placed(situation), self.drive_mode
+        layer, _ = only(self.table, placed, LEVEL_DB_SL, drive_mode=mode, band_hz=(40.0, 500.0))
+        return layer
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
         """Frequencies (f,) [Hz] of the reported pattern, and its acceleration (f, p) [m/s²]."""
@@ -103,7 +105,7 @@ def patterns_match_table(played: Played, truth: Truth) -> None:
     for heard in _touched(played):
         assert len(heard.patterns) == 1, heard.situation
         (reported,) = heard.patterns
-        wanted = find_pattern(truth.table, truth.asked(heard.situation)).excitation
+        wanted = truth.layer(heard.situation).excitation
         assert reported["drive"].keys() == wanted.keys()
         for name, tone in wanted.items():
             got = reported["drive"][name]
@@ -161,7 +163,7 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         )
         judged = min(by_model, JUDGED_UP_TO)
         assert abs(min(measured, JUDGED_UP_TO) - judged) <= 1, (measured, by_model)
-        promised = heard.patterns[-1]["robust_felt_contrast_db"]
+        promised = heard.patterns[-1]["promised_contrast_db"]
         assert 3 < promised <= measured, (promised, measured)
 
 
@@ -173,8 +175,8 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     """
     timing = Timing(truth.table)
     first, *_ = _touched(played)
-    question = truth.asked(first.situation)
-    pattern = timing.with_envelopes(question, find_pattern(truth.table, question), ending=False)
+    layer = truth.layer(first.situation)
+    pattern = timing.with_envelopes(layer, truth.placed(first.situation), ending=False)
     assert pattern.onset is not None
     if truth.onset_knots is not None:
         onset = {name: _sampled(each, truth.onset_knots) for name, each in pattern.onset.items()}
@@ -189,7 +191,7 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     assert abs(min(measured, JUDGED_UP_TO) - judged) <= 2, (measured, predicted)
 
 
-def _onset_contrast(truth: Truth, situation: Situation, pattern: Pattern) -> float:
+def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float:
     """Contrast of the peaks over the first 100 ms of a pattern from rest [dB]."""
     real = truth.drawn.plate.realised(truth.rig)
     plant = Plant(reduce_plate(real.plate, real.mesh, footprints_of(real.eras)), real.eras)

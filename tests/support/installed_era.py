@@ -118,9 +118,9 @@ def try_demo(era: InstalledEra) -> None:
     """The demonstration: the recorded touches that come with it are felt as promised."""
     told = json.loads(era("demo", "--out", "demo", "--json"))
     pairs = [
-        (touch["robust_felt_contrast_db"], touch["measured_felt_contrast_db"])
+        (touch["promised_contrast_db"], touch["measured_contrast_db"])
         for touch in told["touches"]
-        if touch["steady"] and touch["robust_felt_contrast_db"] is not None
+        if touch["steady"] and touch["promised_contrast_db"] is not None
     ]
     expect(len(pairs) > 5, "hardly a touch with others on the plate")
     kept = sum(promised <= felt for promised, felt in pairs)

@@ -22,8 +22,7 @@ from ctypes import CDLL, c_char_p
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.compiled.kernels import processor_features, versions
 
 ROOT = Path(__file__).parents[2]
@@ -99,18 +98,17 @@ def differences(one: Sequence[Answer], other: Sequence[Answer]) -> tuple[list[in
 
 def answers() -> list[Answer]:
     """Answers to the fixed questions: one target, none to five quiet fingers, both drive modes."""
+    from only import only
     from paper_table import contact_sets, smooth_table
 
     found = []
     for quiet in (0, 1, 2, 3, 5):
         for target, *others in contact_sets(12, fingers=max(2, 1 + quiet), seed=quiet):
             for drive_mode in ("phased", "switched"):
-                question = Question(
-                    (target,), tuple(others[:quiet]), level_db_sl=10.0, drive_mode=drive_mode
-                )
-                pattern = find_pattern(smooth_table(), question)
-                tones = sorted({tone.frequency for tone in pattern.excitation.values()})
-                found.append(Answer(tuple(tones), pattern.robust_contrast_db))
+                placed = Placement((target,), tuple(others[:quiet]))
+                layer, felt = only(smooth_table(), placed, 10.0, drive_mode=drive_mode)
+                tones = sorted({tone.frequency for tone in layer.excitation.values()})
+                found.append(Answer(tuple(tones), felt.promised_contrast_db))
     return found
 
 

@@ -66,7 +66,7 @@ class Clicks:
                 before[contact.key] = self.pulses[-1]
             pulse = self._pulses[contact.key] = before.get(contact.key)
             if pulse is None or now < pulse.end:
-                targets.append(Target(contact.key, allow_weaker=True, pulse=pulse))
+                targets.append(Target(contact.key, pulse=pulse))
                 ends.append(math.inf if pulse is None else pulse.end)
         until = min(ends, default=math.inf)
         return HapticIntent(tuple(targets), until=None if until == math.inf else until)

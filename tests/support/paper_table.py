@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
+from model.answer.fingers import Placement
 from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.question import Question
 from model.drive_modes.forms import Forms
 from model.fem.mesh import ELEMENTS, Mesh
 from model.rig.rig import Rig
@@ -23,12 +23,12 @@ def smooth_rig() -> Rig:
     return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, ELEMENTS["Q5"]))
 
 
-def forms_of(table: LocalizationTable, question: Question) -> Forms:
-    """Expected powers at the fingertips of a question, at all frequencies of a table."""
-    fingers = FingersOnPlate.of(table, question.contacts, question.loads)
+def forms_of(table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0) -> Forms:
+    """Expected powers at fingertips, at all frequencies of a table."""
+    fingers = FingersOnPlate.of(table, placed.contacts, placed.loads)
     formed = fingers.forms(np.arange(len(table.frequencies)), with_fine=True)
-    every, count = range(len(question.contacts)), len(question.targets)
-    return formed.of(every[:count], every[count:], question.level_db_sl)
+    every, count = range(len(placed.contacts)), len(placed.targets)
+    return formed.of(every[:count], every[count:], level_db_sl)
 
 
 @cache

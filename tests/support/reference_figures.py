@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from model.answer.query import query_table
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.measures import measures as measures_of
+from model.answer.plan import query
 from model.answer.timing import Timing
 from model.design.area import area_of
 from model.design.contacts import anywhere
@@ -52,17 +53,16 @@ def reference_figures() -> dict[str, list[float]]:
     timing = Timing(table)
     for drive_mode in DRIVE_MODES:
         for name, quiet in CONTACTS.items():
-            question = Question(((0.09, 0.07),), quiet, drive_mode=drive_mode, envelopes=True)
-            pattern, _ = query_table(table, question, timing)
+            placed = Placement(((0.09, 0.07),), quiet)
+            answer = timing.shaped(query(table, placed, drive_mode=drive_mode))
+            felt, more = answer.fingers[0], measures_of(table, answer, timing=timing)
             measures = (
-                pattern.contrast_db,
-                pattern.surroundings_contrast_db,
-                pattern.quiet_level_db_sl,
-                pattern.robust_contrast_db,
-                pattern.robust_felt_contrast_db,
-                pattern.robust_level_db_sl,
-                pattern.transient_contrast_db,
-                pattern.residual_db,
+                felt.contrast_db,
+                answer.layers[0].contrast_to_plate_db,
+                felt.promised_contrast_db,
+                felt.promised_level_db_sl,
+                more.transient_contrast_db,
+                more.residual_db,
             )
             figures[f"query_{drive_mode}_{name}_db"] = np.array(
                 [each for each in measures if each is not None]

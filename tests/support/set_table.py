@@ -1,22 +1,24 @@
 """A table whose answers a test sets, its timing, and rigs for which nothing has to be solved.
 
-The control loop asks a table that has `query` by that, once this is imported, and any other as it
+The control loop asks a table that has `answer` by that, once this is imported, and any other as it
 does without.
 """
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
-from controller.play import decision, table_query
-from model.answer.effect_level import DriveLimits, RaisedPattern
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern, prepare_patterns
-from model.answer.pulse_gains import PulseResponses
-from model.answer.question import MIN_LEVEL_DB_SL, Question
-from model.arrays import FloatArray, IntArray
+from controller.play import decision, joint_answer
+from model.answer.answer import Answer, Layer
+from model.answer.fingers import Finger, Placement, Stimulus, together
+from model.answer.plan import answer, prepare_answers, query
+from model.answer.search import Contents, Stream, Tones
+from model.answer.strength import NO_LIMITS, Limits, scaled
+from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
@@ -59,21 +61,22 @@ class SetTable:
         self.strokes = defaultdict[str, float](lambda: STROKE)
         self.frequencies = np.array([90.0, 110.0, 150.0, 250.0])  # Hz
         self.prepared: list[str] = []
-        self.asked: list[Question] = []
+        self.asked: list[list[Finger]] = []
 
     def prepare(self, drive_mode: str) -> None:
         """Remember it."""
         self.prepared.append(drive_mode)
 
-    def query(self, question: Question, over_effect: object = None) -> Pattern:
-        """The same for every target."""
-        if question.level_db_sl > MIN_LEVEL_DB_SL:  # else it prepares
-            self.asked.append(question)
-        answer = self.shared if self.shared and question.quiet else self.excitation
-        if isinstance(answer, Exception):
-            raise answer
-        contrast = 12.0 if question.quiet else None
-        return Pattern(answer, 0.015, 20.0, contrast, None, question.drive_mode or "")
+    def answer(
+        self, fingers: Sequence[Finger], *, drive_mode: str, shaped: bool, limits: Limits
+    ) -> Answer:
+        """The same for every target, 12 dB above others at 20 dB SL."""
+        self.asked.append([*fingers])
+        quiet = [n for n, each in enumerate(fingers) if each.stimulus is None]
+        drive = self.shared if self.shared and quiet else self.excitation
+        if isinstance(drive, Exception):
+            raise drive
+        return set_answer(fingers, drive, drive_mode=drive_mode, limits=limits)
 
     def amplitudes(
         self, excitation: Excitation, points: FloatArray
@@ -82,42 +85,99 @@ class SetTable:
         return np.array([110.0]), np.ones((1, len(points)))
 
 
-def _query(table: object, question: Question, over_effect: object = None) -> Pattern:
-    return getattr(table, "query", partial(find_pattern, table))(question, over_effect)
+@dataclass(frozen=True, eq=False)
+class SetAnswer(Answer):
+    """An answer whose layers all play one drive."""
+
+    drive: Excitation = field(default_factory=dict)
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """Along ramps of 15 ms."""
+        return tuple(replace(each, ramp=0.015) for each in Answer.layers.func(self))
+
+    def _excitations(self, content: int) -> list[Excitation]:
+        gain = self.tones.gains[content]
+        return [
+            {
+                name: replace(tone, amplitude=gain * tone.amplitude)
+                for name, tone in self.drive.items()
+            }
+        ]
 
 
-def _prepare(table: object, drive_mode: str | None) -> None:
-    getattr(table, "prepare", partial(prepare_patterns, table))(drive_mode)
+def set_answer(
+    fingers: Sequence[Finger],
+    drive: Excitation,
+    *,
+    level_db_sl: float = 20.0,
+    contrast_db: float = 12.0,
+    drive_mode: str = "",
+    limits: Limits = NO_LIMITS,
+) -> Answer:
+    """Each finger with a stimulus feels a layer of its own, within the amplifiers' limits."""
+    felt = [n for n, each in enumerate(fingers) if each.stimulus is not None]
+    quiet = tuple(n for n in range(len(fingers)) if n not in felt)
+    contrast = contrast_db if len(fingers) > 1 else np.nan
+    foreign = level_db_sl - contrast_db if len(fingers) > 1 else np.nan
+    streams = []
+    for n in felt:
+        stimulus = fingers[n].stimulus
+        duration = None if stimulus is None else stimulus.duration
+        streams.append(Stream((n,), level_db_sl, ((0, 1),), fingers[n].priority, duration))
+    tones = Tones(
+        [0] * len(felt),
+        [[1.0]] * len(felt),
+        [1.0] * len(felt),
+        range(len(felt)),
+        [(contrast,) * 3] * len(fingers),
+        [(level_db_sl, level_db_sl)] * len(fingers),
+        [foreign] * len(fingers),
+        contrast,
+        foreign,
+        1.0,
+        is_apart=True,
+    )
+    places = tuple(each.at for each in fingers)
+    contents = Contents(places, (), tuple(streams), quiet, drive_mode=drive_mode)
+    found: Answer = SetAnswer(
+        tuple(fingers),
+        contents,
+        tones,
+        (),
+        (),
+        (),
+        np.array([110.0]),
+        np.ones(1, np.float32),
+        drive=drive,
+    )
+    factor = limits.factor_within(found.amplitudes, defaultdict[str, float](lambda: STROKE))
+    return scaled(found, 20 * np.log10(factor)) if factor < 1 else found
 
 
-decision.find_pattern = table_query.find_pattern = _query
-decision.prepare_patterns = _prepare
+def _answer(table: Any, fingers: Sequence[Finger], **others: Any) -> Answer:
+    asked: Answer = getattr(table, "answer", partial(answer, table))(fingers, **others)
+    return asked
 
 
-class SetLevels:
-    """Levels over durations that are the steady ones."""
+def _query(table: Any, placed: Placement, *level: float, **others: Any) -> Answer:
+    if isinstance(table, SetTable):
+        if isinstance(table.excitation, Exception):
+            raise table.excitation
+        return set_answer(together(placed, Stimulus()), table.excitation)
+    return query(table, placed, *level, **others)
 
-    def raised(
-        self,
-        pattern: Pattern,
-        question: Question,
-        *,
-        level_db_sl: float,
-        duration: float,
-        limits: DriveLimits,
-    ) -> RaisedPattern:
-        """The pattern as it is."""
-        return RaisedPattern(pattern, min(level_db_sl, pattern.level_db_sl), 0.0, None)
 
-    def responses(self, rows: IntArray, *, question: Question, duration: float) -> PulseResponses:
-        """Not to be called."""
-        raise AssertionError("a table whose answers are set must ask for no responses")
+def _prepare(table: Any, drive_mode: str | None) -> None:
+    getattr(table, "prepare", partial(prepare_answers, table))(drive_mode)
+
+
+joint_answer.answer = _answer
+decision.prepare_answers, decision.query = _prepare, _query
 
 
 class SetTiming:
-    """A timing that leaves patterns along their ramps; prepared [Hz]: what was asked of it."""
-
-    levels = SetLevels()
+    """A timing that leaves layers along their ramps; prepared [Hz]: what was asked of it."""
 
     def __init__(self) -> None:
         self.prepared: list[float] = []
@@ -127,11 +187,11 @@ class SetTiming:
         self.prepared += frequencies
 
     def with_envelopes(
-        self, question: Question, pattern: Pattern, *, onset: bool, ending: bool
-    ) -> Pattern:
+        self, layer: Layer, placed: Placement, *, onset: bool, ending: bool
+    ) -> Layer:
         """Return it as it is."""
-        return pattern
+        return layer
 
-    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
-        """Return it as it is."""
-        return pattern
+    def transient_contrast_db(self, layer: Layer, placed: Placement) -> float | None:
+        """Of nothing."""
+        return None

@@ -17,7 +17,11 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.content import Content, Selection
+from controller.play.intent import Target
+from controller.play.joint_answer import answered, selection_of
 from controller.play.observer import Applied
+from controller.sources.contacts import Contact, ContactKey
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
@@ -44,6 +48,17 @@ LAYOUT = SurfaceLayout(
     {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
     elsewhere=None,
 )
+
+
+def chosen_for(
+    targets: Sequence[tuple[Contact, Target]],
+    capabilities: PlaybackCapabilities,
+    *,
+    before: Mapping[tuple[ContactKey, int], Content] = MappingProxyType({}),
+) -> Selection:
+    """What is chosen for fingers that feel what lasts, among no others."""
+    found = answered(table(), targets, (), capabilities, before=before)
+    return selection_of(table(), found, targets, (), before=before)
 
 
 def answers_take(patch: pytest.MonkeyPatch, *seconds: float) -> list[float]:

@@ -64,7 +64,7 @@ RETIRED_WORDS = {
     "patience": "_TIMEOUT",
     "(?<!at_)most|longest|usual": "MAX_, DEFAULT_",
     "persistently": "retry_while_degraded",
-    "or_less": "allow_weaker",
+    "or_less": "is_limit",
     "sole": "HostLock",
     "sounding": "frequencies_at",
     "at_one_moment": "simultaneous",

@@ -177,7 +177,7 @@ function showLayers() {
 // What every finger feels of its own content, where there are several.
 function summariseContents({ contacts, latency_ms }) {
   const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
-    const { verdict, frequency_hz, level_db_sl, robust_felt_contrast_db: promised } = contact;
+    const { verdict, frequency_hz, level_db_sl, promised_contrast_db: promised } = contact;
     if (frequency_hz === null) return verdict;
     return `${fixed(frequency_hz)} Hz ${verdict}, ${fixed(level_db_sl)} dB SL, at least ${fixed(promised)} dB over others`;
   });
@@ -192,7 +192,7 @@ function summarise(pattern) {
   }
   const { contacts, latency_ms } = pattern;
   const level = contacts.filter(({ role }) => role === "target").at(-1)?.level_db_sl;  // as at the finger
-  const { robust_felt_contrast_db: promised, predicted_felt_contrast_db: modelled } = pattern;
+  const { promised_contrast_db: promised, predicted_contrast_db: modelled } = pattern;
   const parts = [];
   if (level != null) parts.push(`target: ${fixed(level)} dB SL`);
   if (promised != null) parts.push(`at least ${fixed(promised)} dB over the other fingers (${fixed(modelled)} as modelled)`);

@@ -183,7 +183,7 @@ export class PlateOverlay {
   }
 
   contact(contact) {
-    const { role, level_db_sl, frequency_hz, held_back, verdict, robust_felt_contrast_db: promised } = contact;
+    const { role, level_db_sl, frequency_hz, held_back, verdict, promised_contrast_db: promised } = contact;
     const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
     const isKnown = (value) => value !== null && value !== undefined;

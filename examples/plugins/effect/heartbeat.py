@@ -39,7 +39,7 @@ class Beating(EffectRun):
         if not is_second:
             return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
         weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
-        return Sensation(weaker, until=self.pulse.end, allow_weaker=True, pulse=self.pulse)
+        return Sensation(weaker, until=self.pulse.end, pulse=self.pulse)
 
 
 class Heartbeat(Effect):

@@ -9,7 +9,7 @@ import numpy as np
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import DriverError, LinkError
 from drivers.playing.contents import Tone
-from model.answer.pattern import Pattern
+from model.answer.answer import Layer
 from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
@@ -64,7 +64,7 @@ def check_table(
         for promise in promises(
             table, places, count=settings.samples, level=level, seed=settings.seed
         ):
-            excitation = promise.pattern.excitation
+            excitation = promise.layer.excitation
             frequencies = np.unique([tone.frequency for tone in excitation.values()])
             # A table may have been built of more; an amplifier's ledger refuses them, too.
             desk.check_frequencies(frequencies, what="frequencies of the table")
@@ -94,7 +94,7 @@ def _recorder(
     )
     with closing(card):
         if settings.url is None:
-            yield card.rate, lambda promise: _by_card(card, desk, promise.pattern, level)
+            yield card.rate, lambda promise: _by_card(card, desk, promise.layer, level)
             return
         rig = desk.rig
         is_output = not rig.outputs.isdisjoint(rig.amplifiers)
@@ -115,7 +115,7 @@ def _by_amplifier(
             tone.amplitude / rig.era(name).stroke,
             float(np.degrees(tone.phase)),
         )
-        for name, tone in promise.pattern.excitation.items()
+        for name, tone in promise.layer.excitation.items()
     ]
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
@@ -131,7 +131,7 @@ def _by_amplifier(
     return heard[-round(_WINDOW * card.rate) :].astype(float)
 
 
-def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> FloatArray:
+def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> FloatArray:
     """Play a pattern from memory: a level is a sample, as of an amplifier whose output it is.
 
     level: that no output exceeds, the loop-back's included, since cables may be swapped.

@@ -22,10 +22,8 @@ from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import answer
-from model.answer.effect_level import EffectLevels
-from model.answer.request import Request
 from model.config.shapes import Rectangle
+from only import phased, wants
 from several_fingers import playable, table
 
 SIZE = 0.03
@@ -54,7 +52,7 @@ def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> l
 
     async def predicted() -> tuple[Prediction, ...]:
         arrived = asyncio.Event()
-        selector = Selector(Chooser(table(), EffectLevels(table())), arrived=arrived.set)
+        selector = Selector(Chooser(table()), arrived=arrived.set)
         selector.select(contacts, intent, playable())
         if selector.is_choosing:
             await arrived.wait()
@@ -86,8 +84,8 @@ def test_places_are_the_worst_of_their_regions() -> None:
         shapes = [one.shape for one in (west, near, east) if one.name in pair]
         assert all(shape.contains(*at) for shape, at in zip(shapes, each.at, strict=True))
         if len(pair) == 2:
-            requests = [Request(shape.centre, level_db_sl=14.0) for shape in shapes]
-            centred = answer(table(), requests, min_contrast_db=-math.inf)
+            fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
+            centred = phased(table(), fingers, min_contrast_db=-math.inf)
             assert centred.promised_worst_db is not None
             assert each.worst_db <= centred.promised_worst_db
             assert each.worst_db <= min(each.contrasts)

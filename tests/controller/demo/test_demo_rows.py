@@ -19,7 +19,6 @@ from controller.demo.touch_row import (
     FingerRow,
     FingerVibration,
     TouchRow,
-    felt_contrast_db,
     peak_contrast_db,
     steady_contrast_db,
 )
@@ -34,8 +33,8 @@ from registry import clock
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 
-FIGURES = ("felt_contrast_db", "contrast_db", "transient_contrast_db", "level_db_sl")
-ROBUST = ("robust_felt_contrast_db", "robust_contrast_db")
+FIGURES = ("contrast_db", "transient_contrast_db", "level_db_sl")
+PROMISED = ("promised_contrast_db",)
 KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
     *("played_s", "shaped_onset", "steady"),
@@ -71,16 +70,8 @@ def row(time, *, contrast, others):
         targets_m=[(0.05, 0.05), (0.2, 0.1)],
         quiet={f"q{n}": (0.1, 0.01 * n) for n in range(others)},
         measured_level_db_sl=19.0,
-        measured_felt_contrast_db=contrast,
+        measured_contrast_db=contrast,
     )
-
-
-def test_steady_contrast_relates_mean_of_target_to_loudest_quiet_point():
-    """By hand: mean of (3 + 1, 5 + 1) is 5, the loudest quiet point 0.5, so 20 dB."""
-    target = vibration([[3.0, 5.0], [1.0, 1.0]])
-    quiet = [vibration([[0.1, 0.4], [0.1, 0.1]]), vibration([[0.2], [0.2]])]
-    assert steady_contrast_db(target, quiet) == pytest.approx(20.0)
-    assert steady_contrast_db(target, []) is None
 
 
 def test_felt_contrast_relates_levels_not_accelerations():
@@ -90,10 +81,10 @@ def test_felt_contrast_relates_levels_not_accelerations():
     """
     low, high = detection_threshold(np.array([100.0, 250.0]))
     target, quiet = vibration([[10 * low], [0.0]]), vibration([[0.0], [10 * low]])
-    assert felt_contrast_db(target, [quiet]) == pytest.approx(20 * np.log10(high / low))
-    assert felt_contrast_db(target, []) is None
+    assert steady_contrast_db(target, [quiet]) == pytest.approx(20 * np.log10(high / low))
+    assert steady_contrast_db(target, []) is None
     both = vibration([[3 * low, 0.0], [4 * high, 0.0]])
-    assert felt_contrast_db(target, [both, quiet]) == pytest.approx(
+    assert steady_contrast_db(target, [both, quiet]) == pytest.approx(
         20 - 20 * np.log10(max(5, 10 * low / high))
     )
 
@@ -104,21 +95,21 @@ def test_contents_are_told_apart_by_their_frequencies():
     felt = vibration(np.diag(thresholds) @ [[10.0], [0.3], [0.4]], (90.0, 170.02, 260.0))
     own, foreign = felt.parted(90.0)
     assert own.level_db_sl == pytest.approx(20.0)
-    assert felt_contrast_db(own, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
+    assert steady_contrast_db(own, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
     nothing, all_others = felt.parted(500.0)
     assert nothing.level_db_sl == -np.inf
     assert all_others.level_db_sl == pytest.approx(felt.level_db_sl)
 
 
-def test_promise_is_kept_by_at_least_the_robust_contrast():
+def test_promise_is_kept_by_at_least_the_promised_contrast():
     """Only steady touches with a promise and a measurement count."""
-    promised = replace(row(1.0, contrast=12.0, others=1), steady=True, robust_felt_contrast_db=12.0)
+    promised = replace(row(1.0, contrast=12.0, others=1), steady=True, promised_contrast_db=12.0)
     assert promised.keeps_promise
-    assert replace(promised, measured_felt_contrast_db=11.9).keeps_promise is False
+    assert replace(promised, measured_contrast_db=11.9).keeps_promise is False
     for unknown in (
         {"steady": False},
-        {"robust_felt_contrast_db": None},
-        {"measured_felt_contrast_db": None},
+        {"promised_contrast_db": None},
+        {"measured_contrast_db": None},
     ):
         assert replace(promised, **unknown).keeps_promise is None
 
@@ -134,7 +125,7 @@ def test_json_has_the_documented_keys_of_every_touch():
     """Also of one that was not driven: without figures, but with the reason."""
     silent = replace(row(1.0, contrast=None, others=1), reason="too close")
     figures = {f"{what}_{of}" for what in ("predicted", "measured") for of in FIGURES}
-    assert silent.as_json().keys() == {*figures, *ROBUST, *KEYS}
+    assert silent.as_json().keys() == {*figures, *PROMISED, *KEYS}
     assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
     shared = replace(silent, fingers=[FINGER])
     assert shared.as_json().keys() - silent.as_json().keys() == {"fingers"}

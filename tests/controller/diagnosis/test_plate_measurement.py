@@ -20,8 +20,8 @@ from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
 from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
@@ -212,8 +212,8 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
         await player.group.arm()
         for target, quiet in FINGERS:
             sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
-            pattern = find_pattern(table, Question((target,), (quiet,), level_db_sl=35.0))
-            plays = await player.play(pattern.excitation)
+            (layer,) = query(table, Placement((target,), (quiet,)), 35.0).layers
+            plays = await player.play(layer.excitation)
             for _ in range(30):
                 await asyncio.sleep(0.05)
                 await player.group.beat()

@@ -300,7 +300,7 @@ def test_ramp_rises_in_steps(
     for one, number in zip(felt, range(1, len(levels)), strict=False):
         until = getattr(one, "until", None)
         assert until is None or until == pytest.approx(5.0 + step * number)
-    last = Sensation(level, allow_weaker=True) if ramp.hold else None
+    last = Sensation(level) if ramp.hold else None
     assert felt[-1] == last
 
 

@@ -15,7 +15,6 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.decision import ENDED, Decider
 from controller.play.intent import Target
-from controller.play.joint_answer import query_jointly, unshaped
 from controller.play.observer import Applied
 from controller.play.playing import PlayedContent
 from controller.play.routing import PlateSet
@@ -23,7 +22,7 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
-from model.answer.pattern import Pattern
+from model.answer import answer
 from model.arrays import Complex64Array
 from model.errors import InputError
 from set_table import SetTiming
@@ -33,6 +32,7 @@ from several_fingers import (
     LEFT,
     RIGHT,
     answers_take,
+    chosen_for,
     fingers_on,
     playable,
     table,
@@ -55,7 +55,7 @@ async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> N
         assert abs(first.frequency - second.frequency) >= 30
         assert [each.verdict for each in applied.targets] == ["own", "own"]
         predicted = {
-            one.content.targets[0][0].key.id: one.pattern.felt_contrast_db
+            one.content.targets[0][0].key.id: one.content.predictions[0].contrast_db
             for one in applied.contents.values()
         }
         assert fingers.contrasts() == pytest.approx(predicted, abs=1.0)
@@ -440,7 +440,7 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
         def refuse(*_: Any, **__: Any) -> None:
             raise InputError("nothing is felt there")
 
-        monkeypatch.setattr("controller.play.chooser.query_table", refuse)
+        monkeypatch.setattr("controller.play.chooser.answered", refuse)
         fingers.at[2] = (0.162, 0.049)
         await fingers.hold(0.02)
         assert len(fingers.committed) == count
@@ -564,7 +564,7 @@ async def test_an_answer_that_fails_silences_all_and_says_why(
 
     async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
         with monkeypatch.context() as patched:
-            patched.setattr("controller.play.chooser.query_jointly", fail)
+            patched.setattr("controller.play.chooser.answered", fail)
             fingers.at[2] = RIGHT
             await fingers.hold(0.5)
         assert calls == 1
@@ -588,7 +588,7 @@ async def test_status_says_what_each_finger_feels() -> None:
         assert len(event.layers) == 3
         for contact, (number, one) in zip(event.contacts, applied.contents.items(), strict=True):
             assert (contact.role, contact.held_back) == ("target", None)
-            promised = contact.robust_felt_contrast_db
+            promised = contact.promised_contrast_db
             assert promised is not None
             assert contact.verdict == ("own" if promised >= 12 else "mixed")
             assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
@@ -606,7 +606,7 @@ def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> No
         for n, at in enumerate(((0.06, 0.06), (0.2, 0.1)))
     ]
     targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
-    found = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
+    found = chosen_for(targets, playable(4))
     (held_back,) = found.not_served
     assert held_back.promised_contrast_db is not None
     assert held_back.promised_contrast_db > 12
@@ -618,12 +618,12 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
     contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
     targets = [(each, Target(each.key, 14.0)) for each in contacts]
-    first = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
+    first = chosen_for(targets, playable(4))
     before = {each.key: each for each in first.contents}
     moved = replace(contacts[0], x=contacts[0].x + 0.01)
     third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
     joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
-    second = query_jointly(table(), joined, (), playable(4), before=before, shape=unshaped)
+    second = chosen_for(joined, playable(4), before=before)
     places = [(each.x, each.y) for each, _ in joined]
     fields = table().unit_fields(np.array(places), contacts=places)
     kept = 0
@@ -637,7 +637,7 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     assert kept
 
 
-def _felt(pattern: Pattern, fields: Complex64Array) -> complex:
+def _felt(pattern: answer.Layer, fields: Complex64Array) -> complex:
     """Acceleration at a finger of a pattern of one frequency, by each ERA's field (f, eras)."""
     (frequency,) = {tone.frequency for tone in pattern.excitation.values()}
     row = int(np.flatnonzero(table().frequencies == frequency)[0])

@@ -40,8 +40,8 @@ async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_
                 press(base * (1.15 if number % 2 else 1 / 1.15))
                 await asyncio.sleep(0.01)
             assert len(chain.table.asked) == decisions
-        asked = [question.loads for question in chain.table.asked]
-    assert asked == [(), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
+        asked = [tuple(each.load for each in fingers) for fingers in chain.table.asked]
+    assert asked == [(1.0, 1.0), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
 
 
 @pytest.mark.parametrize("later", range(1, 4))

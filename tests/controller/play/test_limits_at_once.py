@@ -9,11 +9,9 @@ from controller.play.capabilities import PlaybackCapabilities
 from controller.play.chooser import Chooser
 from controller.play.content import Selection
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.joint_answer import query_jointly, unshaped
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.effect_level import EffectLevels
-from several_fingers import LEFT, RIGHT, playable, table
+from several_fingers import LEFT, RIGHT, chosen_for, playable, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
 FREE = playable()
@@ -21,13 +19,13 @@ FREE = playable()
 
 def a_selector() -> Selector:
     """One that has chosen nothing yet."""
-    return Selector(Chooser(table(), EffectLevels(table())))
+    return Selector(Chooser(table()))
 
 
 def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:
     """What is chosen for both fingers."""
     served = list(zip(CONTACTS, targets, strict=True))
-    return query_jointly(table(), served, (), capabilities, before={}, shape=unshaped)
+    return chosen_for(served, capabilities)
 
 
 def sums(found: Selection) -> np.ndarray:

@@ -16,8 +16,8 @@ from controller.play.playing import PlayedContent, Playing
 from controller.play.routing import PlateSet
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.config.shapes import Rectangle
 from model.vibration.excitation import Tone
 from paper_table import smooth_rig
@@ -162,8 +162,8 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
     click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
 
     def content(targets: Targets, frequency: float, voice: int = 0) -> Content:
-        pattern = Pattern({"SW": Tone(frequency, 1e-6)}, 0.02, 14.0, None, None)
-        return Content(targets, Question((LEFT,)), pattern, voice=voice)
+        pattern = Layer({"SW": Tone(frequency, 1e-6)})
+        return Content(targets, Placement((LEFT,)), pattern, voice=voice)
 
     voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
     playing = Playing(smooth_rig(), 4, lambda key: 0.0)
@@ -181,9 +181,9 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
     shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
     click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
-    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 14.0, None, None)
-    lasting = Content(shared, Question((LEFT,)), pattern)
-    clicking = Content(((contacts[0], click),), Question((LEFT,)), pattern)
+    pattern = Layer({"SW": Tone(100.0, 1e-6)})
+    lasting = Content(shared, Placement((LEFT,)), pattern)
+    clicking = Content(((contacts[0], click),), Placement((LEFT,)), pattern)
     playing = Playing(smooth_rig(), 4, lambda key: 0.0)
     contents = {
         number: PlayedContent(one, PlateSet({}, 0.0), pattern, drive={})

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,16 +13,14 @@ from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
-from controller.play.table_query import strongest
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer.answer import Answer
+from model.answer.fingers import Finger, Stimulus
 from model.errors import InputError
-from model.finger.perception import DEFAULT_THRESHOLD
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Tone
-from set_table import SetLevels
+from set_table import set_answer
 from small_table import small_table
 
 CAPABILITIES = PlaybackCapabilities(
@@ -37,27 +36,29 @@ class Table:
     strokes: Mapping[str, float] = MappingProxyType({"SW": 1e-4})
 
     def __init__(self) -> None:
-        self.asked: list[Question] = []
+        self.asked: list[list[Finger]] = []
+        self.given: list[dict[str, Any]] = []
         self.refuse_below = 0.0
-        self.most = math.inf
-        self.threshold = DEFAULT_THRESHOLD
+        self.most: float | None = None
         self.error: Exception | None = None
-        self.quiet_level: float | None = None
 
     def prepare(self, mode: str) -> None:
         """Do nothing."""
 
-    def query(self, question: Question, over_effect: object = None) -> Pattern:
-        """A pattern that names its question."""
-        self.asked.append(question)
+    def answer(self, fingers: Sequence[Finger], **others: Any) -> Answer:
+        """One of a frequency that names how often it was asked, at the level asked for."""
+        self.asked.append([*fingers])
+        self.given.append(others)
+        (stimulus,) = [each.stimulus for each in fingers if each.stimulus is not None]
         if self.error is not None:
             raise self.error
-        if question.targets[0][0] < self.refuse_below:
+        if fingers[0].at[0] < self.refuse_below:
             raise InputError("nothing is felt there")
-        if question.level_db_sl > self.most:
-            raise InputError("too loud")
-        tone = Tone(100.0 + len(self.asked), 1e-6)
-        return Pattern({"SW": tone}, 0.02, question.level_db_sl, None, self.quiet_level)
+        drive = {"SW": Tone(100.0 + len(self.asked), 1e-6)}
+        level, mode = stimulus.level_db_sl, others["drive_mode"]
+        level = level if self.most is None else self.most
+        limits = others["limits"]
+        return set_answer(fingers, drive, level_db_sl=level, drive_mode=mode, limits=limits)
 
 
 def wanting(**levels: float | None) -> HapticIntent:
@@ -73,7 +74,7 @@ def at(id: int, x: float, y: float = 0.1) -> Contact:
 
 def selector_of(table: Table | LocalizationTable) -> Selector:
     """A selector by a table."""
-    return Selector(Chooser(table, SetLevels()))  # type: ignore[arg-type]
+    return Selector(Chooser(cast(LocalizationTable, table)))
 
 
 @pytest.fixture
@@ -83,17 +84,16 @@ def table() -> Table:
 
 
 def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
-    """The question has the target's level, and drive modes and band of the amplifiers."""
+    """The fingers have the target's level, and drive mode and band of the amplifiers."""
     contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
     shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onset_knots=20))
     selector_of(table).select(contacts, wanting(c3=17.0), shaped)
-    assert table.asked.pop().envelopes
     selection = selector_of(table).select(contacts, wanting(c3=17.0), CAPABILITIES)
-    (question,) = table.asked
-    assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
-    assert (question.level_db_sl, question.drive_mode) == (17.0, "phased")
-    assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
-    assert not question.envelopes
+    assert [each["shaped"] for each in table.given] == [True, False]
+    assert table.given[1]["drive_mode"] == "phased"
+    target, *quiet = table.asked[1]
+    assert (target.at, [each.at for each in quiet]) == ((0.25, 0.1), [(0.1, 0.1), (0.2, 0.1)])
+    assert target.stimulus == Stimulus(17.0, (45.0, 300.0))
     (predicted,) = selection.predictions
     assert (predicted.contact.key.id, predicted.level_db_sl) == (3, 17.0)
 
@@ -118,75 +118,29 @@ def test_selector_asks_within_the_band_of_its_target(
     table.frequencies = np.array([80.0, 100.0, 120.0, 250.0, 350.0])
     intent = HapticIntent((Target(ContactKey("a", 1), 12.0, band=band),))
     selector_of(table).select((at(1, 0.1),), intent, CAPABILITIES)
-    assert table.asked[0].frequencies == asked
+    stimulus = table.asked[0][0].stimulus
+    assert stimulus is not None
+    assert stimulus.band_hz == asked
 
 
-def test_selector_scales_to_what_the_neighbours_allow(table: Table) -> None:
-    """Queried at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
-    table.quiet_level = -2.0
-    selection = selector_of(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
-    assert table.asked[0].level_db_sl == 12.0
-    (content,) = selection.contents
-    assert selection.predictions[0].level_db_sl == pytest.approx(4.0)
-    assert content.pattern.quiet_level_db_sl == pytest.approx(-10.0)
-    assert content.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
-
-
-@pytest.mark.parametrize(
-    ("quiet", "largest", "level"),
-    [
-        (-40.0, 1.0, 26.0),
-        (None, 1.0, 26.0),
-        (-40.0, 2e-6, 12 + 20 * math.log10(2)),
-    ],
-)
-def test_strongest_is_bounded_by_level_and_stroke(
-    quiet: float | None, largest: float, level: float
-) -> None:
-    """Twice a strong vibration, or the full stroke; without neighbours too."""
-    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, quiet)
-    found = strongest(pattern, {"SW": largest})
-    assert found.level_db_sl == pytest.approx(level)
-    gain = 10 ** ((level - 12.0) / 20)
-    assert found.excitation["SW"].amplitude == pytest.approx(1e-6 * gain)
-
-
-def test_strongest_refuses_less_than_10_db_of_contrast() -> None:
-    """Nothing would be felt at the target alone."""
-    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
-    with pytest.raises(InputError):
-        strongest(pattern, {"SW": 1.0})
-
-
-def allow_weaker(level: float) -> HapticIntent:
-    """One level at contact 1, or less where the plate cannot reach it."""
-    return HapticIntent((Target(ContactKey("a", 1), level, allow_weaker=True),))
-
-
-def test_selector_saturates_a_level_or_less(table: Table) -> None:
-    """As strong as neighbours and stroke allow, and never above the level.
-
-    12 dB SL at 1 um, a stroke of 2 um: 6 dB more; at the quiet finger there are -17 dB, 7 dB less
-    than allowed.
-    """
-    table.most, table.quiet_level = 15.0, -17.0
-    capabilities = replace(CAPABILITIES, max_amplitudes={"SW": 2e-6})
+def test_selector_asks_for_what_the_neighbours_allow(table: Table) -> None:
+    """Up to 26 dB SL; where less than 0 are left it says that a finger is in the way."""
     contacts = (at(1, 0.1), at(2, 0.2))
-    for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
-        selection = selector_of(table).select(contacts, allow_weaker(wanted), capabilities)
-        (content,) = selection.contents
-        assert selection.predictions[0].level_db_sl == pytest.approx(level)
-        assert content.question is table.asked[-1]
-    table.most = 11.0
-    selection = selector_of(table).select(contacts, allow_weaker(30.0), capabilities)
-    assert (selection.contents, selection.reason) == ((), "too loud")
+    selector_of(table).select(contacts, wanting(c1=None), CAPABILITIES)
+    stimulus = table.asked[0][0].stimulus
+    assert stimulus == Stimulus(26.0, (45.0, 300.0), is_limit=True)
+    table.most = -0.1
+    selection = selector_of(table).select(contacts, wanting(c1=None), CAPABILITIES)
+    assert selection.contents == ()
+    assert selection.reason is not None
+    assert "quiet finger" in selection.reason
 
 
 def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
-    selection = selector_of(table).select((at(1, 0.1),), allow_weaker(60.0), capabilities)
+    selection = selector_of(table).select((at(1, 0.1),), wanting(c1=60.0), capabilities)
     (content,) = selection.contents
     assert 12 < selection.predictions[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in content.pattern.excitation.values())
@@ -232,7 +186,7 @@ ONE, TWO, NONE = at(1, 0.1), at(2, 0.2), "nothing is wanted"
 PULSE = Pulse(0.04, requested_at=0.0, is_raised=False)
 PULSED = HapticIntent((Target(ContactKey("a", 1), 20.0, pulse=PULSE),))
 REFUSED = "nothing is felt there"
-BAND, ALONE = (45.0, 300.0), (100.0, 100.0)
+BAND, ALONE = (45.0, 300.0), (101.0, 101.0)
 FAILED = "ZeroDivisionError: by no ERA"
 
 COURSES: Mapping[str, Sequence[Chosen]] = {
@@ -245,11 +199,11 @@ COURSES: Mapping[str, Sequence[Chosen]] = {
     "the target moves": moving(1),
     # Loads are asked for in the order of the question, and not at all where all are 1.
     "another load": [
-        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=()),
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=(1.0, 1.0)),
         Chosen((loaded(ONE, 1.6), TWO), wanting(c2=20.0), True, loads=(1.0, 1.6)),
         Chosen((loaded(ONE, 1.6), TWO), wanting(c2=20.0), False),
         Chosen((loaded(ONE, 1.6), loaded(TWO, 2.4)), wanting(c2=20.0), True, loads=(2.4, 1.6)),
-        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=()),
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=(1.0, 1.0)),
     ],
     # It is over before a change would help.
     "a short pulse": [
@@ -298,10 +252,12 @@ def test_selector_asks_again_when_it_must(table: Table, name: str) -> None:
         assert step.is_asked is (chosen is not before) or not chosen.targets, step
         assert bool(chosen.contents) is not bool(step.reason), step
         assert step.reason in ("", chosen.reason), step
-        for wanted, found in ((step.loads, "loads"), (step.frequencies, "frequencies")):
-            assert wanted in (None, *(getattr(one.question, found) for one in chosen.contents)), (
-                step
-            )
+        if step.loads is not None:
+            assert tuple(each.load for each in table.asked[-1]) == step.loads, step
+        if step.frequencies is not None:
+            stimulus = table.asked[-1][0].stimulus
+            assert stimulus is not None
+            assert stimulus.band_hz == step.frequencies, step
         before = chosen
 
 

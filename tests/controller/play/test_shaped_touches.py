@@ -19,8 +19,8 @@ from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import QUANTITIES
-from model.answer.pattern import Pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.transients.base_motion import BaseEnvelope
 from set_chain import FINGER, OTHER, set_running
 from set_table import SetTiming
@@ -33,8 +33,8 @@ class Shapes(SetTiming):
     largest = 1.0
 
     def with_envelopes(
-        self, question: Question, pattern: Pattern, *, onset: bool, ending: bool
-    ) -> Pattern:
+        self, pattern: Layer, placed: Placement, *, onset: bool, ending: bool
+    ) -> Layer:
         """The lines, for the ERAs that play; the largest knot of an onset can be set."""
         up = [number / 21 * self.largest for number in range(1, 21)] + [1.0]
         down = [1 - number / 8 for number in range(1, 9)]
@@ -44,12 +44,12 @@ class Shapes(SetTiming):
             ending=_along(pattern, 1.0, down) if ending else pattern.ending,
         )
 
-    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
+    def transient_contrast_db(self, pattern: Layer, placed: Placement) -> float | None:
         """30 dB with an onset, 10 without."""
-        return replace(pattern, transient_contrast_db=30.0 if pattern.onset else 10.0)
+        return 30.0 if pattern.onset else 10.0
 
 
-def _along(pattern: Pattern, start: float, shares: Sequence[float]) -> dict[str, BaseEnvelope]:
+def _along(pattern: Layer, start: float, shares: Sequence[float]) -> dict[str, BaseEnvelope]:
     tones = {
         name: (tone.frequency, cmath.rect(tone.amplitude, tone.phase))
         for name, tone in pattern.excitation.items()

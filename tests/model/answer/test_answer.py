@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model.answer.answer import answer
-from model.answer.pattern_query import find_pattern, prepare_patterns
+from model.answer.as_json import query_one
+from model.answer.fingers import Finger, Placement
+from model.answer.plan import answer as answer_by_table
+from model.answer.plan import prepare_answers
 from model.answer.promised import felt_amplitudes, loudest_power
-from model.answer.query import answer_as_json
-from model.answer.question import Question
-from model.answer.request import Finger, Request
 from model.answer.search_in_c import choose_tones
 from model.cli import app
 from model.errors import InputError
@@ -20,6 +19,8 @@ from model.finger.perception import detection_threshold
 from model.study.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
 from model.table.raster_kernel import read_fingertips
+from only import drives, only, wants
+from only import phased as answer
 from paper_table import contact_sets, smooth_table
 
 NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06)
@@ -29,12 +30,12 @@ QUIET = (0.16, 0.20)
 def given(table, found, quiet, plates):
     """Contrast of each finger (fingers, d) as amplitudes, contents first, on exact plates."""
     layers = found.layers
-    question = Question(tuple(each.request.at for each in layers), tuple(quiet))
-    tips = read_fingertips(table, question.contacts)
+    placed = Placement(tuple(each.at for each in found.asked if each.stimulus), tuple(quiet))
+    tips = read_fingertips(table, placed.contacts)
     count, points = tips.fine_weights.shape
     powers = []
     for layer in layers:
-        rows, power = powers_on(table, question, layer.excitation, plates)
+        rows, power = powers_on(table, placed, layer.excitation, plates)
         frequency = table.frequencies[rows]
         sensed = power[0] / detection_threshold(frequency) ** 2
         powers.append(sensed.reshape(count, points, -1))
@@ -72,7 +73,7 @@ def test_promise_of_several_contents_is_kept(contents, quiet):
     table = smooth_table()
     for number, places in enumerate(contact_sets(8, fingers=contents + quiet, seed=3)):
         own, others = places[:contents], places[contents:]
-        requests = [Request(at, level_db_sl=12) for at in own]
+        requests = [wants(at, level_db_sl=12) for at in own]
         found = answer(table, requests, [Finger(at) for at in others], min_contrast_db=-99)
         plates = draw_plates(
             np.random.default_rng(number),
@@ -83,7 +84,7 @@ def test_promise_of_several_contents_is_kept(contents, quiet):
         )
         contrast, level = given(table, found, others, plates)
         kept.append((contrast.min(axis=0) >= found.promised_worst_db).mean())
-        promised = [[each.promised_level_db_sl] for each in found.layers]
+        promised = [[each.promised_level_db_sl] for each in found.fingers[:contents]]
         levels.append((level >= promised).mean())
     assert 0.86 <= np.mean(kept) <= 0.95
     assert 0.86 <= np.mean(levels) <= 0.95
@@ -92,45 +93,38 @@ def test_promise_of_several_contents_is_kept(contents, quiet):
 def test_figures_as_modelled_are_those_of_the_exact_plate():
     """Levels and contrasts without errors, at fingers with a content and quiet ones."""
     table, own = smooth_table(), (NEAR, FAR, THIRD)
-    found = answer(table, [Request(at) for at in own], [Finger(QUIET)], min_contrast_db=-99)
+    found = answer(table, [wants(at) for at in own], [Finger(QUIET)], min_contrast_db=-99)
     contrast, level = given(table, found, [QUIET], as_modelled(4))
-    measures = [*found.layers, *found.quiet]
-    assert [each.felt_contrast_db for each in measures] == pytest.approx(contrast[:, 0], abs=0.02)
-    assert [each.level_db_sl for each in found.layers] == pytest.approx(level[:, 0], abs=0.02)
+    assert [each.contrast_db for each in found.fingers] == pytest.approx(contrast[:, 0], abs=0.02)
+    assert [each.level_db_sl for each in found.fingers[:3]] == pytest.approx(level[:, 0], abs=0.02)
 
 
-def test_one_content_is_the_answer_of_the_table():
-    """The same drive as of `query` with the others quiet; draws of errors have another phase."""
+def test_drive_mode_of_the_table_is_obeyed():
+    """Amplifiers that only switch get ERAs at full stroke, as one finger's query; or a refusal."""
     table = smooth_table()
-    found = answer(table, [Request(NEAR, (60, 300), 15.0)], [Finger(FAR), Finger(THIRD)])
-    pattern = find_pattern(
-        table,
-        Question(
-            (NEAR,), (FAR, THIRD), level_db_sl=15.0, drive_mode="phased", frequencies=(60, 300)
-        ),
-    )
-    (layer,) = found.layers
-    assert layer.promised_contrast_db == pytest.approx(pattern.robust_felt_contrast_db, abs=0.1)
-    assert found.promised_worst_db == layer.promised_contrast_db
-    assert layer.promised_level_db_sl == pytest.approx(15.0, abs=1e-3)
-    assert layer.excitation.keys() == pattern.excitation.keys()
-    for name, tone in layer.excitation.items():
-        assert tone.frequency == pattern.excitation[name].frequency
-        assert tone.amplitude == pytest.approx(pattern.excitation[name].amplitude, rel=0.02)
+    assert table.drive_mode == "switched"
+    requests, others = [wants(NEAR, level_db_sl=15.0)], [Finger(FAR)]
+    (layer,) = answer_by_table(table, requests, quiet=others).layers
+    (phased,) = answer(table, requests, others).layers
+    assert layer.excitation == only(table, Placement((NEAR,), (FAR,)), 15.0)[0].excitation
+    assert len(layer.excitation) <= 2 < len(phased.excitation)
+    assert len({tone.amplitude for tone in layer.excitation.values()}) == 1
+    with pytest.raises(InputError, match="phased"):
+        answer_by_table(table, [wants(NEAR), wants(FAR)])
+    shared = [wants(at, name="a") for at in TWENTY[:6]]  # one from the start
+    assert answer_by_table(table, shared).fingers[-1].verdict == "shared"
 
 
 def test_frequencies_are_apart_and_within_their_bands():
     """Bands hold; bands that may be exchanged are each taken once, for a contrast no worse."""
     table, bands = smooth_table(), ((40, 110), (140, 190), (230, 320))
-    requests = [Request(at, band) for at, band in zip((NEAR, FAR, THIRD), bands, strict=True)]
+    requests = [wants(at, band) for at, band in zip((NEAR, FAR, THIRD), bands, strict=True)]
     kept = answer(table, requests, min_contrast_db=-99)
     swapped = answer(table, requests, bands_may_swap=True, min_contrast_db=-99)
-    free = answer(
-        table, [Request(at) for at in (NEAR, FAR, THIRD)], apart_hz=60, min_contrast_db=-99
-    )
+    free = answer(table, [wants(at) for at in (NEAR, FAR, THIRD)], apart_hz=60, min_contrast_db=-99)
 
     def frequencies(found):
-        return [next(iter(each.excitation.values())).frequency for each in found.layers]
+        return [each.frequency for each in found.layers]
 
     assert all(low <= f <= high for f, (low, high) in zip(frequencies(kept), bands, strict=True))
     for f, (low, high) in zip(sorted(frequencies(swapped)), bands, strict=True):
@@ -141,7 +135,7 @@ def test_frequencies_are_apart_and_within_their_bands():
 
 def test_two_contents_of_one_frequency_are_said_to_be_near():
     """Where the bands leave no choice."""
-    found = answer(smooth_table(), [Request(at, (90, 95)) for at in (NEAR, FAR)])
+    found = answer(smooth_table(), [wants(at, (90, 95)) for at in (NEAR, FAR)])
     assert "nearer" in found.applied[0]
 
 
@@ -166,25 +160,25 @@ def test_a_tone_of_the_same_frequency_may_cancel_part_of_ones_own():
 
 def test_two_fingers_that_share_and_no_other_are_served():
     """So near that no contents of their own reach 6 dB: there is nobody to be quiet at."""
-    requests = [Request(at, may_share=True) for at in ((0.16, 0.06), (0.19, 0.06))]
+    requests = [wants(at, may_share=True) for at in ((0.16, 0.06), (0.19, 0.06))]
     found = answer(smooth_table(), requests)
     assert "shares" in found.applied[-1]
-    for layer in found.layers:
-        assert layer.promised_level_db_sl > 19.9
-        assert layer.promised_contrast_db is None
+    for felt in found.fingers:
+        assert felt.promised_level_db_sl > 19.9
+        assert felt.promised_contrast_db is None
 
 
 def test_what_is_not_felt_is_null_in_json():
     """A higher priority takes the whole stroke: JSON has no infinity."""
-    requests = [Request(NEAR, level_db_sl=80.0, priority=1), Request(FAR, level_db_sl=12.0)]
-    found = answer_as_json(smooth_table(), requests)
-    assert found["layers"][1]["verdict"] == "held back"
+    own = [{"at": NEAR, "level_db_sl": 80.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
+    found = query_one(smooth_table(), {"own": own})
+    assert found["fingers"][1]["verdict"] == "held back"
     json.dumps(found, allow_nan=False)
 
 
 def test_what_is_served_below_the_least_contrast_is_said():
     """At a level that leaves a quiet finger more than 6 dB nothing is changed but said."""
-    found = answer(smooth_table(), [Request(NEAR)], [Finger(QUIET)], min_contrast_db=99)
+    found = answer(smooth_table(), [wants(NEAR)], [Finger(QUIET)], min_contrast_db=99)
     assert found.promised_worst_db < 99
     assert ["99" in each for each in found.applied] == [True]
 
@@ -192,32 +186,32 @@ def test_what_is_served_below_the_least_contrast_is_said():
 def test_levels_share_the_stroke_by_one_factor_and_by_priority():
     """No ERA beyond its stroke; equals lose as much, a higher priority loses nothing."""
     table = smooth_table()
-    equal = answer(table, [Request(at, level_db_sl=52) for at in (NEAR, FAR)], min_contrast_db=-99)
-    lost = [52 - each.promised_level_db_sl for each in equal.layers]
+    equal = answer(table, [wants(at, level_db_sl=52) for at in (NEAR, FAR)], min_contrast_db=-99)
+    lost = [52 - each.promised_level_db_sl for each in equal.fingers]
     assert lost[0] == pytest.approx(lost[1], abs=1e-3)
     assert lost[0] == pytest.approx(-20 * np.log10(equal.stroke_factor), abs=1e-3)
     assert lost[0] > 0.5
     first = answer(
         table,
-        [Request(NEAR, level_db_sl=45), Request(FAR, level_db_sl=52, priority=1)],
+        [wants(NEAR, level_db_sl=45), wants(FAR, level_db_sl=52, priority=1)],
         min_contrast_db=-99,
     )
     for found in (equal, first):
         for era in table.eras:
             tones = [each.excitation[era.name].amplitude for each in found.layers]
             assert sum(tones) <= era.stroke * (1 + 1e-6)
-    assert 52 - first.layers[1].promised_level_db_sl < lost[1]
+    assert 52 - first.fingers[1].promised_level_db_sl < lost[1]
 
 
 def test_a_louder_content_does_not_starve_a_softer_one():
     """It is lowered first: the softer keeps its level, at least as long as it is the softer."""
     table, soft = smooth_table(), 12.0
-    requests = [Request(NEAR, level_db_sl=70), Request(FAR, level_db_sl=soft)]
+    requests = [wants(NEAR, level_db_sl=70), wants(FAR, level_db_sl=soft)]
     found = answer(table, requests, min_contrast_db=-99)
-    loud = found.layers[0].promised_level_db_sl
+    loud = found.fingers[0].promised_level_db_sl
     assert soft < loud < 70 - 0.5
     assert [f"{loud:.1f} dB SL" in each for each in found.applied] == [True]
-    assert found.layers[1].promised_level_db_sl == pytest.approx(soft, abs=1e-3)
+    assert found.fingers[1].promised_level_db_sl == pytest.approx(soft, abs=1e-3)
     assert found.stroke_factor == pytest.approx(10 ** ((loud - 70) / 20), rel=1e-3)
     full = [
         sum(each.excitation[era.name].amplitude for each in found.layers) / era.stroke
@@ -225,9 +219,9 @@ def test_a_louder_content_does_not_starve_a_softer_one():
     ]
     assert max(full) == pytest.approx(1.0, abs=1e-5)
     # Two that both must be lowered end at one level.
-    requests = [Request(NEAR, level_db_sl=57), Request(FAR, level_db_sl=54)]
+    requests = [wants(NEAR, level_db_sl=57), wants(FAR, level_db_sl=54)]
     found = answer(table, requests, min_contrast_db=-99)
-    felt = [each.promised_level_db_sl for each in found.layers]
+    felt = [each.promised_level_db_sl for each in found.fingers]
     assert felt[0] == pytest.approx(felt[1], abs=1e-3)
     assert felt[0] < 53.5
 
@@ -236,12 +230,12 @@ def test_fingers_that_may_share_feel_one_content():
     """The nearest two of those that may; all others keep their own."""
     places = ((0.09, 0.07), (0.14, 0.08), (0.25, 0.18), (0.05, 0.19))
     requests = [
-        Request(at, may_share=at in places[:3], priority=int(at == places[1])) for at in places
+        wants(at, may_share=at in places[:3], priority=int(at == places[1])) for at in places
     ]
     found = answer(smooth_table(), requests, min_contrast_db=3.7)
-    assert found.layers[0].verdict == "shared"
-    assert found.layers[0].excitation == found.layers[1].excitation
-    assert found.layers[2].excitation != found.layers[1].excitation
+    assert found.fingers[0].verdict == "shared"
+    assert drives(found)[0] == drives(found)[1]
+    assert drives(found)[2] != drives(found)[1]
     assert "shares" in found.applied[0]
 
 
@@ -249,12 +243,12 @@ def test_fingers_whose_contents_have_one_name_share_and_no_others():
     """Two pairs of names, of which the nearer pair shares: the third finger is between them."""
     places = ((0.09, 0.07), (0.14, 0.08), (0.11, 0.12), (0.25, 0.18))
     names = ("low", "high", "low", "high")
-    requests = [Request(at, content=name) for at, name in zip(places, names, strict=True)]
+    requests = [wants(at, name=name) for at, name in zip(places, names, strict=True)]
     every = answer(smooth_table(), requests, min_contrast_db=-99)
     found = answer(smooth_table(), requests, min_contrast_db=every.promised_worst_db + 0.1)
-    assert "shared" in {found.layers[0].verdict, found.layers[2].verdict}
-    assert found.layers[2].excitation == found.layers[0].excitation
-    assert found.layers[1].excitation != found.layers[3].excitation
+    assert "shared" in {found.fingers[0].verdict, found.fingers[2].verdict}
+    assert drives(found)[2] == drives(found)[0]
+    assert drives(found)[1] != drives(found)[3]
 
 
 TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(4)]
@@ -263,11 +257,11 @@ TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(
 @pytest.mark.parametrize(
     ("given", "most"),
     [
-        (lambda n: {"content": "a"}, 1),
+        (lambda n: {"name": "a"}, 1),
         (lambda n: {"may_share": True, "priority": n}, 1),
-        (lambda n: {"content": "ab"[n % 2]}, 4),
+        (lambda n: {"name": "ab"[n % 2]}, 4),
         (lambda n: {}, 9),
-        (lambda n: {"content": "abcde"[n % 5], "priority": n % 3}, 9),
+        (lambda n: {"name": "abcde"[n % 5], "priority": n % 3}, 9),
         (lambda n: {"max_foreign_db_sl": -50.0, "is_protected": n % 2 == 0}, 9),
         (lambda n: {"level_db_sl": 90.0, "min_contrast_db": 12.0}, 9),
         (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 9),
@@ -281,9 +275,9 @@ def test_twenty_fingers_take_few_searches(given, most, monkeypatch):
         asked.append(contents)
         return choose_tones(table, contents)
 
-    monkeypatch.setattr("model.answer.answer.choose_tones", counted)
-    found = answer(smooth_table(), [Request(at, **given(n)) for n, at in enumerate(TWENTY)])
-    assert len(found.layers) == 20
+    monkeypatch.setattr("model.answer.plan.choose_tones", counted)
+    found = answer(smooth_table(), [wants(at, **given(n)) for n, at in enumerate(TWENTY)])
+    assert len(found.fingers) == 20
     assert len(asked) <= most
 
 
@@ -291,9 +285,9 @@ def test_twenty_fingers_take_little_memory(without_kernels):
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()
     table = smooth_table()
-    prepare_patterns(table, with_ringing=False)
+    prepare_answers(table, with_ringing=False)
     tracemalloc.start()
-    answer(table, [Request(at, content="a", level_db_sl=90.0) for at in TWENTY])
+    answer(table, [wants(at, name="a", level_db_sl=90.0) for at in TWENTY])
     assert tracemalloc.get_traced_memory()[1] < 50e6
     tracemalloc.stop()
 
@@ -301,55 +295,55 @@ def test_twenty_fingers_take_little_memory(without_kernels):
 def test_what_is_to_be_own_is_own_or_makes_contents_give_way():
     """With 12 dB or held back, whichever priority is lower; what 6 dB suffice for is mixed."""
     table, places = smooth_table(), (NEAR, FAR, THIRD)
-    mixed = answer(table, [Request(at) for at in places])
-    assert {each.verdict for each in mixed.layers} >= {"mixed"}
+    mixed = answer(table, [wants(at) for at in places])
+    assert {each.verdict for each in mixed.fingers} >= {"mixed"}
     for priority, verdict in ((1, "own"), (-1, "held back")):
         requests = [
-            Request(at, min_contrast_db=12.0, priority=priority) if at == THIRD else Request(at)
+            wants(at, min_contrast_db=12.0, priority=priority) if at == THIRD else wants(at)
             for at in places
         ]
         found = answer(table, requests)
-        assert found.layers[2].verdict == verdict
-        assert "held back" in {each.verdict for each in found.layers}
+        assert found.fingers[2].verdict == verdict
+        assert "held back" in {each.verdict for each in found.fingers}
 
 
 def test_a_finger_that_must_not_be_disturbed_is_not():
     """Contents that leak more than it allows are held back, to the last; quieter ones are not."""
     table = smooth_table()
-    played = answer(table, [Request(NEAR)], [Finger(QUIET)])
-    leak = played.quiet[0].level_db_sl
+    played = answer(table, [wants(NEAR)], [Finger(QUIET)])
+    leak = played.fingers[1].foreign_level_db_sl
     for bound, verdict in ((leak + 0.1, "own"), (leak - 0.1, "held back")):
-        found = answer(table, [Request(NEAR)], [Finger(QUIET, max_foreign_db_sl=bound)])
-        assert found.layers[0].verdict == verdict
-        assert found.quiet[0].level_db_sl <= bound
-    requests = [Request(NEAR, priority=-1, max_foreign_db_sl=-30.0), Request(FAR)]
+        found = answer(table, [wants(NEAR)], [Finger(QUIET, max_foreign_db_sl=bound)])
+        assert found.fingers[0].verdict == verdict
+        assert found.fingers[1].foreign_level_db_sl <= bound
+    requests = [wants(NEAR, priority=-1, max_foreign_db_sl=-30.0), wants(FAR)]
     found = answer(table, requests)
-    assert [each.verdict for each in found.layers] == ["own", "held back"]
+    assert [each.verdict for each in found.fingers] == ["own", "held back"]
 
 
 def test_the_lowest_priority_is_held_back():
     """With the contrast that it would have had, and the level of the others there."""
-    requests = [Request(at, priority=int(at != FAR)) for at in (NEAR, FAR, THIRD, FOURTH)]
+    requests = [wants(at, priority=int(at != FAR)) for at in (NEAR, FAR, THIRD, FOURTH)]
     every = answer(smooth_table(), requests, min_contrast_db=-99)
     found = answer(smooth_table(), requests, min_contrast_db=every.promised_worst_db + 0.1)
-    held = found.layers[1]
+    held = found.fingers[1]
     assert held.verdict == "held back"
-    assert held.excitation == {}
-    assert held.promised_contrast_db == every.layers[1].promised_contrast_db
+    assert held.layer is None
+    assert held.promised_contrast_db == every.fingers[1].promised_contrast_db
     assert held.foreign_level_db_sl < 20
-    assert all(each.excitation for each in found.layers if each is not held)
+    assert sorted(each.layer for each in found.fingers if each is not held) == [0, 1, 2]
 
 
 def test_a_content_that_is_left_alone_keeps_its_band():
     """The band of the one that is held back is not its own."""
     bands = ((470, 500), (40, 320))
     requests = [
-        Request(at, band, priority=-n)
+        wants(at, band, priority=-n)
         for n, (at, band) in enumerate(zip((NEAR, FAR), bands, strict=True))
     ]
     found = answer(smooth_table(), requests, min_contrast_db=99)
-    assert found.layers[1].verdict == "held back"
-    assert {470 <= tone.frequency <= 500 for tone in found.layers[0].excitation.values()} == {True}
+    assert found.fingers[1].verdict == "held back"
+    assert {470 <= tone.frequency <= 500 for tone in drives(found)[0].values()} == {True}
 
 
 def test_a_finger_without_protection_gives_way_to_more_contrast():
@@ -357,11 +351,11 @@ def test_a_finger_without_protection_gives_way_to_more_contrast():
     places, contrast = (NEAR, FAR, THIRD), []
     for is_protected in (False, True):
         requests = [
-            Request(at, is_protected=is_protected or at != THIRD, priority=int(at != THIRD))
+            wants(at, is_protected=is_protected or at != THIRD, priority=int(at != THIRD))
             for at in places
         ]
         found = answer(smooth_table(), requests, min_contrast_db=7.0)
-        assert found.layers[2].verdict == "held back"
+        assert found.fingers[2].verdict == "held back"
         contrast.append(found.promised_worst_db)
     assert contrast[0] > contrast[1] + 1
 
@@ -369,13 +363,13 @@ def test_a_finger_without_protection_gives_way_to_more_contrast():
 @pytest.mark.parametrize(
     ("requests", "fingers", "named"),
     [
-        ([], [], "at least one request"),
-        ([Request(NEAR), Request(NEAR)], [], "at least 13 mm"),
-        ([Request(NEAR)], [Finger(NEAR)], "at least 13 mm"),
-        ([Request((0.4, 0.1))], [], "on the plate"),
-        ([Request(NEAR, (41, 42)), Request(FAR)], [], "hold a frequency"),
-        ([Request((0.01 * n, 0.01)) for n in range(22)], [], "up to 20"),
-        ([Request(NEAR, load=0.0)], [], "load"),
+        ([], [], "at least one finger"),
+        ([wants(NEAR), wants(NEAR)], [], "at least 13 mm"),
+        ([wants(NEAR)], [Finger(NEAR)], "at least 13 mm"),
+        ([wants((0.4, 0.1))], [], "on the plate"),
+        ([wants(NEAR, (41, 42)), wants(FAR)], [], "hold a frequency"),
+        ([wants((0.01 * n, 0.01)) for n in range(22)], [], "up to 20"),
+        ([wants(NEAR, load=0.0)], [], "load"),
     ],
 )
 def test_answer_refuses_what_contradicts_itself(requests, fingers, named):
@@ -391,14 +385,14 @@ def test_answer_refuses_what_contradicts_itself(requests, fingers, named):
         {"level_db_sl": np.nan},
         {"priority": 1.5},
         {"priority": True},
-        {"content": 3},
+        {"name": 3},
         {"max_foreign_db_sl": np.nan},
     ],
 )
 def test_a_request_refuses_what_no_content_has(given):
     """A band that ends before it begins, no level, and a priority without order."""
     with pytest.raises(InputError, match=r"must be"):
-        Request(NEAR, **given)
+        wants(NEAR, **given)
 
 
 @pytest.fixture(scope="module")
@@ -421,29 +415,30 @@ def test_the_command_answers_as_python_does(table_file):
     found = json.loads(run(table_file, *options, "--json").stdout)
     same = answer(
         smooth_table(),
-        [Request(NEAR, (100, 200), 12.0), Request(FAR, level_db_sl=12.0)],
+        [wants(NEAR, (100, 200), 12.0), wants(FAR, level_db_sl=12.0)],
         [Finger(QUIET)],
     )
-    assert found["robust_worst_db"] == pytest.approx(same.promised_worst_db, abs=1e-3)
+    assert found["promised_worst_db"] == pytest.approx(same.promised_worst_db, abs=1e-3)
     for layer, expected in zip(found["layers"], same.layers, strict=True):
-        assert layer["at_m"] == list(expected.request.at)
-        tones = expected.excitation.values()
-        assert {layer["frequency_hz"]} == {tone.frequency for tone in tones}
+        assert layer["frequency_hz"] == expected.frequency
         assert set(layer["drive"]) == {"SW", "SE", "NE", "NW"}
-        assert layer["level_db_sl"] > 12.0
-        assert layer["robust_felt_contrast_db"] < layer["felt_contrast_db"]
-        assert layer["foreign_level_db_sl"] < 12.0
-        assert layer["verdict"] == expected.verdict
-    assert found["quiet"][0]["at_m"] == list(QUIET)
+        assert layer["fingers"] == list(expected.fingers)
+    for finger, felt in zip(found["fingers"], same.fingers, strict=True):
+        assert finger["at_m"] == list(felt.finger.at)
+        assert (finger["verdict"], finger["layer"]) == (felt.verdict, felt.layer)
+        assert finger["promised_contrast_db"] < finger["contrast_db"]
+        assert finger["foreign_level_db_sl"] < 12.0
+        assert felt.layer is None or finger["level_db_sl"] > 12.0
+    assert found["fingers"][2]["verdict"] == "quiet"
     assert found["applied"] == list(same.applied)
     assert found["solve_time_s"] > 0
     printed = run(table_file, *options).stdout
-    assert f"worst finger: {found['robust_worst_db']:.1f} dB promised" in printed
+    assert f"worst finger: {found['promised_worst_db']:.1f} dB promised" in printed
 
 
 def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
     """Every key of a line, beside a line with a target; what contradicts itself has its number."""
-    own = {"at": [0.09, 0.07], "band_hz": [100, 200], "priority": 1, "may_share": True}
+    own = {"at": [0.09, 0.07], "band_hz": [100, 200], "priority": 1, "sharing": "any"}
     lines = [
         {"own": [own, {"at": [0.25, 0.18], "level_db_sl": 13}], "quiet": [[0.16, 0.2]]},
         {"target": [0.09, 0.07], "mode": "phased"},
@@ -451,7 +446,7 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
         {"own": [own], "target": [0.09, 0.07]},
         {"own": [own], "quiet": [[0.05, 0.19]], "loads": [1, 1]},
         {"own": [own | {"loud": 1}]},
-        {"own": [own], "mode": "phased"},
+        {"own": [own], "duration": 0.04},
         {"target": [0.09, 0.07], "apart_hz": 10},
         {"own": [own], "apart_hz": -1},
         {"own": [own | {"modulation_hz": 9}]},
@@ -461,10 +456,9 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
     result = run(table_file, "--batch", str(batch), "--level", "14")
     assert result.exit_code == 1
     first, second, modulated, *errors = map(json.loads, result.stdout.splitlines())
-    assert [each["promised_level_db_sl"] for each in first["layers"]] == pytest.approx(
-        [14, 13], abs=1e-3
-    )
-    assert second["mode"] == "phased"
+    levels = [each["promised_level_db_sl"] for each in first["fingers"][:2]]
+    assert levels == pytest.approx([14, 13], abs=1e-3)
+    assert second["layers"][0]["mode"] == "phased"
     carrier, sides = modulated["layers"][0]["frequency_hz"], modulated["layers"][0]["side_bands"]
     around = sorted({tone["frequency_hz"] for side in sides for tone in side.values()})
     assert around == pytest.approx([carrier - 20, carrier + 20], abs=5.0)  # half a step
@@ -479,7 +473,7 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
         "--own 0.1,0.1@x",
         "--own 0.1,0.1@145",
         "--own 0.1,0.1 --target 0.2,0.1",
-        "--own 0.1,0.1 --mode phased",
+        "--own 0.1,0.1 --own 0.2,0.1 --mode switched",
         "--target 0.1,0.1 --swap-bands",
     ],
 )

@@ -6,9 +6,9 @@ from math import pi
 import numpy as np
 import pytest
 
-from model.answer.concentration import cell_centres, concentration_of, with_concentration
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
+from model.answer.measures import cell_centres, concentration_of, measures
+from model.answer.plan import query
 from model.arrays import lattice
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import is_beyond
@@ -52,25 +52,25 @@ def test_concentration_on_a_plate_within_five_centimetres():
     assert found.energy_share_near == pytest.approx(1.0)
 
 
-def test_with_concentration_agrees_with_points_counted_one_by_one():
+def test_concentration_agrees_with_points_counted_one_by_one():
     """Two targets, from points 1.7 mm apart; with quiet fingers there is no concentration."""
     table = smooth_table()
     places = ((0.09, 0.08), (0.24, 0.14))
-    question = Question(places, drive_mode="phased")
-    pattern = with_concentration(table, question, find_pattern(table, question))
+    answer = query(table, Placement(places), drive_mode="phased")
+    layer = answer.layers[0]
     points = lattice(*(np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width)))
-    frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
+    frequencies, amplitudes = table.amplitudes(layer.excitation, points)
     energy = ((amplitudes / frequencies[:, None]) ** 2).sum(axis=0)
     peak = amplitudes.sum(axis=0)
     discs = [fingertip_points(*place, PLATE) for place in places]
-    felt = min(table.amplitudes(pattern.excitation, disc)[1].sum(axis=0).mean() for disc in discs)
+    felt = min(table.amplitudes(layer.excitation, disc)[1].sum(axis=0).mean() for disc in discs)
     near = np.min([np.hypot(*(points - place).T) for place in places], axis=0) <= 0.05
     far = np.sort(peak[~near])
-    found = pattern.concentration
+    found = measures(table, answer).concentration
     assert found is not None
     contrast = 20 * np.log10(felt / far[int(0.95 * len(far))])
     assert found.contrast_95_db == pytest.approx(contrast, abs=0.1)
     assert found.area_above_half == pytest.approx((peak > felt / 2).mean() * AREA, rel=0.02)
     assert found.energy_share_near == pytest.approx(energy[near].sum() / energy.sum(), abs=0.01)
-    question = Question(places[:1], places[1:], drive_mode="phased")
-    assert with_concentration(table, question, find_pattern(table, question)).concentration is None
+    answer = query(table, Placement(places[:1], places[1:]), drive_mode="phased")
+    assert measures(table, answer).concentration is None

@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import eigh
 
 from model.answer import search_in_c, search_in_numpy
+from model.answer.fingers import Placement
 from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.pattern_query import find_pattern
 from model.answer.promised import share_stroke
-from model.answer.question import Question
 from model.answer.search import KEPT, MISSING, Contents, Stream
 from model.answer.search_in_c import choose_tones
 from model.answer.search_in_numpy import choose_by_numpy, ranked, worst_ratios
@@ -21,6 +20,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.table import LocalizationTable
+from only import only
 from paper_table import contact_sets, forms_of, smooth_rig
 
 RNG = np.random.default_rng(5)
@@ -56,11 +56,11 @@ def random_table(seed: int) -> LocalizationTable:
     return build_table(rig, frequencies=np.linspace(40, 320, 29), drive_mode="phased")
 
 
-def only(of: LocalizationTable, question: Question) -> Contents:
-    """The content of a question at all frequencies."""
-    stream = Stream((0,), question.level_db_sl, ((0, len(of.frequencies)),))
-    quiet = tuple(range(1, len(question.contacts)))
-    return Contents(question.contacts, (), (stream,), quiet)
+def content(of: LocalizationTable, placed: Placement, level_db_sl: float = 20.0) -> Contents:
+    """One for the first of these fingers, at all frequencies."""
+    stream = Stream((0,), level_db_sl, ((0, len(of.frequencies)),))
+    quiet = tuple(range(1, len(placed.contacts)))
+    return Contents(placed.contacts, (), (stream,), quiet)
 
 
 SETS: dict[str, tuple[int, int, dict[str, Any]]] = {
@@ -137,8 +137,8 @@ def test_bound_and_level_are_those_of_the_best_weights_for_the_mean() -> None:
     Bounds by a general optimiser: the largest eigenvalue of the target's form to the mean one.
     """
     of = table()
-    question = Question((PLACES[0],), tuple(PLACES[1:4]), level_db_sl=20.0)
-    forms, contents = forms_of(of, question), only(of, question)
+    placed = Placement((PLACES[0],), tuple(PLACES[1:4]))
+    forms, contents = forms_of(of, placed), content(of, placed)
     c = forms.targets[0].conj().astype(complex)
     R = forms.quiet.mean(axis=1).astype(complex)
     bounds, levels = [], []
@@ -159,12 +159,12 @@ def test_answers_lose_little(monkeypatch: pytest.MonkeyPatch) -> None:
     of, lost = table(), []
     all_kept = replace(of)  # that keeps no rules yet
     monkeypatch.setattr(search_in_c, "KEPT", len(of.frequencies))
-    find_pattern(all_kept, Question((PLACES[0],), (PLACES[1],)))
+    only(all_kept, Placement((PLACES[0],), (PLACES[1],)))
     monkeypatch.undo()
     for at in range(4):
         for more in (1, 2, 4):
             quiet = (*PLACES[:at], *PLACES[at + 1 : at + 1 + more])
-            contents = only(of, Question((PLACES[at],), quiet))
+            contents = content(of, Placement((PLACES[at],), quiet))
             some = choose_tones(of, contents)
             every = choose_tones(all_kept, contents)
             lost.append(every.worst_db - some.worst_db)
@@ -181,7 +181,7 @@ def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
         monkeypatch.setattr(module, "KEPT", 1)
         monkeypatch.setattr(module, "MISSING", 1)
     of = replace(table())  # that keeps no rules yet
-    contents = only(of, Question((PLACES[0],), (PLACES[1],), level_db_sl=50.0))
+    contents = content(of, Placement((PLACES[0],), (PLACES[1],)), 50.0)
     (kept,) = ranked(FingersOnPlate.of(of, contents.places, ()), contents).tolist()
     found = choose_tones(of, contents)
     assert found.rows[0] != kept
@@ -190,9 +190,9 @@ def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
 def test_prepared_table_goes_to_another_process() -> None:
     """With what it has computed ahead; its answers are the same there."""
     of = table()
-    question = Question((PLACES[0],), (PLACES[1],))
-    pattern = find_pattern(of, question)
-    assert find_pattern(pickle.loads(pickle.dumps(of)), question).excitation == pattern.excitation
+    placed = Placement((PLACES[0],), (PLACES[1],))
+    (layer, _), (other, _) = (only(each, placed) for each in (of, pickle.loads(pickle.dumps(of))))
+    assert other.excitation == layer.excitation
 
 
 def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.answer.pattern_query import find_pattern
-from model.answer.query import query_batch
-from model.answer.question import Question
+from model.answer.as_json import query_batch
+from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
@@ -18,9 +17,10 @@ from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import plate_in_time
+from only import only
 from paper_plate import make_paper_rig
 
-QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), drive_mode="phased")
+PLACED = Placement(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)))
 
 
 @pytest.fixture(scope="module")
@@ -46,33 +46,35 @@ def solved(rig):
 def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
     """Measures of ramps and envelopes agree; envelopes do better with the same excitation."""
     timing = Timing(table)
-    plain = timing.with_transient_measures(QUESTION, find_pattern(table, QUESTION))
-    shaped_pattern = timing.with_transient_measures(
-        QUESTION, timing.with_envelopes(QUESTION, find_pattern(table, QUESTION))
-    )
+    plain, _ = only(table, PLACED, drive_mode="phased")
+    shaped_layer = timing.with_envelopes(plain, PLACED)
     assert plain.onset is plain.ending is None
     ramps = (
         ramped_onset(plain.excitation, rig.eras, ramp=0.040),
         ramped_ending(plain.excitation, rig.eras, ramp=0.040),
     )
-    envelopes = (shaped(shaped_pattern.onset, rig.eras), shaped(shaped_pattern.ending, rig.eras))
-    for pattern, (onset, ending) in ((plain, ramps), (shaped_pattern, envelopes)):
-        contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
-        assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
-        left = solved.residual_db(pattern.excitation, ending)
-        assert pattern.residual_db == pytest.approx(left, abs=0.2)
-    assert shaped_pattern.transient_contrast_db > plain.transient_contrast_db + 3
-    assert shaped_pattern.residual_db < plain.residual_db - 10
-    assert shaped_pattern.excitation == plain.excitation
+    envelopes = (shaped(shaped_layer.onset, rig.eras), shaped(shaped_layer.ending, rig.eras))
+    found = []
+    for layer, (onset, ending) in ((plain, ramps), (shaped_layer, envelopes)):
+        contrast = solved.contrast_db(onset, targets=PLACED.targets, quiet=PLACED.quiet)
+        left = solved.residual_db(layer.excitation, ending)
+        both = timing.transient_contrast_db(layer, PLACED), timing.residual_db(layer, PLACED)
+        found.append(both)
+        assert found[-1][0] == pytest.approx(contrast, abs=0.1)
+        assert found[-1][1] == pytest.approx(left, abs=0.2)
+    assert found[1][0] > found[0][0] + 3
+    assert found[1][1] < found[0][1] - 10
+    assert shaped_layer.excitation == plain.excitation
 
 
 @pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
 def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
     """Knots within a per mille of the largest, at an edge of the plate as well."""
-    question = replace(QUESTION, quiet=quiet)
-    found = Timing(table).with_envelopes(question, find_pattern(table, question))
+    placed = replace(PLACED, quiet=quiet)
+    layer, _ = only(table, placed, drive_mode="phased")
+    found = Timing(table).with_envelopes(layer, placed)
     shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
-    onset = shaper.onset(found.excitation, targets=question.targets, quiet=quiet)
+    onset = shaper.onset(found.excitation, targets=placed.targets, quiet=quiet)
     largest = max(each.largest for each in onset.values())
     for name, each in onset.items():
         np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
@@ -80,13 +82,10 @@ def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
 
 def test_transient_measures_without_quiet_fingers(table):
     """There is no contrast; what is left after the end is known all the same."""
-    alone = Question(((0.09, 0.07),), drive_mode="phased")
-    timing = Timing(table)
-    pattern = timing.with_transient_measures(
-        alone, timing.with_envelopes(alone, find_pattern(table, alone))
-    )
-    assert pattern.transient_contrast_db is None
-    assert pattern.residual_db < -20
+    alone, timing = Placement(((0.09, 0.07),)), Timing(table)
+    layer = timing.with_envelopes(only(table, alone, drive_mode="phased")[0], alone)
+    assert timing.transient_contrast_db(layer, alone) is None
+    assert timing.residual_db(layer, alone) < -20
 
 
 def test_query_batch_has_knots_only_with_envelopes(table):
@@ -95,6 +94,8 @@ def test_query_batch_has_knots_only_with_envelopes(table):
     plain, with_knots = query_batch(
         table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
     )
+    before, after = plain["transient_contrast_db"], with_knots["transient_contrast_db"]
+    (plain,), (with_knots,) = plain["layers"], with_knots["layers"]
     assert plain["onset"] is plain["ending"] is None
     assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
     assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
@@ -108,4 +109,4 @@ def test_query_batch_has_knots_only_with_envelopes(table):
         assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
         assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
         assert with_knots["ending"][era]["knots"][-1]["level"] == 0
-    assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]
+    assert after > before

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 from click.testing import Result
+from model.answer.pattern_query import UnreachableLevel
 from typer.testing import CliRunner
 
-from model.answer.pattern_query import UnreachableLevel
 from model.cli import app
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.errors import InputError

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from drives import by_hand
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.arrays import Complex64Array
 from model.choice import NEARLY
 from model.drive_modes import coherent, playable_drive_modes
@@ -54,15 +54,15 @@ F, E = 5, 3
 
 def forms_on_plate(places, *, targets=1, level=12.0):
     """Forms of fingertips on the paper's plate."""
-    question = Question(tuple(places[:targets]), tuple(places[targets:]), level_db_sl=level)
-    return forms_of(smooth_table(), question)
+    placed = Placement(tuple(places[:targets]), tuple(places[targets:]))
+    return forms_of(smooth_table(), placed, level)
 
 
 def test_the_loudest_point_of_a_quiet_fingertip_counts_as_modelled():
     """Of a rig that is known exactly, in place of the mean of a few points."""
     (places,) = contact_sets(1, fingers=3, seed=8)
     known = replace(smooth_table(), uncertainty=Uncertainty.none())
-    given = forms_of(known, Question((places[0],), tuple(places[1:])))
+    given = forms_of(known, Placement((places[0],), tuple(places[1:])))
     rng = np.random.default_rng(0)
     weights = (rng.standard_normal((27, 4)) + 1j * rng.standard_normal((27, 4))).astype("c8")
     power = given.quiet_power(weights)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.answer.pattern import Pattern
+from model.answer.measures import is_imperceptible
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import (
@@ -91,27 +91,14 @@ def test_a_set_that_is_not_known_is_refused():
 
 def test_quiet_fingers_are_unaware_only_below_the_lowest_thresholds():
     """At 250 Hz the probe's thresholds are 28 dB above the lowest: -38 dB SL suffices, -37 not."""
-    played = {"SW": Tone(250.0, 1e-6)}
-    by_probe = [Pattern(played, 0.04, 20.0, 40.0, quiet) for quiet in (-38.1, -37.5)]
-    assert [each.is_imperceptible_to_quiet for each in by_probe] == [True, False]
-    by_pressing = [
-        Pattern(played, 0.04, 20.0, 30.0, quiet, threshold=PRESSING) for quiet in (-10.1, -9.9)
-    ]
-    assert [each.is_imperceptible_to_quiet for each in by_pressing] == [True, False]
+    played = [{"SW": Tone(250.0, 1e-6)}]
+    assert [is_imperceptible(level, played, PROBE) for level in (-38.1, -37.5)] == [True, False]
+    assert [is_imperceptible(level, played, PRESSING) for level in (-10.1, -9.9)] == [True, False]
 
 
-def test_patterns_above_measured_thresholds_say_so():
+def test_measured_thresholds_end():
     """The probe's thresholds end at 500 Hz, those of pressing fingertips at 315 Hz."""
     assert [highest_measured(name) for name in (PROBE, PRESSING)] == [500.0, 315.0]
-    for frequency, name, is_extrapolated in [
-        (500.0, PROBE, False),
-        (510.0, PROBE, True),
-        (315.0, PRESSING, False),
-        (400.0, PRESSING, True),
-    ]:
-        played = {"SW": Tone(100.0, 1e-6), "SE": Tone(frequency, 1e-6)}
-        pattern = Pattern(played, 0.04, 20.0, None, None, threshold=name)
-        assert pattern.is_level_extrapolated is is_extrapolated
 
 
 @pytest.mark.parametrize("rate", [8000.0, 10_000.0, 44_100.0])

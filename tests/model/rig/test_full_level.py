@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.fem.plate import assemble
@@ -27,6 +26,7 @@ from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
+from only import only
 from paper_plate import make_paper_rig
 
 DESK = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
@@ -115,8 +115,9 @@ def test_era_without_amplifier_supports_as_one_at_rest() -> None:
         rtol=0.02,
         atol=0.02 * np.abs(fields(rig)).max(),
     )
-    question = Question(((0.1, 0.06),), ((0.22, 0.16),), level_db_sl=10.0, drive_mode="phased")
-    assert set(find_pattern(table, question).excitation) <= {"SW", "SE"}
+    placed = Placement(((0.1, 0.06),), ((0.22, 0.16),))
+    layer, _ = only(table, placed, 10.0, drive_mode="phased")
+    assert set(layer.excitation) <= {"SW", "SE"}
 
 
 GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))

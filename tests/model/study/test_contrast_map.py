@@ -46,10 +46,10 @@ def test_map_has_the_answer_of_every_place(
                 promised = found.promised_db[mode][row, column]
                 assert np.isfinite(promised) == far
                 if far:
-                    pattern = era.query(table, (x, y), quiet=[QUIET], drive_mode=mode)
-                    assert promised == pytest.approx(pattern.robust_felt_contrast_db, abs=1e-3)
+                    felt = era.query(table, (x, y), quiet=[QUIET], drive_mode=mode).fingers[0]
+                    assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
                     nominal = found.nominal_db[mode][row, column]
-                    assert nominal == pytest.approx(pattern.felt_contrast_db, abs=1e-3)
+                    assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
 
 
 def test_frame_has_a_row_a_place(found: era.ContrastMap) -> None:

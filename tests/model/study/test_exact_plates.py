@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.ensemble.measures import percentile
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -18,6 +17,7 @@ from model.structure.attachments import FingertipLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
 from model.table.build import build_table
 from model.vibration.excitation import base_amplitudes
+from only import only
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
@@ -36,7 +36,7 @@ PLATES = Plates(
 )
 
 
-def directly(rig, pattern, number, *, targets=1, pressed=(1, 1, 1)):
+def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
     """Felt and acceleration contrast [dB] by the sparse direct solve of that plate.
 
     targets: how many of the places are; the weakest one counts. pressed: factor on the pulp and
@@ -57,7 +57,7 @@ def directly(rig, pattern, number, *, targets=1, pressed=(1, 1, 1)):
         for place, more, factor in zip(places, pressed, PLATES.load[number], strict=True)
     ]
     discs = [fingertip_points(*place, rig.plate) for place in places]
-    frequencies, bases = base_amplitudes(pattern.excitation, rig.eras)
+    frequencies, bases = base_amplitudes(layer.excitation, rig.eras)
     unit = direct_acceleration(
         assemble(plate, rig.mesh),
         eras,
@@ -80,11 +80,11 @@ def directly(rig, pattern, number, *, targets=1, pressed=(1, 1, 1)):
 def test_felt_on_agrees_with_the_direct_solve(targets, mode):
     """Thicker, softer, damped otherwise, misdriven, other fingers on it: within 0.15 dB."""
     places = (TARGET, *QUIET)
-    question = Question(places[:targets], places[targets:], drive_mode=mode)
-    pattern = find_pattern(smooth_table(), question)
-    contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
+    placed = Placement(places[:targets], places[targets:])
+    layer, _ = only(smooth_table(), placed, drive_mode=mode)
+    contrast = felt_on(smooth_table(), placed, layer.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
-    solved = [directly(smooth_rig(), pattern, number, targets=targets) for number in range(3)]
+    solved = [directly(smooth_rig(), layer, number, targets=targets) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
     assert np.ptp(solved) > 0.3  # the plates do differ
 
@@ -96,14 +96,14 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     press alike are off by more.
     """
     loads = (2.5, 0.4, 1.0)
-    question = Question((TARGET,), QUIET, drive_mode="phased", loads=loads)
-    pattern = find_pattern(smooth_table(), question)
-    contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
+    placed = Placement((TARGET,), QUIET, loads)
+    layer, predicted = only(smooth_table(), placed, drive_mode="phased")
+    contrast = felt_on(smooth_table(), placed, layer.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
-    solved = [directly(smooth_rig(), pattern, number, pressed=loads) for number in range(3)]
+    solved = [directly(smooth_rig(), layer, number, pressed=loads) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
-    assert pattern.felt_contrast_db == pytest.approx(solved[0], abs=0.15)
-    alike = [directly(smooth_rig(), pattern, number) for number in range(3)]
+    assert predicted.contrast_db == pytest.approx(solved[0], abs=0.15)
+    alike = [directly(smooth_rig(), layer, number) for number in range(3)]
     assert np.abs(np.subtract(alike, solved)).max() > 0.4
 
 
@@ -113,9 +113,9 @@ def test_discretisation_error_enters_the_contrast_of_plates():
     Far above the response it is the whole amplitude D there: D over quiet and target over D make
     target over quiet.
     """
-    question = Question((TARGET,), QUIET[:1], drive_mode="phased")
+    placed = Placement((TARGET,), QUIET[:1])
     table = smooth_table()
-    excitation = find_pattern(table, question).excitation
+    excitation = only(table, placed, drive_mode="phased")[0].excitation
     plates = replace(
         draw_plates(
             np.random.default_rng(0), Uncertainty.none(), count=3, era_count=4, contact_count=2
@@ -124,7 +124,7 @@ def test_discretisation_error_enters_the_contrast_of_plates():
     )
 
     def contrasts(of):
-        return 20 * np.log10(felt_on(of, question, excitation, plates).contrast)
+        return 20 * np.log10(felt_on(of, placed, excitation, plates).contrast)
 
     right, at_target, at_quiet = contrasts(table)
     assert at_target + at_quiet == pytest.approx(right, abs=0.01)
@@ -170,16 +170,16 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
     level_kept, contrast_kept, typical = [], [], []
     for number, places in enumerate(contact_sets(16, fingers=4, seed=41)):
         count = 1 + number % 3
-        question = Question((places[0],), tuple(places[1 : 1 + count]), drive_mode=mode)
-        pattern = find_pattern(table, question)
+        placed = Placement((places[0],), tuple(places[1 : 1 + count]))
+        layer, promise = only(table, placed, drive_mode=mode)
         plates = draw_plates(
             rng, table.uncertainty, count=200, era_count=4, contact_count=1 + count
         )
-        felt = felt_on(table, question, pattern.excitation, plates)
+        felt = felt_on(table, placed, layer.excitation, plates)
         contrasts = 20 * np.log10(felt.contrast)
-        level_kept.append(20 * np.log10(felt.level) >= pattern.robust_level_db_sl)
-        contrast_kept.append(contrasts >= pattern.robust_felt_contrast_db)
-        typical.append(np.median(contrasts) - pattern.median_felt_contrast_db)
+        level_kept.append(20 * np.log10(felt.level) >= promise.promised_level_db_sl)
+        contrast_kept.append(contrasts >= promise.promised_contrast_db)
+        typical.append(np.median(contrasts) - promise.median_contrast_db)
     assert 0.85 <= np.mean(level_kept) <= 0.95
     assert 0.85 <= np.mean(contrast_kept) <= 0.95
     assert np.mean(typical) == pytest.approx(0.0, abs=0.4)
@@ -211,12 +211,10 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
     for quiet, optimum in zip((1, 2, 3), expected, strict=True):
         found = []
         for places in contact_sets(20, fingers=1 + quiet, seed=100 + quiet):
-            question = Question(
-                (places[0],), tuple(places[1:]), drive_mode="phased", envelopes=True
-            )
-            pattern = find_pattern(table, question)
+            placed = Placement((places[0],), tuple(places[1:]))
+            layer, _ = only(table, placed, drive_mode="phased")
             plates = draw_plates(rng, known, count=100, era_count=4, contact_count=1 + quiet)
-            contrast = felt_on(table, question, pattern.excitation, plates).contrast
+            contrast = felt_on(table, placed, layer.excitation, plates).contrast
             found.append(20 * np.log10(np.percentile(contrast, percent)))
         assert np.median(found) == pytest.approx(optimum, abs=2.0)
 
@@ -227,12 +225,12 @@ def test_promise_holds_where_the_thickness_moves_resonances(places: int) -> None
     uncertainty = Uncertainty(0.01, 1.0, thickness=0.06, stiffness=0.02, damping=1.1)
     table = replace(smooth_table(), uncertainty=uncertainty)
     target, *quiet = contact_sets(places + 1, fingers=2 + places % 2, seed=11)[-1]
-    question = Question((target,), tuple(quiet))
-    pattern = find_pattern(table, question)
+    placed = Placement((target,), tuple(quiet))
+    layer, promise = only(table, placed)
     plates = draw_plates(
         np.random.default_rng(3), uncertainty, count=600, era_count=4, contact_count=1 + len(quiet)
     )
-    contrast = felt_on(table, question, pattern.excitation, plates).contrast
+    contrast = felt_on(table, placed, layer.excitation, plates).contrast
     assert contrast is not None
     found = 20 * np.log10(np.percentile(contrast, 10))
-    assert pattern.robust_felt_contrast_db == pytest.approx(found, abs=1.0)
+    assert promise.promised_contrast_db == pytest.approx(found, abs=1.0)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
@@ -18,6 +17,7 @@ from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import export
 from model.study.export import export_csv, export_mat
 from model.table.file import save_table
+from only import only
 from small_table import FREQUENCIES, small_table, with_strokes
 
 
@@ -121,9 +121,9 @@ def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(dri
             (float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"]))
             for finger in ("target", "quiet")
         )
-        answer = find_pattern(table, Question((target,), (quiet,)))
-        assert float(row["robust_felt_contrast_db"]) == answer.robust_felt_contrast_db
-        assert float(row["robust_level_db_sl"]) >= 20 - 1e-3
+        _, felt = only(table, Placement((target,), (quiet,)))
+        assert float(row["promised_contrast_db"]) == felt.promised_contrast_db
+        assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
     weak = replace(with_strokes(table, 1e-6), grid=Grid(1, 2))
     export_csv(weak, tmp_path / "weak.csv", content="patterns")
     assert all(not row["SW_level"] for row in read_csv(tmp_path / "weak.csv"))

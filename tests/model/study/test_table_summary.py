@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import Laminate, LaminateLayer
@@ -103,10 +103,9 @@ def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
 def test_questions_that_mirror_each_other_are_one_sample(table):
     """On a symmetric plate both have the answer of one of them, to the bit; not on another one."""
     (target,), (other,) = (pair := pair_questions(table)[0][0]).targets, pair.quiet
-    image = Question(
+    image = Placement(
         ((table.plate.length - target[0], target[1]),),
         ((table.plate.length - other[0], other[1]),),
-        level_db_sl=pair.level_db_sl,
     )
     ask = ask_once(table)
     assert ask(pair) == ask(image)
@@ -161,7 +160,7 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
     )
     built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
     summary = summarize(built, find_overview(built))
-    assert summary["robust_felt_contrast_1_quiet_median_db"] is None
+    assert summary["promised_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None
 
 
@@ -195,9 +194,9 @@ def test_summary_counts_levels_and_shares(table):
         "weak_share": 0.75,
         "frequency_count": 3,
         "patterns": 4 * 3 + 6 * 3**2,
-        "robust_felt_contrast_2_quiet_median_db": 50.0,
-        "robust_felt_contrast_2_quiet_tenth_percentile_db": 10.0,
-        "felt_contrast_2_quiet_median_db": 55.0,
+        "promised_contrast_2_quiet_median_db": 50.0,
+        "promised_contrast_2_quiet_tenth_percentile_db": 10.0,
+        "contrast_2_quiet_median_db": 55.0,
         "discretisation_error_percent": 100 * max(quieter.discretisation_error),
     }
     assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)

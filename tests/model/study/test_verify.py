@@ -14,6 +14,7 @@ from model.study.verify import AnswerCheck, verify_table
 from model.table.build import solve_table
 from model.table.file import load_table, save_table
 from model.vibration.excitation import tone_amplitudes
+from only import only
 from paper_plate import make_paper_rig
 from small_table import small_problem, small_table
 
@@ -45,7 +46,7 @@ def test_verify_passes_a_true_table(verified):
     fields, cells = verified.content
     assert fields.error < 5e-5
     assert cells.error < 2e-3  # the raster does not follow the mesh between its nodes
-    assert [len(check.question.quiet) for check in verified.answer_checks] == [1, 2, 3, 1]
+    assert [len(check.placed.quiet) for check in verified.answer_checks] == [1, 2, 3, 1]
 
 
 def test_verify_passes_a_table_with_measured_gains_bolts_and_masses(rig, tmp_path):
@@ -59,7 +60,7 @@ def test_verify_passes_a_table_with_measured_gains_bolts_and_masses(rig, tmp_pat
     assert found.failed_count == 0
 
 
-def test_tolerances_follow_from_the_error_of_the_field(verified, rig):
+def test_tolerances_follow_from_the_error_of_the_field(verified, rig, table):
     """By hand: 20 log10(1 + error / peak), of the target for its level, of both for contrast.
 
     The error is 2e-4 for the raster, 7e-3 for the fingers and (k s)²/8 for elements s = 25.4 mm of
@@ -69,12 +70,12 @@ def test_tolerances_follow_from_the_error_of_the_field(verified, rig):
     x, y = np.meshgrid((np.arange(8) + 0.5) / 8 * 0.3048, (np.arange(6) + 0.5) / 6 * 0.2286)
     matrices = assemble(rig.plate, rig.mesh)
     for check in verified.answer_checks:
-        contacts = (*check.question.targets, *check.question.quiet)
+        contacts = (*check.placed.targets, *check.placed.quiet)
         discs = [fingertip_points(*place, rig.plate) for place in contacts]
         weights = fingertip_weights(*contacts[0], rig.plate)
         points = np.vstack([*discs, np.column_stack([x.ravel(), y.ravel()])])
         frequencies, amplitudes = tone_amplitudes(
-            check.pattern.excitation,
+            only(table, check.placed)[0].excitation,
             rig.eras,
             lambda f, points=points, contacts=contacts: direct_acceleration(
                 matrices,
@@ -150,8 +151,8 @@ def test_answer_check_passes_within_its_tolerances(verified, changed, is_passed)
     """0.1 dB of level and contrast, 1 dB more in time, where contrast beyond 25 dB counts as 25."""
     check = AnswerCheck(
         **{
-            "question": verified.answer_checks[0].question,
-            "pattern": replace(verified.answer_checks[0].pattern, level_db_sl=20.0),
+            "placed": verified.answer_checks[0].placed,
+            "predicted_level_db_sl": 20.0,
             "predicted_contrast_db": 18.0,
             "direct_level_db_sl": 20.0,
             "direct_contrast_db": 18.05,

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -16,6 +15,7 @@ from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 from model.vibration.excitation import Excitation, Tone
+from only import only
 from plate_in_time import make_plate_in_time
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -159,10 +159,8 @@ def test_onset_of_many_eras_is_as_good_as_of_few():
     gained = []
     for *places, _ in PAIRS:
         target, quiet = (tuple((size * place).tolist()) for place in places)
-        question = Question(
-            (target,), (quiet,), level_db_sl=20.0, envelopes=True, drive_mode="phased"
-        )
-        excitation = find_pattern(table, question).excitation
+        layer, _ = only(table, Placement((target,), (quiet,)), drive_mode="phased")
+        excitation = layer.excitation
         onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
         for era in table.eras:
             tone = excitation[era.name]

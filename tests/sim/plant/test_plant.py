@@ -9,9 +9,8 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 from driven_bases import FINGERTIP, faded_base, resting, shaped_base
-from model.answer.pattern import Pattern
-from model.answer.pattern_query import find_pattern
-from model.answer.question import Question
+from model.answer.answer import Layer
+from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -25,6 +24,7 @@ from model.structure.plate import Material, Plate
 from model.table.build import build_table
 from model.transients.base_motion import Term
 from model.transients.measures import ONSET_WINDOW
+from only import only
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 from sim.plant.sampled import SampledPlant
@@ -101,7 +101,7 @@ def gain(frequencies: FloatArray, resonance: float, ratio: float) -> FloatArray:
     return np.asarray(1 / (1 - x**2 + 2j * ratio * x))
 
 
-def driven_by(rig: Rig, pattern: Pattern, times: FloatArray) -> FloatArray:
+def driven_by(rig: Rig, pattern: Layer, times: FloatArray) -> FloatArray:
     """What an onset would move the bases by, (n, eras) [m], if they followed at once."""
     bases = np.zeros((len(times), len(rig.eras)))
     for number, era in enumerate(rig.eras):
@@ -142,11 +142,10 @@ def test_contrast_of_an_onset_behind_actuators_that_lag(
     timing = Timing(table)
     times = (np.arange(round(ONSET_WINDOW * RATE)) + 1) / RATE
     for target, quiet in PAIRS:
-        question = Question((target,), (quiet,), level_db_sl=15.0, envelopes=True)
-        pattern = timing.with_envelopes(
-            question, find_pattern(table, question), onset=is_shaped, ending=False
-        )
-        predicted = timing.with_transient_measures(question, pattern).transient_contrast_db
+        placed = Placement((target,), (quiet,))
+        layer, _ = only(table, placed, 15.0)
+        pattern = timing.with_envelopes(layer, placed, onset=is_shaped, ending=False)
+        predicted = timing.transient_contrast_db(pattern, placed)
         bases = driven_by(rig, pattern, times)
         for number, (resonance, ratio) in enumerate(actuators):
             omega = 2 * np.pi * resonance

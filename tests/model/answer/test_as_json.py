@@ -8,13 +8,13 @@ from unittest.mock import Mock
 import pytest
 from typer.testing import CliRunner
 
-from model.answer.pattern_query import find_pattern
-from model.answer.query import query_batch
-from model.answer.question import Question
+from model.answer.as_json import query_batch
+from model.answer.fingers import Placement
 from model.cli import app
 from model.commands.table_cli import query
 from model.errors import InputError
 from model.table.file import save_table
+from only import only
 from paper_table import smooth_table
 
 RUNNER = CliRunner()
@@ -35,11 +35,11 @@ def test_a_line_of_a_batch_is_read_key_by_key():
         ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
     )
     (found,) = query_batch(smooth_table(), [line])
-    places = ((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),)
-    question = Question(*places, 15.0, drive_mode="switched", loads=(1.0, 2.0, 0.5))
-    expected = find_pattern(smooth_table(), question)
-    assert found["drive"] == smooth_table().drive_of(expected.excitation)
-    assert found["robust_contrast_db"] == expected.robust_contrast_db
+    placed = Placement(((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),), (1.0, 2.0, 0.5))
+    layer, felt = only(smooth_table(), placed, 15.0, drive_mode="switched")
+    assert found["layers"][0]["drive"] == smooth_table().drive_of(layer.excitation)
+    assert found["layers"][0]["fingers"] == [0, 1]
+    assert found["fingers"][0]["promised_contrast_db"] == felt.promised_contrast_db
 
 
 BAD_LINES = {
@@ -49,7 +49,7 @@ BAD_LINES = {
     '{"target": [0.1, 0.1], "loud": 3}': "loud",
     '{"target": [0.1, "x"]}': "target.1",
     '{"target": [0.1, 0.1], "targets": [[0.2, 0.1]]}': "target must be given without targets",
-    "{}": "at least one target",
+    "{}": "at least one finger",
 }
 
 
@@ -70,7 +70,7 @@ def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
     result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", str(batch)])
     assert result.exit_code == has_errors
     first, second, *errors = map(json.loads, result.stdout.splitlines())
-    assert first["mode"] == second["mode"] == "phased"
+    assert first["layers"][0]["mode"] == second["layers"][0]["mode"] == "phased"
     assert [each["line"] for each in errors] == [5, 6][: len(errors)]
     assert all("error" in each for each in errors)
     assert len(errors) == 2 * has_errors
@@ -81,7 +81,7 @@ def test_batch_reads_standard_input(table_file):
     line = '{"target": [0.1, 0.1], "mode": "phased"}\n'
     result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", "-"], input=line)
     assert result.exit_code == 0
-    assert json.loads(result.stdout)["mode"] == "phased"
+    assert json.loads(result.stdout)["layers"][0]["mode"] == "phased"
 
 
 def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monkeypatch):
@@ -104,11 +104,12 @@ def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):
     command = ["table", "query", str(table_file), "--batch", str(batch), *options.split()]
     result = RUNNER.invoke(app, command)
     default, given = map(json.loads, result.stdout.splitlines())
-    assert (default["mode"], given["mode"]) == ("phased", "switched")
-    assert default["robust_level_db_sl"] == pytest.approx(14.0)
-    assert given["robust_level_db_sl"] == pytest.approx(9.0)
-    assert default["onset"] is not None
-    assert given["onset"] is None
+    for found, level in ((default, 14.0), (given, 9.0)):
+        assert found["fingers"][0]["promised_level_db_sl"] == pytest.approx(level)
+    (shaped,), (plain,) = default["layers"], given["layers"]
+    assert (shaped["mode"], plain["mode"]) == ("phased", "switched")
+    assert shaped["onset"] is not None
+    assert plain["onset"] is None
 
 
 def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
@@ -125,18 +126,18 @@ def test_query_has_all_measures(table_file):
     options = "--target 0.09,0.07 --quiet 0.25,0.18 --mode phased --level 18 --json"
     result = RUNNER.invoke(app, ["table", "query", str(table_file), *options.split()])
     answer = json.loads(result.stdout)
-    assert answer["mode"] == "phased"
-    assert answer["robust_level_db_sl"] == pytest.approx(18.0)
-    assert answer["level_db_sl"] > 18.0
-    assert answer["robust_contrast_db"] < answer["contrast_db"]
-    assert answer["robust_felt_contrast_db"] < answer["median_felt_contrast_db"]
-    assert answer["median_felt_contrast_db"] < answer["felt_contrast_db"]
-    felt = answer["level_db_sl"] - answer["quiet_level_db_sl"]
-    assert answer["felt_contrast_db"] == pytest.approx(felt)
-    assert answer["robust_quiet_level_db_sl"] > answer["quiet_level_db_sl"] > -10
+    (layer,), (felt, quiet) = answer["layers"], answer["fingers"]
+    assert (layer["mode"], layer["fingers"]) == ("phased", [0])
+    assert (felt["verdict"], quiet["verdict"]) == ("own", "quiet")
+    assert (felt["layer"], quiet["layer"], quiet["level_db_sl"]) == (0, None, None)
+    assert felt["promised_level_db_sl"] == pytest.approx(18.0)
+    assert felt["level_db_sl"] > 18.0
+    assert felt["promised_contrast_db"] < felt["median_contrast_db"] < felt["contrast_db"]
+    assert quiet["foreign_level_db_sl"] > felt["level_db_sl"] - felt["contrast_db"] > -10
     assert answer["is_imperceptible_to_quiet"] is False
+    assert answer["applied"] == []
     assert answer["solve_time_s"] > 0
-    for tone in answer["drive"].values():
+    for tone in layer["drive"].values():
         assert 0 < tone["level"] <= 1
         assert -180 <= tone["phase_deg"] <= 180
     assert "transient_contrast_db" in answer

@@ -1,0 +1,228 @@
+"""Fingers on a plate, and the stimulus that each is to feel."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+
+from model.arguments import expect_number, shown
+from model.arrays import Point
+from model.config.points import in_metres
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.finger import MAX_CONTACTS
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.perception import STRONG_DB_SL
+from model.structure.attachments import check_loads
+from model.structure.plate import Plate
+
+MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
+"""Below the smallest amplitude of a channel, and above what a plate survives."""
+
+SHAPED_FROM = 0.2
+"""Shortest duration [s] of a stimulus with a shaped onset, which settles in half of it."""
+
+MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
+"""Modulations that side bands play [Hz]; slower ones are changes of level."""
+
+ANY_BAND = (0.0, math.inf)
+
+NEVER, BY_NAME, ANY, MUST = SHARING = ("never", "by name", "any", "must")
+"""Whether a finger may feel the vibration of another one."""
+
+
+@dataclass(frozen=True)
+class Stimulus:
+    """What a finger is to feel.
+
+    level_db_sl: over its duration, onset included, on the plate as modelled; of a stimulus that
+    lasts what nine of ten plates give; band_hz: lowest and highest frequency; duration [s]: None
+    for one that lasts, a click has 0.04; modulation_hz: how often a second the strength of one that
+    lasts comes and goes, MIN_MODULATION to MAX_MODULATION, None for a steady one; is_limit: whether
+    it is as strong as the quiet fingers allow, up to that level; name: fingers of one name may be
+    given one vibration.
+    """
+
+    level_db_sl: float = STRONG_DB_SL
+    band_hz: tuple[float, float] = ANY_BAND
+    duration: float | None = None
+    modulation_hz: float | None = None
+    is_limit: bool = False
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check everything that does not depend on the table."""
+        _check_pair(self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz")
+        expect_number(self.level_db_sl, what="level_db_sl", unit="dB above the threshold")
+        low, high = self.band_hz
+        if not 0 <= low <= high:  # False for NaN
+            raise InputError(
+                f"band_hz must be from a lowest to a highest frequency, got {low:g} to {high:g}"
+            )
+        if not MIN_LEVEL_DB_SL <= self.level_db_sl <= MAX_LEVEL_DB_SL:
+            raise InputError(
+                f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
+                f"{self.level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold"
+            )
+        if not (self.name is None or isinstance(self.name, str)):
+            raise InputError(f"name of a stimulus must be text, got {shown(self.name)}")
+        if self.duration is not None:
+            expect_number(self.duration, what="duration", unit="seconds")
+            if not 0 < self.duration < math.inf:
+                raise InputError(f"duration must be above 0 s and finite, got {self.duration:g}")
+        if self.modulation_hz is not None:
+            expect_number(self.modulation_hz, what="modulation_hz", unit="Hz")
+            if not MIN_MODULATION <= self.modulation_hz <= MAX_MODULATION:
+                raise InputError(
+                    f"modulation_hz must be from {MIN_MODULATION:g} to {MAX_MODULATION:g} Hz, got "
+                    f"{self.modulation_hz:g}"
+                )
+            if self.duration is not None:
+                raise InputError("modulation_hz must be left out of a stimulus with a duration")
+
+
+@dataclass(frozen=True)
+class Finger:
+    """A finger at a place [m], and what it asks.
+
+    stimulus: what it is to feel, None for nothing; load: relative to the rig's fingertip; priority:
+    lower ones give way first; sharing: whether it may feel the vibration of another finger:
+    `never`, that of one of the same name (`by name`), of the nearest that may have `any`, or it
+    `must` feel one with all of its name; is_protected: whether it keeps the others' vibrations away
+    where its own is given up; min_contrast_db: promised contrast to the vibrations of others below
+    which these or its own give way; max_foreign_db_sl: level of others' vibrations here that nine
+    of ten plates do not exceed, else they are held back.
+    """
+
+    at: Point
+    stimulus: Stimulus | None = None
+    load: float = 1.0
+    priority: int = 0
+    sharing: str = BY_NAME
+    is_protected: bool = True
+    min_contrast_db: float = -math.inf
+    max_foreign_db_sl: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check everything that does not depend on the table."""
+        _check_pair(self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres")
+        expect_number(self.load, what="load", unit="times the rig's fingertip")
+        if not (self.stimulus is None or isinstance(self.stimulus, Stimulus)):
+            raise InputError(
+                f"stimulus must be one such as era.Stimulus(20), got {shown(self.stimulus)}"
+            )
+        if isinstance(self.priority, bool) or not isinstance(self.priority, int):
+            raise InputError(f"priority must be a whole number, got {self.priority!r}")
+        if self.sharing not in SHARING:
+            raise InputError(
+                f"sharing must be one of {', '.join(SHARING)}, got {shown(self.sharing)}"
+            )
+        _check_bound(self.min_contrast_db, what="min_contrast_db", unit="dB")
+        _check_bound(self.max_foreign_db_sl, what="max_foreign_db_sl", unit="dB SL")
+
+    @property
+    def name(self) -> str | None:
+        """Of its stimulus."""
+        return None if self.stimulus is None else self.stimulus.name
+
+    def may_feel_one_with(self, other: "Finger") -> bool:
+        """Whether both fingers may feel one vibration."""
+        one, two = self.stimulus, other.stimulus
+        if one is None or two is None:
+            return False
+        if (one.duration, one.is_limit) != (two.duration, two.is_limit):
+            return False
+        if self.sharing == other.sharing == ANY:
+            return True
+        is_same = self.name is not None and self.name == other.name
+        return is_same and NEVER not in (self.sharing, other.sharing)
+
+    def must_feel_one_with(self, other: "Finger") -> bool:
+        """Whether both fingers feel one vibration from the start."""
+        are_felt = self.stimulus is not None and other.stimulus is not None
+        return are_felt and self.name == other.name and self.sharing == other.sharing == MUST
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Places [m] of the fingers that are to feel a vibration, and of all others.
+
+    loads: of each relative to the rig's fingertip, targets first; empty for 1.
+    """
+
+    targets: tuple[Point, ...]
+    quiet: tuple[Point, ...] = ()
+    loads: tuple[float, ...] = ()
+
+    @property
+    def contacts(self) -> tuple[Point, ...]:
+        """All places, targets first."""
+        return (*self.targets, *self.quiet)
+
+
+def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
+    """Return fingers that must feel one stimulus, and the others."""
+    loads = placed.loads or (1.0,) * len(placed.contacts)
+    if len(loads) != len(placed.contacts):
+        raise InputError(
+            f"loads must have one value per finger ({len(placed.contacts)}), got {len(loads)}"
+        )
+    count = len(placed.targets)
+    return [
+        Finger(at, stimulus if n < count else None, load, sharing=MUST)
+        for n, (at, load) in enumerate(zip(placed.contacts, loads, strict=True))
+    ]
+
+
+def checked_mode(name: str) -> str:
+    """Return the name of a drive mode; raises InputError for any other."""
+    if name not in DRIVE_MODES:
+        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {shown(name)}")
+    return name
+
+
+def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
+    """Raise InputError for a finger off the plate; what: the finger's name."""
+    length, width = plate.length, plate.width
+    for x, y in places:
+        if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
+            raise InputError(
+                f"{what} ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
+                f"({length:g}, {width:g}) m{in_metres(x, y, length=length, width=width)}"
+            )
+
+
+def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
+    """Raise InputError for fingers that contradict each other or are not on the plate."""
+    if all(each.stimulus is None for each in fingers):
+        raise InputError("an answer must have at least one finger with a stimulus, got none")
+    if len(fingers) > MAX_CONTACTS:
+        raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
+    check_loads([each.load for each in fingers])
+    check_on_plate("finger", [each.at for each in fingers], plate)
+    for number, finger in enumerate(fingers):
+        x, y = finger.at
+        for other in fingers[:number]:
+            gap = math.dist(other.at, finger.at)
+            is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
+            if gap < FINGERTIP_RADIUS and not (is_one and gap > 0):
+                raise InputError(
+                    f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
+                    f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"
+                )
+
+
+def _check_bound(given: float, *, what: str, unit: str) -> None:
+    """Raise InputError for anything but a number, which may be infinite."""
+    expect_number(given, what=what, unit=unit)
+    if math.isnan(given):
+        raise InputError(f"{what} must be a number of {unit}, got {given}")
+
+
+def _check_pair(given: object, *, what: str, such_as: str) -> None:
+    """Raise InputError for anything but two numbers."""
+    pair = given if isinstance(given, Sequence | np.ndarray) else ()
+    if len(pair) != 2 or not (isinstance(pair[0], Real) and isinstance(pair[1], Real)):
+        raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")

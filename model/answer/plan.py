@@ -1,0 +1,389 @@
+"""One answer to all fingers, and what is done where not all can be served.
+
+A promise below the least contrast at the worst finger is not served as requested. In this order,
+and each only where the fingers allow it: the nearest two that may share feel one vibration; the
+finger of the lowest priority that need not be protected gives up vibration and protection; the
+vibration of the lowest priority is held back. Of many vibrations several of these steps are one.
+Where nothing reaches it, the best tried is served, but for bounds that fingers state themselves:
+these hold, if by silence.
+"""
+
+import math
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from model.answer.answer import MIN_CONTRAST_DB, Answer
+from model.answer.fingers import (
+    ANY,
+    MIN_LEVEL_DB_SL,
+    Finger,
+    Placement,
+    Stimulus,
+    check_fingers,
+    checked_mode,
+    together,
+)
+from model.answer.modulation import is_served, with_modulation
+from model.answer.search import APART_HZ, Contents, Stream, Tones
+from model.answer.search_in_c import choose_tones
+from model.answer.strength import (
+    NO_LIMITS,
+    Limits,
+    as_quiet_fingers_allow,
+    as_ramps_allow,
+    gains_within,
+    scaled,
+    with_gains,
+)
+from model.arguments import expect_between
+from model.arrays import Point
+from model.choice import NEARLY, best_by, best_of
+from model.drive_modes import UNRESTRICTED
+from model.errors import InputError
+from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
+from model.table.table import EFFECT_DURATIONS, LocalizationTable
+
+MAX_SEPARATE = 5
+"""Fingers that may share, up to which each has a vibration of its own at first.
+
+Of more, one for all was the end in 34 of 36 sets with two quiet fingers.
+"""
+
+CONTENTS_A_STEP = 3
+"""Of so many vibrations one gives way before what is left is measured, at least one in all."""
+
+
+def answer(
+    table: LocalizationTable,
+    fingers: Sequence[Finger],
+    *,
+    quiet: Sequence[Point | Finger] = (),
+    drive_mode: str | None = None,
+    shaped: bool = False,
+    apart_hz: float = APART_HZ,
+    bands_may_swap: bool = False,
+    min_contrast_db: float = MIN_CONTRAST_DB,
+    limits: Limits = NO_LIMITS,
+) -> Answer:
+    """Answer all fingers at once, each with a vibration of its own.
+
+    quiet: more fingers, which are to feel nothing; drive_mode: the table's own if None, which must
+    be `phased` for more than one vibration; shaped: whether the amplifiers play shaped onsets and
+    endings, which `Timing` adds; apart_hz: distance of the vibrations' frequencies, where their
+    bands allow it; bands_may_swap: whether a finger may have the band of another one;
+    min_contrast_db: below which the promise at the worst finger is not served as requested;
+    limits: of the amplifiers. A stimulus whose modulation would leave a finger unserved, or whose
+    side bands do not fit, is steady, as is a shared one. Levels are lowered where stroke and limits
+    do not allow all: of the lower priorities first, of one priority the louder ones first.
+    Raises InputError for fingers that contradict each other, and a band without frequencies.
+    """
+    expect_between(apart_hz, 0.0, what="apart_hz")
+    every = (*fingers, *[each if isinstance(each, Finger) else Finger(each) for each in quiet])
+    check_fingers(every, table.plate)
+    mode = checked_mode(drive_mode or table.drive_mode)
+    answering = _Answering(table, every, mode, shaped, apart_hz, bands_may_swap, limits)
+    found = answering.within_limits(answering.solve(min_contrast_db), min_contrast_db)
+    changed = _changed(found)
+    return replace(found, applied=(*found.applied, *changed)) if changed else found
+
+
+def query(
+    table: LocalizationTable,
+    placed: Placement,
+    level_db_sl: float = STRONG_DB_SL,
+    *,
+    drive_mode: str | None = None,
+    **stimulus: Any,
+) -> Answer:
+    """Answer fingers that feel one vibration, and others that feel nothing, as `answer`."""
+    fingers = together(placed, Stimulus(level_db_sl, **stimulus))
+    return answer(table, fingers, drive_mode=drive_mode)
+
+
+def prepare_answers(
+    table: LocalizationTable, drive_mode: str | None = None, *, with_ringing: bool = True
+) -> None:
+    """Compute ahead what the first answer of a table in a drive mode needs.
+
+    with_ringing: of short stimuli, too, which takes the longest.
+    """
+    centre = (table.plate.length / 2, table.plate.width / 2)
+    for quiet in ((), ((0.0, 0.0),)):
+        placed = Placement((centre,), quiet)
+        query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
+    if (drive_mode or table.drive_mode) == UNRESTRICTED:
+        for duration in EFFECT_DURATIONS if with_ringing else ():
+            table.ringing(duration)
+
+
+def _changed(found: Answer) -> list[str]:
+    """What became of modulations and levels, in words."""
+    steady, lowered = [], []
+    for number, stream in enumerate(found.contents.streams):
+        first = stream.targets[0]
+        stimulus = found.asked[first].stimulus
+        is_modulated = stimulus is not None and stimulus.modulation_hz is not None
+        if is_modulated and list(found.tones.owners).count(number) == 1:
+            steady.append(f"vibration of {_at(found.asked[first])} is steady")
+        if stream.limit_db_sl is None and found.lowered_db(number):
+            is_short = stream.duration is not None
+            level = found.tones.level_db_sl[first][not is_short]
+            why = (
+                "all that the ERAs' stroke and the amplifiers allow"
+                if found.stroke_factor < 1 - NEARLY or not is_short
+                else "so that quiet fingers feel half of it at most"
+            )
+            at = _at(found.asked[first])
+            lowered.append(f"vibration of {at} is lowered to {level:.1f} dB SL, {why}")
+    return [*steady, *lowered]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which fingers, by index, feel which content and which are quiet.
+
+    contents: the fingers of each, its own first; quiet: those that are protected; held: contents
+    given up, with the contrast that they would have had, and whether they would disturb a finger;
+    applied: what was changed, in words.
+    """
+
+    contents: tuple[tuple[int, ...], ...]
+    quiet: tuple[int, ...]
+    held: tuple[tuple[int, float, bool], ...] = ()
+    applied: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Answering:
+    """Fingers on a table's plate, numbered in their order."""
+
+    table: LocalizationTable
+    fingers: tuple[Finger, ...]
+    drive_mode: str
+    is_shaped: bool
+    apart_hz: float
+    bands_may_swap: bool
+    limits: Limits
+
+    def solve(self, min_contrast_db: float) -> Answer:
+        """Change the plan until the worst finger has the contrast, else take the best tried."""
+        quiet = [n for n, each in enumerate(self.fingers) if each.stimulus is None]
+        plan = self._many_joined(_Plan(self._first_contents, tuple(quiet)))
+        if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
+            raise InputError(
+                f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
+                f"got {self.drive_mode}, which plays one; give drive_mode={UNRESTRICTED!r} where "
+                "the amplifiers play it"
+            )
+        tried = [found := self._measure(plan)]
+        while _is_out_of_bounds(found) or (
+            found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
+        ):
+            for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
+                plan = self._with_less(plan, found)
+            tried.append(found := self._measure(plan))
+        if found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
+            allowed = [each for each in tried if not _is_out_of_bounds(each)]
+            below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
+            found = best_by(allowed, _worst_of)
+            found = replace(found, applied=(*found.applied, below))
+        if self.drive_mode == UNRESTRICTED:
+            found = with_modulation(self.table, found, playable=self.limits.frequencies)
+        return as_quiet_fingers_allow(self.table, found)
+
+    def within_limits(self, found: Answer, min_contrast_db: float) -> Answer:
+        """The answer lowered to what the amplifiers' limits allow.
+
+        Where a finger would not be served any more, by the rule again at the lower levels.
+        """
+        strokes = self.table.strokes
+        found = as_ramps_allow(self.table, found, self.limits)
+        if (factor := self.limits.factor_within(found.amplitudes, strokes)) >= 1 - NEARLY:
+            return found
+        if len(found.contents.streams) > 1:
+            gains = gains_within(found, self.limits, strokes)
+            lowered = with_gains(self.table, found, gains)
+            if not is_served(lowered, found):
+                lowered = replace(self, fingers=_softer(found, gains.tolist())).solve(
+                    min_contrast_db
+                )
+                lowered = replace(lowered, asked=self.fingers)
+            found = lowered
+            factor = self.limits.factor_within(found.amplitudes, strokes)
+        return scaled(found, float(decibels(factor))) if factor < 1 else found
+
+    @cached_property
+    def _first_contents(self) -> tuple[tuple[int, ...], ...]:
+        """The fingers of each vibration at first: of one name where they must feel one."""
+        found: list[list[int]] = []
+        for number, finger in enumerate(self.fingers):
+            if finger.stimulus is None:
+                continue
+            for content in found:
+                if finger.must_feel_one_with(self.fingers[content[0]]):
+                    content.append(number)
+                    break
+            else:
+                found.append([number])
+        return tuple([tuple(each) for each in found])
+
+    def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
+        """The plan after the next step of the rule."""
+        requests, contents = self.fingers, plan.contents
+        pairs = [
+            (one, other)
+            for number, one in enumerate(contents)
+            for other in contents[:number]
+            if all(requests[a].may_feel_one_with(requests[b]) for a in one for b in other)
+        ]
+        if pairs:
+            near = [
+                -min(math.dist(requests[a].at, requests[b].at) for a in one for b in other)
+                for one, other in pairs
+            ]
+            return self._joined(plan, pairs[best_of(near)])
+        disturbed = found.disturbed[:1]
+        others = [each for each in contents if not {*disturbed}.intersection(each)]
+        least = min(requests[each[0]].priority for each in others)
+        lowest = [each for each in others if requests[each[0]].priority == least]
+        open_ = [
+            each for each in lowest if not any(requests[finger].is_protected for finger in each)
+        ]
+        given_up = (open_ or lowest)[-1]
+        had = [found.tones.contrast_db[finger][2] for finger in given_up]
+        verb = "is neither served nor protected" if open_ else "is held back"
+        return _Plan(
+            tuple(each for each in contents if each != given_up),
+            plan.quiet if open_ else (*plan.quiet, *given_up),
+            (
+                *plan.held,
+                *(
+                    (finger, -math.inf if math.isnan(each) else each, bool(disturbed))
+                    for finger, each in zip(given_up, had, strict=True)
+                ),
+            ),
+            (*plan.applied, f"vibration of {_at(requests[given_up[0]])} {verb}"),
+        )
+
+    def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
+        """The plan with some of its contents as one, that of the highest priority."""
+        one, *others = sorted(contents, key=lambda each: -self.fingers[each[0]].priority)
+        fingers = sum(others, one)
+        at = _at(self.fingers[one[0]])
+        return replace(
+            plan,
+            contents=tuple(
+                fingers if each == one else each for each in plan.contents if each not in others
+            ),
+            applied=(
+                *plan.applied,
+                *(f"{_at(self.fingers[each[0]])} shares the vibration of {at}" for each in others),
+            ),
+        )
+
+    def _many_joined(self, plan: _Plan) -> _Plan:
+        """The plan with one content for more than MAX_SEPARATE fingers that may all share."""
+        groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
+        for content in plan.contents:
+            finger = self.fingers[content[0]]
+            if finger.may_feel_one_with(finger):
+                groups[finger.sharing == ANY or str(finger.name)].append(content)
+        for group in groups.values():
+            if len(group) > MAX_SEPARATE:
+                plan = self._joined(plan, group)
+        return plan
+
+    @cached_property
+    def _bands(self) -> dict[int, tuple[int, int]]:
+        """The first of the rows that each finger may have, and one past the last."""
+        frequencies, bands = self.table.frequencies.tolist(), {}
+        for number, finger in enumerate(self.fingers):
+            if finger.stimulus is None:
+                continue
+            low, high = finger.stimulus.band_hz
+            first, end = bisect_left(frequencies, low), bisect_right(frequencies, high)
+            if first == end:
+                nearest = min(frequencies, key=lambda each: abs(each - low))
+                raise InputError(
+                    f"band of {_at(finger)} must be LOW-HIGH in Hz and hold a frequency of the "
+                    f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
+                    f"is the nearest, got {low:g}-{high:g}; build a table with others: era table "
+                    "build --frequencies"
+                )
+            bands[number] = first, end
+        return bands
+
+    def _contents(self, plan: _Plan) -> Contents:
+        """A plan for a kernel."""
+        bands, streams, background = self._bands, [], None
+        for fingers in plan.contents:
+            own = tuple(bands.values()) if self.bands_may_swap else (bands[fingers[0]],)
+            first = self.fingers[fingers[0]]
+            stimulus, priority, level = first.stimulus, first.priority, -math.inf
+            for finger in fingers:
+                other = self.fingers[finger]
+                level = max(level, other.stimulus.level_db_sl if other.stimulus else level)
+                priority = max(priority, other.priority)
+            duration, limit = None, None
+            if stimulus is not None:
+                duration = stimulus.duration
+                if stimulus.is_limit:
+                    level, limit = min(level, FELT_DB_SL), level
+            streams.append(Stream(fingers, float(level), own, priority, duration, limit))
+        if len(streams) == 1 and not plan.quiet:
+            places = [self.fingers[finger].at for finger in streams[0].targets]
+            background = self.table.background(places)
+        return Contents(
+            tuple([each.at for each in self.fingers]),
+            tuple([each.load for each in self.fingers]),
+            tuple(streams),
+            plan.quiet,
+            self.apart_hz,
+            background=background,
+            drive_mode=self.drive_mode,
+            is_shaped=self.is_shaped,
+        )
+
+    def _measure(self, plan: _Plan) -> Answer:
+        """What fingers feel of a plan's contents."""
+        table, contents, applied = self.table, self._contents(plan), plan.applied
+        if contents.streams:
+            tones = choose_tones(table, contents)
+        else:
+            tones = Tones.none(len(contents.places))
+        if not tones.is_apart:
+            applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
+        given = self.fingers, contents, tones, plan.held, applied
+        return Answer(*given, table.eras, table.frequencies, table.thresholds)
+
+
+def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
+    """The fingers of an answer, each at the frequency of its layer and at a lower level."""
+    softer = list(found.asked)
+    for layer, gain in zip(found.layers, gains_db, strict=True):
+        for number in layer.fingers:
+            finger = softer[number]
+            if finger.stimulus is not None and layer.frequency is not None:
+                level = max(MIN_LEVEL_DB_SL, finger.stimulus.level_db_sl + gain)
+                band = layer.frequency, layer.frequency
+                stimulus = replace(finger.stimulus, level_db_sl=level, band_hz=band)
+                softer[number] = replace(finger, stimulus=stimulus)
+    return tuple(softer)
+
+
+def _is_out_of_bounds(found: Answer) -> bool:
+    """Whether a finger has less contrast, or more of others' contents, than it allows."""
+    is_one_of_many = len(found.contents.streams) > 1  # one alone cannot give way to others
+    return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
+
+
+def _worst_of(found: Answer) -> float:
+    return math.inf if found.promised_worst_db is None else found.promised_worst_db
+
+
+def _at(finger: Finger) -> str:
+    return f"({finger.at[0]:g}, {finger.at[1]:g}) m"

@@ -235,7 +235,7 @@ def _felt(
     for each, level in zip(short, leaks, strict=True):
         key = each[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        requested = Requested((each,), contacts, protected or frozenset(), {}, (beside,), math.inf)
+        requested = Requested((each,), contacts, protected or frozenset(), {}, (beside,))
         (felt,) = simulator.chooser.choose(requested, simulator.capabilities).short[key].predictions
         found[key] = felt.promised_contrast_db or 0.0, felt.verdict
         worst = min(worst, found[key][0])

@@ -34,7 +34,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
-from controller.play.observer import Applied, Observer, Silenced
+from controller.play.observer import Observer, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from registry import clock
 
@@ -180,7 +180,9 @@ class EventPublisher:
         self.view.contacts = contacts
         self.hub.publish("contacts", self.view.contacts_event)
 
-    def _reported(self, topic: Literal["pattern", "silence"], report: Applied | Silenced) -> None:
+    def _reported(
+        self, topic: Literal["pattern", "silence"], report: PlayReport | SilenceReport
+    ) -> None:
         """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
         self.view.report = report
         if report.latency is not None:

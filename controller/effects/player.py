@@ -73,7 +73,7 @@ class EffectPlayer:
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
         self._waiting: dict[ContactKey, Pulse] = {}  # short ones before their turn
-        self._sensing = self._targets = self._felt = frozenset[ContactKey]()  # of the last intent
+        self._sensing = self._targets = self._felt = set[ContactKey]()  # of the last intent
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
@@ -87,33 +87,32 @@ class EffectPlayer:
             if play is not None and sensation is not None:
                 felt.append((play.number, play, contact, sensation))
         felt.sort()
-        elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
-        targets = [
-            sensation.target(
+        newest = max([number for number, play, _, _ in felt if play.is_elsewhere], default=None)
+        waiting, self._waiting = self._waiting, {}
+        sensing, targets = set[ContactKey](), list[Target]()
+        for number, play, contact, sensation in felt:
+            sensing.add(contact.key)
+            if play.is_elsewhere and number != newest:
+                continue  # of these only the newest is felt
+            target = sensation.target(
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
-            for number, play, contact, sensation in felt
-            if number not in elsewhere[:-1]  # of these only the newest is felt
-        ]
-        waiting, self._waiting = self._waiting, {}
-        for target in targets:
+            targets.append(target)
             if target.key in waiting and target.is_short:
                 self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
-        self._sensing = frozenset([contact.key for _, _, contact, _ in felt])
-        self._targets = frozenset([each.key for each in targets])
-        self._felt = frozenset([each.key for each in now_felt])
+        self._sensing, self._targets = sensing, {each.key for each in targets}
+        self._felt = {each.key for each in now_felt}
+        protected = [
+            key
+            for key, finger in self._fingers.items()
+            if finger.region is not None and finger.region.is_protected
+        ]
         return HapticIntent(
             now_felt,
             "" if now_felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
             until=min(ends, default=None),
-            protected=frozenset(
-                [
-                    key
-                    for key, finger in self._fingers.items()
-                    if finger.region is not None and finger.region.is_protected
-                ]
-            ),
+            protected=frozenset(protected),
         )
 
     def why_not(self, key: ContactKey) -> str:

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from controller.play import decision, table_query
+from controller.play import planner, table_query
 from model.answer.effect_level import DriveLimits, RaisedPattern
 from model.answer.pattern import Pattern
 from model.answer.pattern_query import find_pattern, prepare_patterns
@@ -90,8 +90,8 @@ def _prepare(table: object, drive_mode: str | None) -> None:
     getattr(table, "prepare", partial(prepare_patterns, table))(drive_mode)
 
 
-decision.find_pattern = table_query.find_pattern = _query
-decision.prepare_patterns = _prepare
+planner.find_pattern = table_query.find_pattern = _query
+planner.prepare_patterns = _prepare
 
 
 class SetLevels:

@@ -17,7 +17,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.observer import Applied
+from controller.play.observer import PlayReport
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
@@ -191,7 +191,7 @@ class Felt:
     """
 
     delay: float
-    applied: Applied
+    applied: PlayReport
     accelerations: FloatArray
     weights: FloatArray
     sample_rate: float

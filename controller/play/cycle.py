@@ -22,7 +22,6 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.group import Group
-from drivers.host.joint_sets import Played
 from drivers.protocol.timing import HEARTBEAT
 from model.answer.timing import Timing
 from model.counting import counted
@@ -109,7 +108,8 @@ class Cycle:
         try:
             async with self._sending:
                 with suppress(LinkDegraded):  # what plays is unknown, and planned anew; others feed
-                    await self._send(planner, plan, now)
+                    if plan is not None and self.group.is_armed:
+                        await self._send(planner, plan)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     # From its beginning: the watchdog has run since its request was sent.
@@ -129,28 +129,51 @@ class Cycle:
             reason = str(error)
             self._report(lambda each: each.refused(reason))
 
-    async def _send(self, planner: Planner, plan: Plan | None, now: float) -> None:
-        """Send what a plan of a time [s] changes, or what is due by itself; raises DriverError.
+    async def _send(self, planner: Planner, plan: Plan) -> None:
+        """Send what a plan changes, and report the outcome; raises DriverError.
 
-        Sends nothing unless the amplifiers are armed.
+        While an amplifier is degraded nothing starts or is prolonged.
         """
-        if not self.group.is_armed:
-            return
-        if plan is None:
-            if now >= planner.layers.due:
-                await self._go_on(planner, now)
-        elif plan.sets.started and self.group.members.degraded:
-            if ends := planner.only_ends(plan):  # unreported
-                played = await self._play(planner, ends)
-                if isinstance(played, CommandRefused):
-                    raise played
-                planner.confirm(ends, played, now=clock.now())
-        else:
-            self._plan = plan
-            try:
-                await self._execute(planner, plan)
-            finally:
-                self._plan = None
+        if self.group.members.degraded:
+            plan = planner.only_ends(plan)
+        self._plan = plan
+        try:
+            outcome = await self._play(planner, plan.sets)
+            if isinstance(outcome, CommandRefused):
+                plan = planner.refused(plan, outcome, now=clock.now())
+                outcome = await self._play(planner, plan.sets)
+        finally:
+            self._plan = None
+        if reason := plan.sets.reason:
+            self._report(lambda each: each.refused(reason))
+        if plan.is_reported:
+            sent_at = outcome if isinstance(outcome, float) else None
+            self._report_playing(planner, plan, sent_at=sent_at)
+
+    async def _play(self, planner: Planner, sets: Sets) -> float | CommandRefused | None:
+        """Play sets on all amplifiers, from one moment on; returns when [s] the last byte was sent.
+
+        None where nothing is to be sent, or why they were refused. Whatever is raised instead
+        leaves it unknown what plays.
+        """
+        if not sets:
+            return None
+        try:
+            if sets.silence is not None:
+                sent_at = await self.group.silence(sets.silence)
+                planner.layers.may_play = frozenset()
+                return sent_at
+            if self.group.sets.is_incomplete:
+                await self.group.silence(RELEASE_RAMP)  # before the next pattern
+            played = await self.group.apply(sets.by_amplifier)
+        except BaseException as error:
+            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
+            if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
+                return error
+            planner.forget()
+            raise
+        planner.confirm(sets, played, now=clock.now())
+        return played.sent_at
 
     def _count_too_late(self, clicks: int) -> None:
         if self.group.is_armed:
@@ -236,34 +259,6 @@ class Cycle:
         if (change := self._tracker.expire(clock.now())).up:
             self._follow(change)
 
-    async def _go_on(self, planner: Planner, now: float) -> None:
-        """Prolong the layers that are due, and report those that have ended; raises DriverError."""
-        layers = planner.layers
-        if not self.group.members.degraded and (renewal := layers.renewal(now)):
-            played = await self._play(planner, renewal)
-            if isinstance(played, CommandRefused):
-                layers.not_renewed(renewal, played)
-            else:
-                layers.confirm(renewal, played, clock.now())
-        if (ended := planner.ended(now)) is not None:
-            self._report_playing(planner, ended, sent_at=None)
-
-    async def _execute(self, planner: Planner, plan: Plan) -> None:
-        """Send the sets of a plan and report the outcome; raises DriverError."""
-        sent_at = None
-        if plan.sets.layers:
-            played = await self._play(planner, plan.sets)
-            if isinstance(played, CommandRefused):
-                plan = planner.refused(plan, played, now=clock.now())
-            else:
-                sent_at = played.sent_at
-                planner.confirm(plan.sets, played, now=clock.now())
-        if plan.sets.silence is not None:
-            sent_at = await self._silence(planner, plan.sets.silence)
-        if reason := plan.sets.reason:
-            self._report(lambda each: each.refused(reason))
-        self._report_playing(planner, plan, sent_at=sent_at)
-
     def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
         """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
         now = clock.now()
@@ -274,32 +269,6 @@ class Cycle:
             return
         silenced = silence_report(plan, sent_at=sent_at, now=now)
         self._report(lambda each: each.silenced(silenced))
-
-    async def _silence(self, planner: Planner, ramp: float) -> float:
-        """Silence all layers of all amplifiers; returns when [s] that was sent."""
-        try:
-            sent_at = await self.group.silence(ramp)
-        except BaseException:
-            planner.forget()
-            raise
-        planner.layers.may_play = frozenset()
-        return sent_at
-
-    async def _play(self, planner: Planner, sets: Sets) -> Played | CommandRefused:
-        """Play sets on all amplifiers, from one moment on, or say why not.
-
-        Whatever is raised instead leaves it unknown what plays.
-        """
-        try:
-            if self.group.sets.is_incomplete:
-                await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            return await self.group.apply(sets.by_amplifier)
-        except BaseException as error:
-            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
-            if isinstance(error, CommandRefused) and not is_overtaken:
-                return error
-            planner.forget()
-            raise
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, or the expiry of an intent."""

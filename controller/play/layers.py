@@ -17,7 +17,6 @@ from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
 from controller.play.intent import FADED_AFTER
 from controller.play.routing import (
-    FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
@@ -159,7 +158,7 @@ class Layers:
         """
         left, skipped = [*contents], list[Content]()
         reason, retry_at = "", math.inf
-        while left:
+        while True:
             for is_shaped in (True, False):
                 sets, playing = self._sets(left, now, is_shaped=is_shaped)
                 refusal = self.check(sets.by_amplifier) if sets.started else None
@@ -176,26 +175,13 @@ class Layers:
             newest = max([playing[number] for number in sets.started], key=_requested_at).content
             skipped += [each for each in left if each.targets == newest.targets]
             left = [each for each in left if each.targets != newest.targets]
-        silence = self.silence(FADE_RAMP, now)
-        return replace(silence, skipped=skipped, reason=reason, retry_at=retry_at)
-
-    def end(self, now: float) -> Sets:
-        """Return the sets by which all layers end, along endings if these lead from what plays."""
-        numbers = sorted(self.may_play)
-        if self.is_silent or not numbers:
-            return self.silence(FADE_RAMP, now)
-        if not all(self._may_end_shaped(number, now) for number in numbers):
-            return self.silence(FADE_RAMP, now)
-        ends = {each: self.builder.build_end(each, has_endings=True) for each in numbers}
-        self._note_end(now)
-        return Sets(ends, settled_after=self.builder.end_ramp)
 
     def silence(self, ramp: float, now: float) -> Sets:
         """Return the silence of all layers along a ramp [s]; nothing if they are silent."""
         if self.is_silent:
             return Sets()
-        self._note_end(now)
-        self.is_silent = True
+        self._replace({})
+        self.is_silent, self._layer_of, self._fades_until = True, {}, now + FADED_AFTER
         return Sets(silence=ramp)
 
     def renewal(self, now: float) -> Sets:
@@ -222,6 +208,11 @@ class Layers:
         for number in renewal.layers:
             due = math.inf if refusal.until is None else refusal.until
             self._change(number, renewal_due=due)
+
+    def have_settled(self, now: float) -> bool:
+        """Whether all that may play has settled, so that endings lead from there."""
+        may_end = [self._may_end_shaped(number, now) for number in self.may_play]
+        return bool(may_end) and all(may_end)
 
     def confirm(self, sets: Sets, played: Played, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
@@ -360,10 +351,6 @@ class Layers:
         if now < self._fades_until:
             ends.append(now)
         return max(ends, default=math.inf) + FADED_AFTER
-
-    def _note_end(self, now: float) -> None:
-        self._replace({})
-        self._layer_of, self._fades_until = {}, now + FADED_AFTER
 
     def _change(self, number: int, **values: Any) -> None:
         """Give what plays in a layer other values of its fields."""

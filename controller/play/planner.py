@@ -43,7 +43,7 @@ class Plan:
 
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest. since [s]: when
     the first finger changed that this answers; is_touch: whether one of these came, moved or
-    pressed, instead of lifts alone or none.
+    pressed, instead of lifts alone or none. is_reported: not, where what is felt stays as it is.
     """
 
     contacts: tuple[Contact, ...]
@@ -52,6 +52,7 @@ class Plan:
     since: float
     is_touch: bool = False
     sets: Sets = field(default_factory=Sets)
+    is_reported: bool = True
 
 
 class Planner:
@@ -159,11 +160,16 @@ class Planner:
         self._plan, self._retry_at = None, math.inf
         self.layers.forget()
 
-    def only_ends(self, plan: Plan) -> Sets:
-        """Return the sets of a plan without what it starts, which is planned again later."""
+    def only_ends(self, plan: Plan) -> Plan:
+        """Return a plan without what it starts, which is planned again later, or prolongs."""
+        if not plan.is_reported:
+            return replace(plan, sets=Sets())
+        if not plan.sets.started:
+            return plan
         self.forget()
         layers, started = plan.sets.layers, plan.sets.started
-        return Sets({number: each for number, each in layers.items() if number not in started})
+        ends = {number: each for number, each in layers.items() if number not in started}
+        return replace(plan, sets=Sets(ends), is_reported=False)
 
     def confirm(self, sets: Sets, played: Played, *, now: float) -> None:
         """Note what the amplifiers play of sets by now [s].
@@ -183,24 +189,14 @@ class Planner:
 
         It is planned again when the refusal ends, where that is known.
         """
+        if not plan.is_reported and self.layers.contents:
+            self.layers.not_renewed(plan.sets, refusal)
+            return replace(plan, sets=Sets())
         if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
             self._awaited.clear()
         self._retry_at = math.inf if refusal.until is None else refusal.until
         silence = replace(self.layers.silence(FADE_RAMP, now), reason=str(refusal))
-        return replace(plan, sets=silence)
-
-    def ended(self, now: float) -> Plan | None:
-        """Return what plays on where contents have ended by themselves at a time [s], once.
-
-        With silence if there is none; None if nothing has ended.
-        """
-        contents = self.layers.ended(now)
-        if not contents or self._plan is None:
-            return None
-        selection = self._plan.selection.without(contents, ENDED)
-        sets = Sets(reason=ENDED)
-        self._plan = replace(self._plan, selection=selection, sets=sets, since=now)
-        return self._plan
+        return replace(plan, sets=silence, is_reported=True)
 
     def plan(self, now: float) -> Plan | None:
         """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
@@ -214,7 +210,7 @@ class Planner:
                     self._too_late(1)
         before, contacts = self._plan, self._tracker.contacts
         if not self._tracker.changed and before is not None and now < self.due:
-            return None
+            return self._go_on(before, now) if now >= self.layers.due else None
         self._seen = contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
@@ -249,6 +245,18 @@ class Planner:
             return plan
         return None if is_awaited or _why_not(plan) == _why_not(before) else plan  # else: only said
 
+    def _go_on(self, plan: Plan, now: float) -> Plan | None:
+        """Plan what is due where nothing changes: what has ended by itself, or is to be prolonged.
+
+        With silence if nothing plays on.
+        """
+        if contents := self.layers.ended(now):
+            selection = plan.selection.without(contents, ENDED)
+            self._plan = replace(plan, selection=selection, sets=Sets(), since=now)
+            return self._plan
+        renewal = self.layers.renewal(now)
+        return replace(plan, sets=renewal, is_reported=False) if renewal else None
+
     def _note_answer(self) -> None:
         self.look_again()
         self._arrived()
@@ -269,7 +277,9 @@ class Planner:
         """Return the end of all that plays: along endings only under fingers that stay."""
         if not contacts:
             return self.layers.silence(RELEASE_RAMP, now)
-        return self.layers.silence(FADE_RAMP, now) if has_failed else self.layers.end(now)
+        if has_failed or not self.layers.have_settled(now):
+            return self.layers.silence(FADE_RAMP, now)
+        return self.layers.plan((), now)
 
     def _answered(self, started: Collection[int], now: float) -> tuple[float, bool]:
         """Return since when [s] fingers have changed that are answered, and whether any but lifted.

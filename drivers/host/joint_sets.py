@@ -54,7 +54,12 @@ class JointSets:
         """Whether possibly only some amplifiers have committed the last set."""
 
     def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-        """Return why ledgers would not admit layers by amplifier now; None if all would."""
+        """Return why ledgers would not admit layers by amplifier now; None if all would.
+
+        Not while a set is incomplete, which is silenced first.
+        """
+        if self.is_incomplete:
+            return None
         refusals: dict[str, CommandRefused] = {}
         for name, each in layers.items():
             if (refusal := self._members.amplifiers[name].refusal_of(each)) is not None:

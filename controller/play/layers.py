@@ -173,8 +173,8 @@ class Layers:
                 reason, until = str(refusal), refusal.until
             retry_at = self._faded_by(contents, now) if until is None else until
             newest = max([playing[number] for number in sets.started], key=_requested_at).content
-            skipped += [each for each in left if each.targets == newest.targets]
-            left = [each for each in left if each.targets != newest.targets]
+            voices = [each for each in left if each.targets == newest.targets]
+            skipped, left = skipped + voices, [each for each in left if each not in voices]
 
     def silence(self, ramp: float, now: float) -> Sets:
         """Return the silence of all layers along a ramp [s]; nothing if they are silent."""

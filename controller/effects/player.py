@@ -23,7 +23,7 @@ CLICKS_APART = 0.060
 """Pause [s] between the starts of short pulses at two fingers: together they would be one."""
 
 # A short pulse that would have to wait longer [s], two turns with rounding, is left out.
-_MAX_WAIT = 0.125
+_MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 
 @dataclass

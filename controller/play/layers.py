@@ -283,7 +283,7 @@ class Layers:
             for number, content in numbers.items()
             if number not in self.contents or self.contents[number].content != content
         ]
-        for number in changed:
+        for number in changed if len(numbers) > 1 else ():
             content = numbers[number]
             voices = [n for n, one in numbers.items() if one.targets == content.targets]
             if len(voices) > 1 and restarted_by(content.pattern.excitation, self._drive_of(number)):

@@ -21,7 +21,7 @@ from controller.learning.estimator_process import (
     EstimatorProcess,
     EstimatorTimeouts,
 )
-from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
+from controller.learning.messages import Answers, Estimate, Note, Ready, RefreshedAnswers, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.play.loop import Controller
 from controller.play.observer import Observer, PlayReport
@@ -180,13 +180,13 @@ class Learning:
         )
         self._spawn("estimator", self._estimator.run())
 
-    def _received(self, reply: Ready | Estimate | Refreshed | Note) -> None:
+    def _received(self, reply: Ready | Estimate | RefreshedAnswers | Note) -> None:
         match reply:
             case Ready():
                 self._ready(reply)
             case Estimate():
                 self._take(reply)
-            case Refreshed():
+            case RefreshedAnswers():
                 self._robust = reply.robust
                 if not self.status.are_robust and not self._is_held:
                     self._correct(reply.answers)

@@ -16,15 +16,11 @@ _IRREGULAR = re.compile(
 
 EXPECTED = {
     "Felt": "what fingers feel in a study: renamed with the answer that it judges",
-    "Request": "of an answer and of the API: the answer's becomes a finger with its stimulus",
     "Content": "rows of a file of a table, and what plays: renamed with the commands",
     "Playing": "what plays, and a message of the API about it: renamed with the layers",
-    "Applied": "of what plays: renamed with the layers",
-    "Silenced": "of what plays: renamed with the layers",
     "Requested": "of what plays: renamed with the layers",
     "Chosen": "of what plays: renamed with the layers",
     "_Intended": "of what plays: renamed with the layers",
-    "_Sender": "of TUIO, and of a replay: renamed with the touch sources",
     "Explained": "a message of the API: renamed with its methods",
     "Acceptor": "of the API's socket, and of the gateway's: renamed with the API",
 }

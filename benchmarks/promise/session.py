@@ -23,7 +23,7 @@ from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
-from controller.play.observer import Applied
+from controller.play.observer import PlayReport
 from model.answer.timing import Timing
 from model.finger.fingertip import FINGERTIP_RADIUS
 from registry import clock
@@ -61,7 +61,7 @@ class Outcome:
 class _Steady:
     """What has been promised to each finger, and the time [s] when it is measured."""
 
-    applied: Applied
+    applied: PlayReport
     until: float
 
     @property
@@ -84,7 +84,7 @@ class _Event:
     name: str
     time: float
     before: _Steady
-    first: Applied
+    first: PlayReport
     after: _Steady
     path: tuple[tuple[float, float], ...] = ()
 

@@ -236,7 +236,7 @@ def _felt(
     for one, level in zip(short, leaks, strict=True):
         key = one[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        requested = Requested((one,), contacts, protected or frozenset(), {}, (beside,), math.inf)
+        requested = Requested((one,), contacts, protected or frozenset(), {}, (beside,))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
         (predicted,) = chosen.predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict

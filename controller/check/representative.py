@@ -1,9 +1,9 @@
-"""What an effect makes felt in general: its strongest sensation, at rest and along some ways."""
+"""What an effect makes felt in general: its strongest stimulus, at rest and along some ways."""
 
 import math
 from collections.abc import Iterator
 
-from controller.effects.effect import Effect, Sensation
+from controller.effects.effect import Effect, EffectStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.intent import Target
@@ -37,13 +37,13 @@ def strongest_target(
     return strongest.target(_KEY, name, region, band=band, priority=priority)
 
 
-def _strength(sensation: Sensation) -> float:
-    return math.inf if sensation.level_db_sl is None else sensation.level_db_sl
+def _strength(stimulus: EffectStimulus) -> float:
+    return math.inf if stimulus.level_db_sl is None else stimulus.level_db_sl
 
 
 def _while_resting(
     effect: Effect, region: Region | None, level: float | None, at: tuple[float, float]
-) -> Iterator[Sensation]:
+) -> Iterator[EffectStimulus]:
     contact = _finger(at)
     run = effect.start_in(region, contact, 0.0, level_db_sl=level)
     now: float | None = 0.0
@@ -53,14 +53,14 @@ def _while_resting(
         felt = run.feel(contact, now)
         if felt is None:
             return
-        if isinstance(felt, Sensation):
+        if isinstance(felt, EffectStimulus):
             yield felt
         now = None if felt.until is None else max(felt.until, now + 1e-6)
 
 
 def _while_moving(
     effect: Effect, region: Region | None, level: float | None, at: tuple[float, float]
-) -> Iterator[Sensation]:
+) -> Iterator[EffectStimulus]:
     for speed in _SPEEDS:
         for along in ((1.0, 0.0), (0.0, 1.0), None):
             count = max(2, math.ceil(_WAY / speed / _REPORT)) + 8
@@ -68,7 +68,7 @@ def _while_moving(
             run = effect.start_in(region, _finger(way[0]), 0.0, level_db_sl=level)
             for step, position in enumerate(way):
                 felt = run.feel(_finger(position), step * _REPORT)
-                if isinstance(felt, Sensation):
+                if isinstance(felt, EffectStimulus):
                     yield felt
 
 

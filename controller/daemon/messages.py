@@ -28,7 +28,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.operation.states import Loss
 from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
-from controller.play.observer import Applied, Silenced
+from controller.play.observer import PlayReport, SilenceReport
 from controller.play.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers.counters import LinkStatistics
@@ -62,13 +62,13 @@ class PlateView:
 
     effect_of: Callable[[ContactKey], str | None]
     contacts: tuple[Contact, ...] = ()
-    report: Applied | Silenced | None = None
+    report: PlayReport | SilenceReport | None = None
     why_not: Callable[[ContactKey], str] = lambda key: ""
 
     @property
-    def applied(self) -> Applied | None:
+    def applied(self) -> PlayReport | None:
         """The pattern that plays; None while nothing does."""
-        return self.report if isinstance(self.report, Applied) else None
+        return self.report if isinstance(self.report, PlayReport) else None
 
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts with their roles."""
@@ -84,7 +84,7 @@ class PlateView:
 
     def _statuses(self, contacts: Iterable[Contact]) -> list[ContactStatus]:
         report, reason = self.report, ""
-        if isinstance(report, Silenced) and not report.targets:  # as by a failure
+        if isinstance(report, SilenceReport) and not report.targets:  # as by a failure
             reason = report.reason
         known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
@@ -134,7 +134,7 @@ class PlateView:
     def silence_event(self) -> SilenceEvent | None:
         """The event of topic `silence`; None while something plays, or before a decision."""
         silenced = self.report
-        if not isinstance(silenced, Silenced):
+        if not isinstance(silenced, SilenceReport):
             return None
         return SilenceEvent(
             contacts=self._statuses(silenced.contacts),
@@ -143,7 +143,7 @@ class PlateView:
         )
 
 
-def playing_of(applied: Applied | None) -> dict[str, Any]:
+def playing_of(applied: PlayReport | None) -> dict[str, Any]:
     """What of a `Playing` is of a pattern: its tones, what is promised and predicted, if any."""
     felt = None if applied is None else applied.felt
     contents = {} if applied is None else applied.contents
@@ -165,7 +165,7 @@ def played_tones(drive: Drive) -> dict[str, PlayedTone]:
 
 
 def contact_status(
-    contact: Contact, report: Applied | Silenced | None, effect: str | None, *, why_not: str
+    contact: Contact, report: PlayReport | SilenceReport | None, effect: str | None, *, why_not: str
 ) -> ContactStatus:
     """Describe a contact with what it is predicted to feel, and the effect that it was to feel.
 
@@ -195,7 +195,7 @@ def contact_status(
                     "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
                     "held_back": felt.held_back,
                 }
-    if isinstance(report, Applied) and any(each.key == contact.key for each in report.quiet):
+    if isinstance(report, PlayReport) and any(each.key == contact.key for each in report.quiet):
         status |= {
             "role": "quiet",
             "foreign_level_db_sl": _finite(report.quiet_levels.get(contact.key)),

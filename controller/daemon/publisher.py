@@ -35,7 +35,7 @@ from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
-from controller.play.observer import Applied, Observer, Silenced
+from controller.play.observer import Observer, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from registry import clock
 
@@ -194,10 +194,12 @@ class EventPublisher:
         self._noted({"time_s": clock.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
-    def _reported(self, topic: Literal["pattern", "silence"], report: Applied | Silenced) -> None:
+    def _reported(
+        self, topic: Literal["pattern", "silence"], report: PlayReport | SilenceReport
+    ) -> None:
         """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
         self.view.report = report
-        why = report.reason if isinstance(report, Silenced) else ""
+        why = report.reason if isinstance(report, SilenceReport) else ""
         self._noted({"time_s": report.time, topic: report.targets, "reason": why})
         if report.latency is not None:
             latencies = self.latencies if report.is_touch else self.lift_latencies

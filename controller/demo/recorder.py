@@ -17,8 +17,8 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.play.content import HELD_BACK, Prediction
-from controller.play.observer import Applied, Observer, Silenced
-from controller.play.playing import PlayedContent
+from controller.play.layers import LayerContent
+from controller.play.observer import Observer, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.transients.measures import ONSET_WINDOW
 from registry import clock
@@ -65,7 +65,7 @@ class _PlayedPattern:
     the fingers and over its first 100 ms.
     """
 
-    applied: Applied
+    applied: PlayReport
     touches: Sequence[_Touch]
     until: float = math.inf
     steady: Measured | None = None
@@ -145,7 +145,7 @@ class TouchRecorder:
             touch.until = clock.now()
             self._complete(touch)
 
-    def _pattern_applied(self, applied: Applied) -> None:
+    def _pattern_applied(self, applied: PlayReport) -> None:
         self._end_pattern(applied.time)
         for each in self.touches.values():
             each.reason = each.reason or _NOT_THE_TARGET
@@ -161,7 +161,7 @@ class TouchRecorder:
         for touch in touches:
             touch.patterns.append(cast(_PlayedPattern, self._playing))
 
-    def _silenced(self, silenced: Silenced) -> None:
+    def _silenced(self, silenced: SilenceReport) -> None:
         self._end_pattern(silenced.time)
         for each in silenced.targets:
             if touch := self.touches.get(each.contact.key):
@@ -278,7 +278,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     )
 
 
-def _content_of(felt: Prediction, applied: Applied) -> PlayedContent:
+def _content_of(felt: Prediction, applied: PlayReport) -> LayerContent:
     """What plays for a finger, its own or the one that it shares."""
     return next(
         played

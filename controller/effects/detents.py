@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, ClassVar, Literal
 
-from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
+from controller.effects.effect import MIN_DURATION, Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
@@ -35,7 +35,7 @@ class Notches:
         self._level = level_db_sl
         self._pulse: Pulse | None = None  # of the last notch
 
-    def at(self, coordinate: float, now: float) -> Sensation | NoSensation:
+    def at(self, coordinate: float, now: float) -> EffectStimulus | NoStimulus:
         """Return a click from each passing on; several passed at once are one click."""
         away = coordinate - self._middle
         passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
@@ -44,11 +44,11 @@ class Notches:
             self._pulse = Pulse(self._duration, now)
         return self.resting(now)
 
-    def resting(self, now: float) -> Sensation | NoSensation:
+    def resting(self, now: float) -> EffectStimulus | NoStimulus:
         """Return the rest of the last click, without a further notch."""
         if self._pulse is not None and now < self._pulse.end:
-            return Sensation(self._level, until=self._pulse.end, pulse=self._pulse)
-        return NoSensation()
+            return EffectStimulus(self._level, until=self._pulse.end, pulse=self._pulse)
+        return NoStimulus()
 
 
 class Detents(Effect):
@@ -92,6 +92,6 @@ class _DetentsRun(EffectRun):
         self._detents = detents
         self._notches = notches
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return a click from each passing on."""
         return self._notches.at(self._detents.position(contact), now)

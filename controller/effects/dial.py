@@ -4,7 +4,7 @@ import math
 from typing import Annotated, ClassVar
 
 from controller.effects.detents import Notches
-from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
+from controller.effects.effect import MIN_DURATION, Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.effects.region import Region
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
@@ -49,9 +49,9 @@ class Dial(Effect):
 class _Nothing(EffectRun):
     """Nothing as long as the finger stays."""
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return nothing."""
-        return NoSensation()
+        return NoStimulus()
 
 
 class _DialRun(EffectRun):
@@ -65,13 +65,13 @@ class _DialRun(EffectRun):
         self._last: float | None = None  # [rad] within one turn; None before the first
         self._notches: Notches | None = None
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return a click from each passing on."""
         x, y = contact.x - self._centre[0], contact.y - self._centre[1]
         radius = math.hypot(x, y)
         if radius < _CENTRE_RADIUS:
             self._last = None  # it may come out at any angle
-            return NoSensation() if self._notches is None else self._notches.resting(now)
+            return NoStimulus() if self._notches is None else self._notches.resting(now)
         angle = math.atan2(y, x)
         if self._last is not None:
             self._angle += math.remainder(angle - self._last, math.tau)

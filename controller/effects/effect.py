@@ -47,7 +47,7 @@ Level: TypeAlias = Annotated[float | Literal["neighbours"], BeforeValidator(_lev
 
 
 @dataclass(frozen=True, slots=True)
-class Sensation:
+class EffectStimulus:
     """Target of one finger from now on.
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
@@ -88,8 +88,8 @@ class Sensation:
 
 
 @dataclass(frozen=True, slots=True)
-class NoSensation:
-    """A finger shall feel nothing now; until as in `Sensation`."""
+class NoStimulus:
+    """A finger shall feel nothing now; until as in `EffectStimulus`."""
 
     until: float | None = None
 
@@ -98,7 +98,7 @@ class EffectRun(ABC):
     """One run of an effect at one finger, from its start."""
 
     @abstractmethod
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return what the finger shall feel at a time [s]; None once the run is over.
 
         Called in order of time: at every change of the contact and when `until` is reached.
@@ -113,12 +113,12 @@ class SteadyRun(EffectRun):
     pulse: Pulse | None
     modulation_hz: float | None = None
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return the level until the end of the pulse."""
         end = None if self.pulse is None else self.pulse.end
         if end is not None and now >= end:
             return None
-        return Sensation(
+        return EffectStimulus(
             self.level_db_sl, until=end, pulse=self.pulse, modulation_hz=self.modulation_hz
         )
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from controller.effects.band import Band
-from controller.effects.effect import EffectRun, NoSensation, Sensation
+from controller.effects.effect import EffectRun, EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.intent import NO_CONTACTS, HapticIntent, Pulse, Target
@@ -23,7 +23,7 @@ CLICKS_APART = 0.060
 """Pause [s] between the starts of short pulses at two fingers: together they would be one."""
 
 # A short pulse that would have to wait longer [s], two turns with rounding, is left out.
-_MAX_WAIT = 0.125
+_MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 
 @dataclass
@@ -63,7 +63,7 @@ class EffectPlayer:
     Every finger feels its newest play; when that is over, the one before continues. Of the fingers
     that feel the effect outside of all regions only the newest does. Short pulses of two fingers
     are 60 ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
-    sensation at the moment (no detent passed, no movement) does not count.
+    stimulus at the moment (no detent passed, no movement) does not count.
     """
 
     def __init__(self, layout: SurfaceLayout) -> None:
@@ -73,47 +73,46 @@ class EffectPlayer:
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
         self._waiting: dict[ContactKey, Pulse] = {}  # short ones before their turn
-        self._sensing = self._targets = self._felt = frozenset[ContactKey]()  # of the last intent
+        self._sensing = self._targets = self._felt = set[ContactKey]()  # of the last intent
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        felt: list[tuple[int, _Play, Contact, Sensation]] = []
+        felt: list[tuple[int, _Play, Contact, EffectStimulus]] = []
         ends: list[float] = []
         for contact in contacts:
-            play, sensation = self._current_sensation(contact, now, ends)
-            if play is not None and sensation is not None:
-                felt.append((play.number, play, contact, sensation))
+            play, stimulus = self._current_stimulus(contact, now, ends)
+            if play is not None and stimulus is not None:
+                felt.append((play.number, play, contact, stimulus))
         felt.sort()
-        elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
-        targets = [
-            sensation.target(
+        newest = max([number for number, play, _, _ in felt if play.is_elsewhere], default=None)
+        waiting, self._waiting = self._waiting, {}
+        sensing, targets = set[ContactKey](), list[Target]()
+        for number, play, contact, stimulus in felt:
+            sensing.add(contact.key)
+            if play.is_elsewhere and number != newest:
+                continue  # of these only the newest is felt
+            target = stimulus.target(
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
-            for number, play, contact, sensation in felt
-            if number not in elsewhere[:-1]  # of these only the newest is felt
-        ]
-        waiting, self._waiting = self._waiting, {}
-        for target in targets:
+            targets.append(target)
             if target.key in waiting and target.is_short:
                 self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
-        self._sensing = frozenset([contact.key for _, _, contact, _ in felt])
-        self._targets = frozenset([each.key for each in targets])
-        self._felt = frozenset([each.key for each in now_felt])
+        self._sensing, self._targets = sensing, {each.key for each in targets}
+        self._felt = {each.key for each in now_felt}
+        protected = [
+            key
+            for key, finger in self._fingers.items()
+            if finger.region is not None and finger.region.is_protected
+        ]
         return HapticIntent(
             now_felt,
             "" if now_felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
             until=min(ends, default=None),
-            protected=frozenset(
-                [
-                    key
-                    for key, finger in self._fingers.items()
-                    if finger.region is not None and finger.region.is_protected
-                ]
-            ),
+            protected=frozenset(protected),
         )
 
     def why_not(self, key: ContactKey) -> str:
@@ -281,27 +280,27 @@ class EffectPlayer:
         band = self.layout.band_of(name, region)
         finger.plays.append(_Play(name, run, self._number, priority, band, region))
 
-    def _current_sensation(
+    def _current_stimulus(
         self, contact: Contact, now: float, ends: list[float]
-    ) -> tuple[_Play | None, Sensation | None]:
-        """Return the play that a finger feels now and its sensation; add all `until` to ends.
+    ) -> tuple[_Play | None, EffectStimulus | None]:
+        """Return the play that a finger feels now and its stimulus; add all `until` to ends.
 
         All its plays are called, because those for motion follow the finger.
         """
         finger = self._fingers[contact.key]
-        felt: tuple[_Play | None, Sensation | None] = (None, None)
+        felt: tuple[_Play | None, EffectStimulus | None] = (None, None)
         lasting: list[_Play] = []
         for play in finger.plays:
             result = play.run.feel(contact, now)
             if result is None:
                 finger.ended = play.name
                 continue
-            if not isinstance(result, Sensation | NoSensation):
-                raise WrongResultError(play.run, result, Sensation)
+            if not isinstance(result, EffectStimulus | NoStimulus):
+                raise WrongResultError(play.run, result, EffectStimulus)
             lasting.append(play)
             if result.until is not None:
                 ends.append(result.until)
-            if isinstance(result, Sensation):
+            if isinstance(result, EffectStimulus):
                 felt = (play, result)
         finger.plays = lasting
         return felt

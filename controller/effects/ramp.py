@@ -10,8 +10,8 @@ from controller.effects.effect import (
     MIN_DURATION,
     Effect,
     EffectRun,
-    NoSensation,
-    Sensation,
+    EffectStimulus,
+    NoStimulus,
 )
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
@@ -67,13 +67,13 @@ class _RampRun(EffectRun):
     step: float
     is_held: bool
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return the level of the current step."""
         index = max(0, int((now - self.pulse.start) / self.step))
         if index >= len(self.levels) - 1 and self.is_held:
-            return Sensation(self.levels[-1])
+            return EffectStimulus(self.levels[-1])
         if index >= len(self.levels):
             return None
         until = self.pulse.start + (index + 1) * self.step
         pulse = None if self.is_held else self.pulse
-        return Sensation(self.levels[index], until, pulse=pulse)
+        return EffectStimulus(self.levels[index], until, pulse=pulse)

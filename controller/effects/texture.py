@@ -10,9 +10,9 @@ from pydantic import model_validator
 from controller.effects.effect import (
     Effect,
     EffectRun,
+    EffectStimulus,
     Modulation,
-    NoSensation,
-    Sensation,
+    NoStimulus,
 )
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
@@ -77,7 +77,7 @@ class _TextureRun(EffectRun):
         self._path = deque([(now, contact.x, contact.y)])
         self._attenuation: float | None = None  # below the level at `fast` [dB]
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return the level of the speed over the last 60 ms."""
         before, *position = self._path[-1]
         if math.dist((contact.x, contact.y), position) >= _NOISE:
@@ -88,11 +88,11 @@ class _TextureRun(EffectRun):
             self._path.popleft()
         rests_from = self._path[-1][0] + _REST_TIMEOUT
         if now >= rests_from:
-            return NoSensation()
+            return NoStimulus()
         speed = self._speed(contact, now)
         if speed < self._texture.slow:
-            return NoSensation(until=rests_from)
-        return Sensation(
+            return NoStimulus(until=rests_from)
+        return EffectStimulus(
             self._level_at(speed),
             until=rests_from,
             modulation_hz=self._texture.modulation,

@@ -24,7 +24,7 @@ from controller.learning.estimator_process import (
 from controller.learning.messages import Answers, Estimate, Note, Ready, RefreshedAnswers, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.play.loop import Controller
-from controller.play.observer import Applied, Observer
+from controller.play.observer import Observer, PlayReport
 from controller.sources.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.answer.timing import Timing
@@ -113,7 +113,7 @@ class Learning:
         if self._readings is not None:
             self._readings.contacts_changed(contacts)
 
-    def _pattern_applied(self, applied: Applied) -> None:
+    def _pattern_applied(self, applied: PlayReport) -> None:
         if self._readings is not None:
             self._readings.pattern_applied(applied)
 

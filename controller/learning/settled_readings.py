@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from controller.diagnosis.plate_sensors import PlateSensor
-from controller.play.observer import Applied
+from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact
 from drivers.errors import DriverError, Preempted
 from drivers.host.amplifier import Amplifier
@@ -58,11 +58,11 @@ class SettledReadings:
         self._highest = min(sensor.frequency_max for sensor in sensors)
         self._contacts: tuple[Contact, ...] = ()
         self._settled_contacts: tuple[Contact, ...] = ()
-        self._playing: Applied | None = None
+        self._playing: PlayReport | None = None
         self._due = math.inf
         self._change = asyncio.Event()
 
-    def pattern_applied(self, applied: Applied) -> None:
+    def pattern_applied(self, applied: PlayReport) -> None:
         """Follow a pattern that the amplifiers have confirmed, if it can be read."""
         frequencies = {command.frequency for command in applied.drive.values()}
         is_one = len(applied.contents) == len(frequencies) == 1
@@ -117,7 +117,7 @@ class SettledReadings:
             return False
         return True
 
-    async def _read(self, applied: Applied, contacts: tuple[Contact, ...]) -> None:
+    async def _read(self, applied: PlayReport, contacts: tuple[Contact, ...]) -> None:
         """Read a pattern until a reading was not disturbed; raises DriverError."""
         (frequency,) = {command.frequency for command in applied.drive.values()}
         for _ in range(READINGS):

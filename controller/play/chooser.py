@@ -39,10 +39,9 @@ class Requested:
     """What is to be chosen among contacts: for short pulses, and what lasts, None where it is kept.
 
     protected: contacts that must not notice the contents of others; before: what is felt now, by
-    finger and voice; kept: what plays on beside it; triggered_at [s]: when the change arrived;
-    takes_long: whether what lasts takes longer than the control loop may wait; is_moving: whether
-    only places have changed; is_rested: whether what plays would do, too, but kept its frequencies
-    while a finger moved.
+    finger and voice; kept: what plays on beside it; takes_long: whether what lasts takes longer
+    than the control loop may wait; is_moving: whether only places have changed; is_rested: whether
+    what plays would do, too, but kept its frequencies while a finger moved.
     """
 
     short: Targets
@@ -50,7 +49,6 @@ class Requested:
     protected: frozenset[ContactKey]
     before: Mapping[tuple[ContactKey, int], Content]
     kept: tuple[Selection, ...]
-    triggered_at: float
     lasting: Targets | None = None
     takes_long: bool = False
     is_moving: bool = False
@@ -243,7 +241,7 @@ def unanswered(requested: Requested, reason: str) -> Chosen:
     """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
     none = silent(requested, requested.lasting or (), reason)
     return Chosen(
-        replace(requested, triggered_at=math.inf),
+        requested,
         None if requested.is_rested else none,
         {each[0].key: silent(requested, (each,), reason) for each in requested.short},
         is_limited=False,

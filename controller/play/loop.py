@@ -1,36 +1,21 @@
-"""The control loop: decide, send what changed, then feed the amplifiers' watchdogs."""
+"""The controller of a plate: its amplifiers are opened, armed, stopped and released here."""
 
 import asyncio
-import logging
-import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 from controller.play.capabilities import playback_capabilities
-from controller.play.decision import RELEASE_RAMP, Decider, Decision
+from controller.play.cycle import Cycle
 from controller.play.intent import IntentSource
-from controller.play.observer import Observer, applied_by, silenced_by
-from controller.play.routing import PlateSet
-from controller.sources.contacts import Change, ContactTracker
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import TouchFrame
-from drivers.errors import (
-    CommandError,
-    CommandRefused,
-    DriverError,
-    LinkDegraded,
-    LinkError,
-    Preempted,
-)
+from controller.play.observer import Observer
+from controller.play.planner import Planner
+from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.feeding import UNREACHED, Stopped
 from drivers.host.group import Group, GroupState
-from drivers.host.joint_sets import Played
 from drivers.opening import Lines
-from drivers.protocol.timing import HEARTBEAT, REPLY_TIMEOUT
+from drivers.protocol.timing import REPLY_TIMEOUT
 from model.answer.timing import Timing
-from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -39,13 +24,8 @@ from registry import clock
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 
-# s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
-IDLE_INTERVAL = 0.5
 
-_logger = logging.getLogger(__name__)
-
-
-class Controller:
+class Controller(Cycle):
     """Drives the amplifiers of a rig by touch frames: open, arm, run, close.
 
     table: for this rig; lines: makes the lines to its amplifiers, anew for each opening; urls and
@@ -74,7 +54,13 @@ class Controller:
         connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
         watchdog: float = WATCHDOG,
     ) -> None:
-        self._rig = rig
+        super().__init__(
+            rig,
+            Group({}, watchdog=watchdog),
+            intent_source=intent_source,
+            timing=timing,
+            observer=observer,
+        )
         self.table = table
         """The table that answers."""
         self.urls = dict(rig.amplifiers if urls is None else urls)
@@ -91,32 +77,9 @@ class Controller:
         self._connected = connected
         self.watchdog = watchdog
         """Watchdog of armed amplifiers [s]."""
-        self.group = Group({}, watchdog=watchdog)
-        """All amplifiers together."""
         self.amplifiers: dict[str, Amplifier] = {}
         """Amplifiers by name, as identified last; empty before."""
-        self.observers = [observer]
-        self._intent_source = intent_source
-        self._timing = timing
         self._drive_mode = drive_mode
-        self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
-        self.rejects = RejectCounter(_logger)
-        """What of touches was rejected, at the sources and as contacts: the only such counter."""
-        self.clicks_too_late = 0
-        """Short vibrations that came too late to be felt while armed, since the start.
-
-        They were over, or had lost their touch, before the amplifiers were to play them; with
-        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
-        do not allow.
-        """
-        self._decider_if_open: Decider | None = None
-        self._wake = asyncio.Event()
-        self._changed_at = -math.inf  # s; of the last change, until all are decided
-        self._heartbeat_due = 0.0
-        self._sending = asyncio.Lock()  # held while a turn sends
-        self._is_closed = False
-        self._is_armed_anew = False  # until the next turn, which sends again what is to play
-        self._expiry: asyncio.TimerHandle | None = None
 
     @property
     def is_released(self) -> bool:
@@ -124,17 +87,10 @@ class Controller:
         return self._lines is None
 
     @property
-    def is_preparing(self) -> bool:
-        """Whether a change of contacts is on its way to the amplifiers."""
-        if self._decider_if_open is not None and self._decider_if_open.is_choosing:
-            return True
-        return self.group.members.last_sent_at < self._changed_at
-
-    @property
     def drive_mode(self) -> str:
         """The drive mode of questions to the table; the best possible one until `open`."""
-        if self._decider_if_open is not None:
-            return self._decider_if_open.capabilities.drive_mode
+        if self._planner_if_open is not None:
+            return self._planner_if_open.capabilities.drive_mode
         return self._drive_mode or DRIVE_MODES[-1]
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
@@ -144,8 +100,8 @@ class Controller:
         here.
         """
         self.table, self._timing = table, timing
-        if self._decider_if_open is not None:
-            self._decider_if_open.replace_answers(table, timing)
+        if self._planner_if_open is not None:
+            self._planner_if_open.replace_answers(table, timing)
 
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
@@ -181,7 +137,7 @@ class Controller:
                 if name in self.amplifiers:
                     amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
                 self.amplifiers[name] = amplifier
-            decider = Decider(
+            planner = Planner(
                 self._rig,
                 self.table,
                 tracker=self._tracker,
@@ -190,15 +146,16 @@ class Controller:
                 ),
                 intent_source=self._intent_source,
                 timing=self._timing,
+                check=self.group.sets.refusal_of,
                 arrived=self._wake.set,
                 too_late=self._count_too_late,
             )
-            await asyncio.to_thread(decider.prepare)  # seconds, of a large rig
+            await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
         except BaseException as error:
             if not isinstance(error, LinkError):
                 await self.release()
             raise
-        self._decider_if_open = decider
+        self._planner_if_open = planner
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send the stop that it is owed.
@@ -229,7 +186,7 @@ class Controller:
         await self.group.arm()
         self._is_armed_anew = True
         if not was_armed:  # else what plays goes on
-            self._decider.playing.may_play = frozenset()
+            self._planner.layers.may_play = frozenset()
         self._heartbeat_due = clock.now()
         self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()
@@ -305,263 +262,6 @@ class Controller:
             finally:
                 if self._lines is lines:
                     self._lines = None
-
-    async def run(self) -> None:
-        """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
-
-        It sends only while they are armed. An observer is told of a loss, all others are stopped
-        by then; a loss while disarmed shows in the next request, as the supervisor checks.
-        """
-        while not self._is_closed:
-            await self.step()
-            self._report(lambda each: each.cycle_completed())
-            await self._wait_for_event()
-
-    async def step(self) -> None:
-        """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
-        self._wake.clear()
-        decider = self._decider_if_open
-        if decider is None:
-            return
-        now = clock.now()
-        if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
-            self._is_armed_anew = False
-            decider.forget()
-        if (expired := self._tracker.expire(now)).up:
-            decider.note(now, expired)
-        decision = decider.decide(now)
-        try:
-            async with self._sending:
-                with suppress(LinkDegraded):  # what plays is unknown, and decided anew; others feed
-                    await self._send(decider, decision, now)
-                # Not after a set that was given up: the next cycle silences it first.
-                if self._is_heartbeat_due:
-                    # From its beginning: the watchdog has run since its request was sent.
-                    due = self._heartbeat_due = clock.now() + HEARTBEAT
-                    try:
-                        await self.group.beat()
-                    finally:
-                        if self._heartbeat_due == due:  # none replies again since
-                            rest = HEARTBEAT / 2  # on a slow wire
-                            self._heartbeat_due = max(due, clock.now() + rest)
-        except (Preempted, LinkDegraded):
-            pass  # what plays is unknown, and decided anew
-        except LinkError as error:
-            lost = str(error)
-            self._report(lambda each: each.link_lost(lost))
-        except DriverError as error:
-            reason = str(error)
-            self._report(lambda each: each.refused(reason))
-        finally:
-            if expired.up:
-                self._report(lambda each: each.contacts_changed(self._tracker.contacts, expired))
-            if not self._wake.is_set():
-                self._changed_at = -math.inf
-
-    async def _send(self, decider: Decider, decision: Decision | None, now: float) -> None:
-        """Send what a decision at a time [s] changes, or what is due by itself; raises DriverError.
-
-        Sends nothing unless the amplifiers are armed.
-        """
-        if not self.group.is_armed:
-            return
-        if decision is None:
-            if now >= decider.playing.due:
-                await self._go_on(decider, now)
-        elif decision.started and self.group.members.degraded:
-            await self._end_only(decider, decision)
-        else:
-            await self._execute(decider, decision)
-
-    def _count_too_late(self, clicks: int) -> None:
-        if self.group.is_armed:
-            self.clicks_too_late += clicks
-            _logger.warning(
-                "%s came too late to be felt: replies are late", counted(clicks, "click")
-            )
-
-    def _feed_at_once(self) -> None:
-        self._heartbeat_due = clock.now()
-        self._wake.set()
-
-    def deliver(self, frame: TouchFrame) -> None:
-        """Process a touch frame; to be called in the loop's thread."""
-        # Contacts that came since the last cycle have not been decided yet.
-        is_undecided = self.group.is_armed and self._wake.is_set()
-        change = self._tracker.update(frame, keeps_taps=is_undecided)
-        if change:
-            self._follow(change, frame.time)
-        self._schedule_expiry()
-        for reason in change.rejected:
-            self.rejects.count(reason, f"touch of {frame.source}")
-
-    def lift(self, prefix: str) -> None:
-        """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
-        for source in self._tracker.sources_of(prefix):
-            try:
-                self.deliver(TouchFrame(source, clock.now(), ()))
-            except Exception:
-                _logger.exception("loop: fingers of %s not lifted", source)
-
-    def request_update(self) -> None:
-        """Query the intent source again, because its intent changed without a touch."""
-        if self._decider_if_open is not None:
-            self._decider_if_open.look_again()
-        self._wake.set()
-
-    @property
-    def _is_heartbeat_due(self) -> bool:
-        """Whether to feed the watchdogs now; pending silence has priority."""
-        if not self.group.is_armed or self._decider.is_silence_pending:
-            return False
-        return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
-
-    @property
-    def _decider(self) -> Decider:
-        if self._decider_if_open is None:
-            raise CommandError("controller must be open; call open() first")
-        return self._decider_if_open
-
-    def _follow(self, change: Change, time: float) -> None:
-        """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
-        decider = self._decider_if_open
-        if decider is not None:  # else the amplifiers were never open
-            decider.note(time, change)
-        self._wake.set()
-        if self.group.is_armed:
-            self._changed_at = clock.now()
-        if decider is not None and decider.is_silence_pending:
-            self.group.abort_exchange()
-        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
-
-    def _schedule_expiry(self) -> None:
-        """Check for expired sources when the next one times out.
-
-        A timer that is due before stays: nothing is set anew for every frame of a source.
-        """
-        due = self._tracker.next_expiry
-        if self._expiry is not None:
-            if self._expiry.when() <= due < math.inf:
-                return
-            self._expiry.cancel()
-            self._expiry = None
-        if due < math.inf:
-            pause = max(0.0, due - clock.now())
-            self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
-
-    def _expire(self) -> None:
-        self._expiry, now = None, clock.now()
-        if (change := self._tracker.expire(now)).up:
-            self._follow(change, now)
-        self._schedule_expiry()
-
-    async def _go_on(self, decider: Decider, now: float) -> None:
-        """Prolong the layers that are due, and report those that have ended; raises DriverError."""
-        due = {} if self.group.members.degraded else decider.renewal(now)
-        if due:
-            decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
-        if (ended := decider.ended(now)) is not None:
-            self._report_playing(decider, ended, sent_at=None)
-
-    async def _end_only(self, decider: Decider, decision: Decision) -> None:
-        """End what a decision ends, unreported, and start nothing; raises DriverError."""
-        ends = decider.only_ends(decision)
-        if ends.sets:
-            played = await self._play(decider, ends.sets)
-            if isinstance(played, CommandRefused):
-                raise played
-            decider.confirm(ends, played, now=clock.now())
-
-    async def _execute(self, decider: Decider, decision: Decision) -> None:
-        """Send the sets of a decision and report the outcome; raises DriverError."""
-        sent_at = None
-        if decision.silence is not None:
-            sent_at = await self._silence(decider, decision.silence)
-        elif decision.sets:
-            played = await self._play(decider, decision.sets)
-            if isinstance(played, CommandRefused):
-                instead = decider.refused(decision, played, now=clock.now())
-                await self._execute(decider, instead)
-                return
-            sent_at = played.sent_at
-            decider.confirm(decision, played, now=clock.now())
-        refusal = decision.refusal
-        if refusal is not None:
-            self._report(lambda each: each.refused(refusal))
-        self._report_playing(decider, decision, sent_at=sent_at)
-
-    def _report_playing(
-        self, decider: Decider, decision: Decision, *, sent_at: float | None
-    ) -> None:
-        """Report what plays after a decision, or silence; sent_at [s]: None if nothing was sent."""
-        if decision.selection.contents and decision.silence is None:
-            applied = applied_by(
-                decision,
-                decider.playing.contents,
-                sent_at=sent_at,
-                now=clock.now(),
-                timing=self._timing,
-            )
-            self._report(lambda each: each.pattern_applied(applied))
-            return
-        silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
-        self._report(lambda each: each.silenced(silenced))
-
-    async def _silence(self, decider: Decider, ramp: float) -> float:
-        """Silence all layers of all amplifiers; returns when [s] that was sent."""
-        try:
-            sent_at = await self.group.silence(ramp)
-        except BaseException:
-            decider.forget()
-            raise
-        decider.playing.may_play = frozenset()
-        return sent_at
-
-    async def _play(
-        self, decider: Decider, sets: Mapping[int, PlateSet]
-    ) -> Played | CommandRefused:
-        """Play the sets of layers on all amplifiers, from one moment on, or say why not.
-
-        Whatever is raised instead leaves it unknown what plays.
-        """
-        try:
-            if self.group.sets.is_incomplete:
-                await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            layers = {
-                name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
-            }
-            return await self.group.apply(layers)
-        except BaseException as error:
-            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
-            if isinstance(error, CommandRefused) and not is_overtaken:
-                return error
-            decider.forget()
-            raise
-
-    async def _wait_for_event(self) -> None:
-        """Wait for a change, a heartbeat, the timeout of a source or the expiry of an intent."""
-        if self._wake.is_set():
-            return
-        now = clock.now()
-        until = min(now + IDLE_INTERVAL, self._tracker.next_expiry)
-        if self._decider_if_open is not None:
-            until = min(until, self._decider_if_open.due)
-        if self.group.is_armed:
-            until = min(until, self._heartbeat_due, self.group.members.lost_from)
-        pause = max(0.0, until - now)
-        timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
-        try:
-            await self._wake.wait()
-        finally:
-            timer.cancel()
-
-    def _report(self, event: Callable[[Observer], None]) -> None:
-        """Report an event to all observers; their exceptions are only logged."""
-        for observer in self.observers:
-            try:
-                event(observer)
-            except Exception:
-                _logger.exception("loop: observer failed")
 
 
 async def _identified(

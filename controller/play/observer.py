@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.play.content import Prediction, not_served
-from controller.play.decision import Decision
-from controller.play.playing import PlayedContent
+from controller.play.layers import LayerContent
+from controller.play.planner import Plan
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import Layer
@@ -15,7 +15,7 @@ from model.answer.timing import Timing
 
 
 @dataclass(frozen=True)
-class Applied:
+class PlayReport:
     """The contents that amplifiers play since their last confirmed set.
 
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts, and
@@ -24,14 +24,14 @@ class Applied:
     to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
     of the report; from_rest: whether the plate
     was at rest; settled_after [s]: when the last fade or envelope has ended; lasts: whether all
-    play until their contacts change; is_touch: as of the decision.
+    play until their contacts change; is_touch: as of the plan.
     """
 
     contacts: tuple[Contact, ...]
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
     quiet_levels: Mapping[ContactKey, float]
-    contents: Mapping[int, PlayedContent]
+    contents: Mapping[int, LayerContent]
     latency: float | None
     time: float
     from_rest: bool
@@ -41,7 +41,7 @@ class Applied:
     timing: Timing = field(repr=False, compare=False)
 
     @property
-    def newest(self) -> PlayedContent:
+    def newest(self) -> LayerContent:
         """The content that changed last."""
         return [*self.contents.values()][-1]
 
@@ -81,7 +81,7 @@ class Applied:
 
 
 @dataclass(frozen=True)
-class Silenced:
+class SilenceReport:
     """All channels are silent, for a reason; latency and time [s].
 
     targets: of contacts that were to feel something, with the reason for each. latency: up to the
@@ -96,51 +96,53 @@ class Silenced:
     is_touch: bool = False
 
 
-def applied_by(
-    decision: Decision,
-    playing: Mapping[int, PlayedContent],
+def play_report(
+    plan: Plan,
+    playing: Mapping[int, LayerContent],
     *,
     sent_at: float | None,
     now: float,
     timing: Timing,
-) -> Applied:
-    """Report what plays after a decision, by layer; sent_at [s]: as of `silenced_by`."""
-    selected = decision.selection.contents
+) -> PlayReport:
+    """Report what plays after a plan, by layer; sent_at [s]: of the last byte, None for none."""
+    selection = plan.selection
     order = sorted(
-        (number for number, one in playing.items() if one.content in selected),
-        key=decision.started.__contains__,
+        (number for number, one in playing.items() if one.content in selection.contents),
+        key=plan.sets.started.__contains__,
     )
-    return Applied(
-        contacts=decision.contacts,
-        targets=decision.selection.predictions,
-        quiet=decision.selection.quiet,
-        quiet_levels=decision.selection.quiet_levels,
+    return PlayReport(
+        contacts=plan.contacts,
+        targets=selection.predictions,
+        quiet=selection.quiet,
+        quiet_levels=selection.quiet_levels,
         contents={number: playing[number] for number in order},
-        latency=None if sent_at is None else sent_at - decision.triggered_at,
+        latency=None if sent_at is None else sent_at - plan.since,
         time=now if sent_at is None else sent_at,
-        from_rest=decision.from_rest,
-        settled_after=max((each.settled_after for each in decision.sets.values()), default=0.0),
-        lasts=all(target.pulse is None for each in selected for _, target in each.targets),
-        is_touch=decision.is_touch,
+        from_rest=plan.from_rest,
+        settled_after=plan.sets.settled_after,
+        lasts=all(
+            target.pulse is None for each in selection.contents for _, target in each.targets
+        ),
+        is_touch=plan.is_touch,
         timing=timing,
     )
 
 
-def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Silenced:
-    """Report a decision for silence; sent_at [s]: of its last byte, None if nothing was sent."""
-    selection = decision.selection
-    reason = decision.refusal or selection.reason or ""
+def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceReport:
+    """Report a plan for silence; sent_at [s]: of its last byte, None if nothing was sent."""
+    selection = plan.selection
+    reason = plan.sets.reason or selection.reason or ""
     known = {each.contact.key: each for each in selection.not_served}
-    return Silenced(
-        contacts=decision.contacts,
+    return SilenceReport(
+        contacts=plan.contacts,
         targets=tuple(
             known.get(contact.key) or not_served(contact, reason)
             for contact, _ in selection.targets
         ),
         reason=reason,
-        latency=None if sent_at is None else sent_at - decision.triggered_at,
+        latency=None if sent_at is None else sent_at - plan.since,
         time=now,
-        is_touch=decision.is_touch,
+        is_touch=plan.is_touch,
     )
 
 
@@ -156,8 +158,8 @@ class Observer:
     """
 
     contacts_changed: Callable[[tuple[Contact, ...], Change], None] = _ignore
-    pattern_applied: Callable[[Applied], None] = _ignore
-    silenced: Callable[[Silenced], None] = _ignore
+    pattern_applied: Callable[[PlayReport], None] = _ignore
+    silenced: Callable[[SilenceReport], None] = _ignore
     refused: Callable[[str], None] = _ignore
     link_lost: Callable[[str], None] = _ignore
     cycle_completed: Callable[[], None] = _ignore

@@ -30,26 +30,15 @@ from model.vibration import excitation as physics
 Drive = Mapping[str, Tone]
 """What ERAs play, by name, without silent ones."""
 
+PlateLayer = Mapping[str, Layer]
+"""What one layer plays on every amplifier, by name."""
+
 FADE_RAMP = 0.020
 """Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
 
 _STEP, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("envelope_step", "level", "phase"))
 _FREQUENCY = QUANTITIES["frequency"]
 _DIGITS = 6  # of a step of the wire
-
-
-@dataclass(frozen=True)
-class PlateSet:
-    """What one layer plays on every amplifier, by name.
-
-    settled_after [s]: from the commit until the last fade or onset has ended; has_endings: whether
-    it ends along shaped endings; is_shaped: whether it has any envelope, or leads along one.
-    """
-
-    layers: Mapping[str, Layer]
-    settled_after: float
-    has_endings: bool = False
-    is_shaped: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,7 +87,7 @@ class SetBuilder:
         is_shaped: bool = True,
         lasts: float = math.inf,
         among: int = 1,
-    ) -> tuple[PlateSet, answer.Layer]:
+    ) -> tuple[PlateLayer, answer.Layer]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
         playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
@@ -129,35 +118,23 @@ class SetBuilder:
             ending=ending,
         )
         ramp = next(iter(layers.values())).ramp
-        pattern = replace(pattern, ramp=ramp, onset=onset, ending=ending)
-        settled = max(ramp, next(iter(onset.values())).duration) if onset else ramp
-        return PlateSet(layers, settled, bool(ending), bool(onset or ending)), pattern
+        return layers, replace(pattern, ramp=ramp, onset=onset, ending=ending)
 
-    def plain(self, shaped: PlateSet) -> PlateSet:
-        """Build a set along its ramp, where an amplifier's ledger refuses its envelopes."""
-        layers: dict[str, Layer] = {}
-        for name, layer in shaped.layers.items():
-            if not layer.tones:
-                return self.build_end(layer.number, has_endings=False)
-            tones = [replace(tone, onset=None, ending=None) for tone in layer.tones]
-            layers[name] = replace(layer, tones=tuple(tones))
-        return PlateSet(layers, layer.ramp)
+    def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
+        """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
+        layer = Layer(number, ramp=ramp, valid_for=valid_for, renew=True)
+        return dict.fromkeys(self.rig.amplifiers, layer)
 
-    def build_renewal(self, playing: PlateSet, *, valid_for: float) -> PlateSet:
-        """Build the set that prolongs another for a time [s]."""
-        layers = {
-            name: Layer(layer.number, ramp=layer.ramp, valid_for=valid_for, renew=True)
-            for name, layer in playing.layers.items()
-        }
-        return PlateSet(layers, playing.settled_after)
-
-    def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
+    def build_end(self, number: int, *, has_endings: bool) -> PlateLayer:
         """Build the set that ends a layer along its endings, or along a ramp."""
-        ramp = min(FADE_RAMP, self.ramp_max)
-        if not has_endings:
-            return PlateSet(route({}, self.rig, ramp=ramp, number=number), ramp)
-        layers = {name: Layer(number, ramp=ramp) for name in self.rig.amplifiers}
-        return PlateSet(layers, ramp, is_shaped=True)
+        if has_endings:
+            return dict.fromkeys(self.rig.amplifiers, Layer(number, ramp=self.end_ramp))
+        return route({}, self.rig, ramp=self.end_ramp, number=number)
+
+    @property
+    def end_ramp(self) -> float:
+        """The ramp [s] along which a layer ends under fingers that stay."""
+        return min(FADE_RAMP, self.ramp_max)
 
 
 def route(

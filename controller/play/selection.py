@@ -123,9 +123,8 @@ class Selector:
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
-        self._waits_since = math.inf  # s; when the first change came that waits for the thread
-        self.triggered_at = math.inf
-        """When [s] the change arrived whose answer the last selection has."""
+        self.requests = 0
+        """How often the thread was asked."""
         self.due = math.inf
         """When [s] to select anew though no contact changes: a finger rests, a pulse has ended."""
 
@@ -140,12 +139,12 @@ class Selector:
         intent: HapticIntent,
         capabilities: PlaybackCapabilities,
         *,
-        triggered_at: float = math.inf,
+        now: float = math.inf,
     ) -> Selection:
         """Return the selection for contacts in their order of arrival; equal if it is kept.
 
-        While the thread computes, what played and is still to be felt stays. triggered_at [s]: when
-        their change arrived.
+        While the thread computes, what played and is still to be felt stays. now [s]: infinite
+        where fingers do not move.
         """
         by_key = {target.key: target for target in intent.targets}
         # Lists: a generator would be a call for each.
@@ -161,7 +160,6 @@ class Selector:
         if came and self._lasting.targets and not intended.is_met_by(self._lasting):
             # Who has come back may be elsewhere.
             self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
-        self.triggered_at = math.inf
         arrived = self._thread.take()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
@@ -172,24 +170,23 @@ class Selector:
                 self._short[contact.key] = pulse
         if not contacts:
             self._lasting = _NOTHING
-        self._waits_since = min(self._waits_since, triggered_at)
         if self._thread.is_busy:
-            self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
+            self.due = now + _RESTS_AFTER if self.due <= now else self.due
         else:
             chooser = self.chooser
             for requested in self._to_request(
-                intended, pulses, triggered_at, has_waited=arrived is not None
+                intended, pulses, now, has_waited=arrived is not None
             ):
                 if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities))
                 elif self._thread.is_blocked:
                     self._take(unanswered(requested, BLOCKED))
                 else:
+                    self.requests += 1
                     self._thread.compute(
                         partial(chooser.choose, requested, capabilities),
                         instead=unanswered(requested, GIVEN_UP),
                     )
-            self._waits_since = math.inf
         parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
@@ -206,7 +203,7 @@ class Selector:
         self,
         intended: _Intended,
         pulses: Mapping[ContactKey, Selection],
-        triggered_at: float,
+        now: float,
         *,
         has_waited: bool,
     ) -> Iterator[Requested]:
@@ -216,10 +213,10 @@ class Selector:
         """
         lasting = intended.lasting
         is_kept = not lasting or intended.is_met_by(self._lasting)
-        is_due = self.due < math.inf and self.due <= triggered_at
+        is_due = self.due < math.inf and self.due <= now
         is_rested = bool(lasting) and is_due and is_kept
         if is_due:
-            self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
+            self.due = now + _RESTS_AFTER if lasting and not is_rested else math.inf
         new = tuple([each for each in intended.short if each[0].key not in self._short])
         if is_kept and not is_rested and not new:
             return
@@ -227,19 +224,17 @@ class Selector:
         before = {one.key: one for one in felt.contents}
         for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
-        playing = _playing(self._short, triggered_at)
-        requested = Requested(
-            new, intended.contacts, intended.protected, before, (felt, *playing), self._waits_since
-        )
+        playing = _playing(self._short, now)
+        requested = Requested(new, intended.contacts, intended.protected, before, (felt, *playing))
         if has_waited or is_kept:
             if new:
                 yield requested
-                new, playing = (), _playing(self._short, triggered_at)
+                new, playing = (), _playing(self._short, now)
             if is_kept and not is_rested:
                 return
         takes_long = not is_alone(lasting, intended.protected)
         is_moving = takes_long and not is_rested and intended.is_moved_from(self._lasting)
-        self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
+        self.due = now + _RESTS_AFTER if is_moving else math.inf
         yield replace(
             requested,
             short=new,
@@ -278,8 +273,6 @@ class Selector:
             if chosen.is_limited:
                 ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER
-        if chosen.short or not is_late:
-            self.triggered_at = chosen.requested.triggered_at
 
 
 def _together(

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from controller.sources.datagrams import MAX_DATAGRAM
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
 from registry.regular_file import regular_file
@@ -21,7 +22,6 @@ from registry.regular_file import regular_file
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
 MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
-_MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,9 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
                 f"hexadecimal, got {line[:60]!r}"
             )
         datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
-        if len(datagram.payload) > _MAX_DATAGRAM:
+        if len(datagram.payload) > MAX_DATAGRAM:
             raise InputError(
-                f"{path}, line {number}: datagram must have at most {_MAX_DATAGRAM} bytes, got "
+                f"{path}, line {number}: datagram must have at most {MAX_DATAGRAM} bytes, got "
                 f"{len(datagram.payload)}"
             )
         if datagrams and datagram.time < datagrams[-1].time:
@@ -87,7 +87,7 @@ async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port:
     Raises LinkError if the port is closed.
     """
     loop = asyncio.get_running_loop()
-    sender = _Sender()
+    sender = _ReplaySocket()
     try:
         transport, _ = await loop.create_datagram_endpoint(lambda: sender, remote_addr=(host, port))
     except OSError as error:
@@ -110,7 +110,7 @@ def _refusal(host: str, port: int, problem: Exception) -> LinkError:
     )
 
 
-class _Sender(asyncio.DatagramProtocol):
+class _ReplaySocket(asyncio.DatagramProtocol):
     """The UDP end of a replay; keeps an error that the network reported."""
 
     def __init__(self) -> None:

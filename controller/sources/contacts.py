@@ -1,77 +1,15 @@
-"""The contacts on the plate, from any sequence of touch frames, and their loads.
-
-A load is told from what a panel reports: force, or size of the contact. It is relative to the rig's
-`fingertip`, a finger that presses lightly, and grows with the area of contact (`Fingertip.scaled`).
-Area grows as the force to the power of two thirds (Hertz), and so does the load: between the third
-of Hertz's stiffness and the first power of a pulp that stiffens exponentially.
-docs/concepts/people.md has the sources, and how well this is known.
-"""
+"""The contacts on the plate, from any sequence of touch frames."""
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from controller.sources.eviction import to_evict
+from controller.sources.loads import LANDING, followed
 from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
-
-LIGHT_FORCE = 0.5
-"""Force [N] of a finger that presses lightly: the mean of a tap on a touch screen."""
-
-LIGHT_MAJOR = 9.4
-"""Longer axis [mm] of its contact: the mean of index fingers on touch screens."""
-
-MIN_REPORTED, MAX_REPORTED = 0.4, 2.5
-"""Bounds of a reported load: contacts of 6 to 15 mm, forces of 0.13 to 2 N.
-
-Two standard deviations of the rig's default `uncertainty` of a load. What a panel reports beyond
-them tells more of the panel than of the finger.
-"""
-
-LANDING = 0.1
-"""Time [s] after which a finger that lands has its area of contact; until then none is reported."""
-
-MIN_CHANGE = 1.5
-"""Factor by which a reported load must differ from a contact's before that changes."""
-
-_BY_FORCE, _BY_SIZE = 2 / 3, 2.0  # exponents of the load
-
-
-@dataclass(frozen=True)
-class LightPress:
-    """Values of a panel's axes under a finger that presses lightly.
-
-    None for an axis that the panel does not have, or whose unit it does not state.
-    """
-
-    pressure: float | None = None
-    touch_major: float | None = None
-
-    def load(self, *, pressure: float, touch_major: float) -> float | None:
-        """Return the load of a contact with these values, not bounded; the force goes first.
-
-        None without a positive value of an axis.
-        """
-        if self.pressure is not None and pressure > 0:
-            return float((pressure / self.pressure) ** _BY_FORCE)
-        if self.touch_major is not None and touch_major > 0:
-            return float((touch_major / self.touch_major) ** _BY_SIZE)
-        return None
-
-
-def followed(known: float, reported: float | None) -> float:
-    """Return the load of a contact: the known one, unless the reported one differs enough.
-
-    Bounded. A contact whose panel stops reporting keeps its load.
-    """
-    if reported is None or not reported > 0:  # NaN is not
-        return known
-    bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
-    change = max(bounded / known, known / bounded)
-    return bounded if change >= MIN_CHANGE else known
-
 
 RIM = 0.0065
 """How far beyond the plate's edge [m] a finger counts as on it: a fingertip's radius.
@@ -170,6 +108,8 @@ class ContactTracker:
         """All contacts in order of arrival; the newest is the last."""
         self.next_expiry = math.inf
         """When [s] the first contacts are lifted unless a frame of their source arrives."""
+        self.changed: dict[ContactKey | None, float] = {}
+        """When [s] contacts changed first that no set has answered; None: the first that lifted."""
 
     def expiry_of(self, key: ContactKey) -> float:
         """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
@@ -206,11 +146,12 @@ class ContactTracker:
         for key, touch in touches.items():
             known = self._contacts.get(key)
             if known is None and len(self._contacts) >= MAX_CONTACTS:
-                evicted = self._contact_to_evict(key)
+                origins = {name: each.origin for name, each in self._sources.items()}
+                evicted = to_evict([each.source for each in self._contacts], key.source, origins)
                 if evicted is None:
                     rejected.append("too_many")
                     continue
-                up += self._lift([evicted])
+                up += self._lift([[*self._contacts][evicted]])
             contact = self._contacts[key] = self._contact(key, touch, known, frame.time)
             if known is None:
                 down.append(contact)
@@ -218,6 +159,10 @@ class ContactTracker:
                 moved.append(contact)
             elif known.load != contact.load:
                 pressed.append(contact)
+        if up:
+            self._note_lifts(up, frame.time)
+        for contact in (*down, *moved, *pressed):
+            self.changed.setdefault(contact.key, frame.time)
         self._note_next()
         return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
 
@@ -234,6 +179,7 @@ class ContactTracker:
         for name, source in self._sources.items():
             if source.received > now:
                 self._sources[name] = replace(source, received=now, expiry=now + source.timeout)
+        self._note_lifts(up, now)
         self._note_next()
         return Change(up=up) if up else _UNCHANGED
 
@@ -246,29 +192,6 @@ class ContactTracker:
             load = followed(load, touch.load)
         x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
         return Contact(key, x, y, since, load)
-
-    def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:
-        """Return the contact to lift for another one, if any.
-
-        The newest contact of the input, then the origin, then the source with most contacts, if it
-        has at least two more than the newcomer's.
-        """
-        keys = list(self._contacts)
-        groupings: tuple[Callable[[ContactKey], str], ...]
-        groupings = (_input_of, self._origin_of, lambda key: key.source)
-        for depth, group_of in enumerate(groupings):
-            counts = Counter(map(group_of, keys))
-            own = group_of(newcomer)
-            if max(counts.values(), default=0) > counts[own] + 1:
-                for deeper in groupings[depth:]:
-                    ((fullest, _),) = Counter(map(deeper, keys)).most_common(1)
-                    keys = [key for key in keys if deeper(key) == fullest]
-                return keys[-1]
-            keys = [key for key in keys if group_of(key) == own]
-        return None
-
-    def _origin_of(self, key: ContactKey) -> str:
-        return self._sources[key.source].origin
 
     def _keep_taps(self, frame: TouchFrame) -> None:
         """Keep contacts that have just come down and are not in a frame any more."""
@@ -285,6 +208,12 @@ class ContactTracker:
             self._taps.pop(contact.key, None)
         return lifted
 
+    def _note_lifts(self, up: Iterable[Contact], time: float) -> None:
+        """Note that contacts have changed for the last time at a time [s]."""
+        for contact in up:
+            first = self.changed.pop(contact.key, time)
+            self.changed[None] = min(first, self.changed.get(None, time))
+
     def _note_next(self) -> None:
         """Forget sources without contacts, and note when the others expire."""
         sources, ends = {}, [*self._taps.values()]
@@ -296,11 +225,6 @@ class ContactTracker:
             self._newest = max(self._newest, source.received)
         self._sources, self.contacts = sources, tuple(self._contacts.values())
         self.next_expiry = min(ends, default=math.inf)
-
-
-def _input_of(key: ContactKey) -> str:
-    """Return the input of a source, the beginning of its name; without one its kind."""
-    return key.source.partition(":")[0]
 
 
 def _source_of(frame: TouchFrame) -> _Source:

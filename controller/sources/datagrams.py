@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 MAX_ITERATION_TIME = 0.00025  # s; longest delay of other tasks by a flood
+MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 BACKLOG_THRESHOLD = 16  # waiting datagrams; from here on superseded ones are dropped
 _MAX_WAITING = 512  # also read per iteration; the oldest are dropped
 

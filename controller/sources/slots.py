@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from controller.sources.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.sources.loads import LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from controller.sources.touch import Touch
 from model.errors import InputError
 
@@ -51,7 +51,7 @@ def as_slot_event(event: InputEvent) -> InputEvent:
 
 
 @dataclass(frozen=True)
-class Report:
+class PanelReport:
     """Events of a panel up to a SYN_REPORT.
 
     states: all its touches, for each state within the report, so that a contact is seen that comes
@@ -126,7 +126,7 @@ class SlotReader:
                 touches[id] = touch if id == touch.id else replace(touch, id=id)
         return tuple(touches.values())
 
-    def feed(self, kind: int, code: int, value: int) -> Report | None:
+    def feed(self, kind: int, code: int, value: int) -> PanelReport | None:
         """Process one event (EV_..., code and value); return the report that it completes, or None.
 
         Slots that are negative are ignored. Raises InputError for type A.
@@ -146,11 +146,11 @@ class SlotReader:
         self._current = current
         self._slots = {number: replace(state) for number, state in slots.items()}
 
-    def _report(self) -> Report:
+    def _report(self) -> PanelReport:
         """Complete the current report."""
         if self._dropped:  # the events since then are incomplete
             self._slots.clear()
-        report = Report((*self._pending, self.touches), is_partial=self._dropped)
+        report = PanelReport((*self._pending, self.touches), is_partial=self._dropped)
         self._pending, self._changed, self._dropped = [], set(), False
         return report
 

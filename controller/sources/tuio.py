@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
-from controller.sources.datagrams import Datagram, Peer, listen
+from controller.sources.datagrams import MAX_DATAGRAM, Datagram, Peer, listen
 from controller.sources.osc import Argument, OscError, osc_messages, read_message
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
@@ -30,7 +30,6 @@ DEFAULT_PORT = 3333  # registered for TUIO
 _PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
 _IDLE_ADDRESSES = ("/tuio2/frm", "/tuio2/alv")  # without a position
 
-_MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 _MAX_MESSAGES = 256  # of a datagram: some 4 ms, and ten times as many cursors as there are contacts
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
@@ -335,7 +334,7 @@ class TuioSource(TouchSource):
                 self.host,
                 self.port,
                 received,
-                max_size=_MAX_DATAGRAM,
+                max_size=MAX_DATAGRAM,
                 drop_superseded=without_superseded,
             )
         except OSError as error:

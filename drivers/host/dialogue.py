@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 from drivers.counters import LinkStatistics
 from drivers.errors import (
@@ -45,6 +46,9 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
+_CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
+_Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
+_UNCHECKED: tuple[Sequence[Layer] | None, float, float, _Checked] = (None, -math.inf, 0.0, ((), []))
 _logger = logging.getLogger(__name__)
 
 
@@ -100,6 +104,7 @@ class Dialogue:
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
+        self._checked = _UNCHECKED  # what was checked, until when [s], and the outcome
         self._contradictions = self._misachieved = 0  # in a row: statuses, achieved layers
         self._contradicted_at = -math.inf
         self._was_unfed = False  # the status of the last contradiction
@@ -163,17 +168,41 @@ class Dialogue:
         self, token: int, layers: Sequence[Layer], *, now: bool
     ) -> tuple[Staged, list[Values]]:
         """Have the ledger admit a set; returns its messages, too. Raises CommandRefused."""
-        moment = self._time()
-        # Longest time from the admission of a set until it is committed.
-        attempts = ATTEMPTS * len(self.line.members)
-        delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
-        admitted = self.ledger.admit(layers, moment, delay=delay)
-        stream = pack_layers(admitted)
-        if len(stream) > (limit := self.capabilities["set_words"]):
-            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
+        moment, (known, until, delay, checked) = self._time(), self._checked
+        if known is not layers or moment > until:
+            delay, checked = self._check(layers, moment)
+        (admitted, stream), self._checked = checked, _UNCHECKED
         messages = parts(stream, session=self.session, token=token, now=now)
         self._admitted = Staged(token, admitted, True, since=moment, until=moment + delay)
         return self._admitted, messages
+
+    def refusal_of(self, layers: Sequence[Layer]) -> CommandRefused | None:
+        """Return why the ledger would not admit layers now; None if it would.
+
+        They are not checked again if they are staged within 5 ms, nothing sent or received since.
+        """
+        moment = self._time()
+        try:
+            delay, checked = self._check(layers, moment, longer=_CHECKED_FOR)
+        except CommandRefused as error:
+            return error
+        self._checked = layers, moment + _CHECKED_FOR, delay, checked
+        return None
+
+    def _check(
+        self, layers: Sequence[Layer], moment: float, *, longer: float = 0.0
+    ) -> tuple[float, _Checked]:
+        """Return layers as the ledger admits them, and their words; raises CommandRefused.
+
+        With the longest time [s] until they are committed; longer [s]: until they are staged.
+        """
+        attempts = ATTEMPTS * len(self.line.members)
+        delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
+        admitted = self.ledger.admit(layers, moment, delay=delay + longer)
+        stream = pack_layers(admitted)
+        if len(stream) > (limit := self.capabilities["set_words"]):
+            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
+        return delay, (admitted, stream)
 
     def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
@@ -228,6 +257,7 @@ class Dialogue:
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
+        self._checked = _UNCHECKED
         if name == "Hello":
             return
         feeding = self.feeding
@@ -261,7 +291,7 @@ class Dialogue:
 
         Raises CommandRefused once its statuses contradict what was sent, twice in a row.
         """
-        now = self._time()
+        now, self._checked = self._time(), _UNCHECKED
         self.counts.last_round_trip = now - sent_at
         message = MESSAGES.get(name)
         if message is None:

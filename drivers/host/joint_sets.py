@@ -51,6 +51,19 @@ class JointSets:
         self.is_incomplete = False
         """Whether possibly only some amplifiers have committed the last set."""
 
+    def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
+        """Return why ledgers would not admit layers by amplifier now; None if all would.
+
+        Not while a set is incomplete, which is silenced first.
+        """
+        if self.is_incomplete:
+            return None
+        refusals: dict[str, CommandRefused] = {}
+        for name, each in layers.items():
+            if (refusal := self._members.amplifiers[name].refusal_of(each)) is not None:
+                refusals[name] = refusal
+        return _merged(refusals) if refusals else None
+
     async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 

@@ -1,6 +1,6 @@
 """Interfaces for effects: entry points `era_haptics.effects`."""
 
-from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, Level, NoStimulus
 from controller.effects.kinds import effect_kind
 from controller.effects.region import Region
 from controller.play.intent import Pulse
@@ -19,11 +19,11 @@ __all__ = [
     "ContactKey",
     "Effect",
     "EffectRun",
+    "EffectStimulus",
     "Level",
-    "NoSensation",
+    "NoStimulus",
     "Pulse",
     "Quantity",
     "Region",
-    "Sensation",
     "effect_kind",
 ]

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self, cast
 
 from controller.play.loop import Controller
-from controller.play.observer import Applied, Observer, Silenced
+from controller.play.observer import Observer, PlayReport, SilenceReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values
@@ -64,8 +64,8 @@ class Chain:
     timeout: float | None = None
     table: Any = field(init=False)
     far_ends: "list[FarEnd]" = field(init=False)
-    applied: list[Applied] = field(default_factory=list)
-    silenced: list[Silenced] = field(default_factory=list)
+    applied: list[PlayReport] = field(default_factory=list)
+    silenced: list[SilenceReport] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     contacts: list[int] = field(default_factory=list)

@@ -16,7 +16,7 @@ from chain import Chain
 from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.play.observer import Applied
+from controller.play.observer import PlayReport
 from drivers.judge.watching.capture import Violation
 from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
@@ -216,7 +216,7 @@ class Streamed(Chain):
         self.far.bench.place_fingers(stream.places, now=clock.now(), observers=observers)
 
 
-def _pattern(applied: Applied) -> Mapping[str, Any]:
+def _pattern(applied: PlayReport) -> Mapping[str, Any]:
     event = PlateView(effect_of=lambda key: None, report=applied).pattern_event()
     assert event is not None
     return event.model_dump()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.play import decision, joint_answer
+from controller.play import joint_answer, planner
 from model.answer.answer import Answer, Layer
 from model.answer.fingers import Finger, Placement, Stimulus, together
 from model.answer.plan import answer, prepare_answers, query
@@ -173,7 +173,7 @@ def _prepare(table: Any, drive_mode: str | None) -> None:
 
 
 joint_answer.answer = _answer
-decision.prepare_answers, decision.query = _prepare, _query
+planner.prepare_answers, planner.query = _prepare, _query
 
 
 class SetTiming:

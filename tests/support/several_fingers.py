@@ -20,7 +20,7 @@ from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.content import Content, Selection
 from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
-from controller.play.observer import Applied
+from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.timing import Timing
 from model.arrays import FloatArray
@@ -206,7 +206,7 @@ class Felt:
     """
 
     delay: float
-    applied: Applied
+    applied: PlayReport
     accelerations: FloatArray
     weights: FloatArray
     sample_rate: float

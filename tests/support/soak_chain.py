@@ -15,7 +15,7 @@ from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Trigger
-from controller.play.observer import Applied, Observer
+from controller.play.observer import Observer, PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.judge.watching.config import TimeLimits
@@ -219,7 +219,7 @@ class Soak(Chain):
         self.note("link", change, message)
         self.counts["links lost"] += change == "lost"
 
-    def _applied(self, applied: Applied) -> None:
+    def _applied(self, applied: PlayReport) -> None:
         self.counts["patterns"] += 1
         drive = dict(sorted(applied.drive.items()))
         self.note("pattern", f"{applied.latency or 0.0:.9f}", drive)

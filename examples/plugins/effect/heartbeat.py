@@ -7,10 +7,10 @@ from era_haptics.plugins.effects import (
     Contact,
     Effect,
     EffectRun,
-    NoSensation,
+    EffectStimulus,
+    NoStimulus,
     Pulse,
     Quantity,
-    Sensation,
 )
 
 PULSE = 0.08  # s; the plate needs 20 ms to follow
@@ -26,7 +26,7 @@ class Beating(EffectRun):
         self.start, self.period, self.level_db_sl = start, period, level_db_sl
         self.pulse = Pulse(PULSE, start)  # the last one
 
-    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus:
         """Return the current pulse or pause, and when it ends."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
         begin = self.start + beats * self.period
@@ -35,11 +35,11 @@ class Beating(EffectRun):
         if self.pulse.requested_at != latest:
             self.pulse = Pulse(PULSE, latest)
         if now + _ROUNDING >= self.pulse.end:
-            return NoSensation(until=begin + (self.period if is_second else SECOND))
+            return NoStimulus(until=begin + (self.period if is_second else SECOND))
         if not is_second:
-            return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
+            return EffectStimulus(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
         weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
-        return Sensation(weaker, until=self.pulse.end, pulse=self.pulse)
+        return EffectStimulus(weaker, until=self.pulse.end, pulse=self.pulse)
 
 
 class Heartbeat(Effect):

@@ -6,7 +6,7 @@ python try_effect.py KIND
 import sys
 
 import era_haptics as era
-from era_haptics.plugins.effects import Contact, ContactKey, Sensation, effect_kind
+from era_haptics.plugins.effects import Contact, ContactKey, EffectStimulus, effect_kind
 
 if len(sys.argv) != 2:
     sys.exit(__doc__)
@@ -19,14 +19,18 @@ course = effect.start(finger, 0.0, level_db_sl=effect.level_db_sl)
 now: float | None = 0.0
 while now is not None and now < 2.0:
     felt = course.feel(finger, now)
-    if isinstance(felt, Sensation) and felt.pulse is not None and felt.pulse.started_at is None:
+    if (
+        isinstance(felt, EffectStimulus)
+        and felt.pulse is not None
+        and felt.pulse.started_at is None
+    ):
         felt.pulse.started_at = now  # as by the amplifiers: it ends a duration later
         felt = course.feel(finger, now)
     if felt is None:
         print(f"{now:5.2f} s  over")
         break
     level = "nothing"
-    if isinstance(felt, Sensation):
+    if isinstance(felt, EffectStimulus):
         level = "all that can be" if felt.level_db_sl is None else f"{felt.level_db_sl:g} dB SL"
     print(f"{now:5.2f} s  {level}")
     if felt.until is not None and felt.until <= now:

@@ -11,7 +11,7 @@ from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
 from controller.effects.layout import default_effects
 from controller.gateway.settings import read_token
-from controller.play.observer import Silenced
+from controller.play.observer import SilenceReport
 from daemon_bench import (
     ENABLED,
     READY,
@@ -182,7 +182,7 @@ async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart(tmp_
     """
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=60)
-        await until(lambda: isinstance(bench.daemon._publisher.view.report, Silenced))
+        await until(lambda: isinstance(bench.daemon._publisher.view.report, SilenceReport))
         assert "no contact" in ((await era.status()).silence_reason or "")
         for places in ([ON_PAD], [], [ON_PAD], [ON_QUIET], [], [ON_PAD], []):
             for _ in range(4):

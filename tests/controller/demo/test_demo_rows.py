@@ -23,7 +23,7 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.play.content import Prediction, not_served
-from controller.play.observer import Applied, Silenced
+from controller.play.observer import PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
@@ -173,7 +173,7 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
         observer = recorder.observer
         observer.contacts_changed((near,), Change(down=(near,)))
         reason = "too close to an edge"
-        silenced = Silenced((near,), (not_served(near, reason),), reason, None, clock.now())
+        silenced = SilenceReport((near,), (not_served(near, reason),), reason, None, clock.now())
         observer.silenced(silenced)
         observer.contacts_changed((), Change(up=(near,)))
         observer.contacts_changed((down,), Change(down=(down,)))
@@ -216,7 +216,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
                 quiet=quiet,
                 from_rest=True,
             )
-            observer.pattern_applied(cast(Applied, applied))
+            observer.pattern_applied(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
             for _ in range(8):
                 finger = replace(finger, x=finger.x + 0.004)

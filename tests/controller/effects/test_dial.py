@@ -7,7 +7,7 @@ import pytest
 
 from controller.effects.click import Click
 from controller.effects.dial import Dial
-from controller.effects.effect import NoSensation, Sensation
+from controller.effects.effect import EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
@@ -29,8 +29,8 @@ def clicks(way: Sequence[Contact], *, spacing: float) -> list[int]:
     """At which steps of a way, a second apart, a click starts."""
     run = Dial(spacing=spacing).start_in(KNOB, way[0], 0.0, level_db_sl=20.0)
     felt = [run.feel(contact, float(step)) for step, contact in enumerate(way)]
-    assert all(isinstance(each, Sensation | NoSensation) for each in felt)
-    return [step for step, each in enumerate(felt) if isinstance(each, Sensation)]
+    assert all(isinstance(each, EffectStimulus | NoStimulus) for each in felt)
+    return [step for step, each in enumerate(felt) if isinstance(each, EffectStimulus)]
 
 
 @pytest.mark.parametrize("sense", [1, -1])

@@ -17,7 +17,7 @@ from controller.daemon.messages import effects_result
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
-from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.effects.kinds import BUILT_IN
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
@@ -216,7 +216,7 @@ SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
         ],
     ),
     # A finger between detents of a region feels nothing, and leaves the others what they feel.
-    "plays without a sensation count for nothing": (
+    "plays without a stimulus count for nothing": (
         SurfaceLayout((left(on_move="dots"),), {"dots": Detents(), "buzz": Buzz()}),
         [
             At(0.0, {1: 20.0}, [finger(1, 0.15), finger(2, 0.05)]),
@@ -300,7 +300,7 @@ def test_ramp_rises_in_steps(
     for one, number in zip(felt, range(1, len(levels)), strict=False):
         until = getattr(one, "until", None)
         assert until is None or until == pytest.approx(5.0 + step * number)
-    last = Sensation(level) if ramp.hold else None
+    last = EffectStimulus(level) if ramp.hold else None
     assert felt[-1] == last
 
 
@@ -314,15 +314,15 @@ def test_texture_level_follows_speed() -> None:
         course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
         for step in range(1, 20):
             felt = course.feel(finger(1, speed * 0.01 * step), 0.01 * step)
-        assert isinstance(felt, Sensation)
+        assert isinstance(felt, EffectStimulus)
         assert felt.level_db_sl == level
         assert felt.until is not None
         assert 0.08 <= felt.until - 0.18 <= 0.0901
-        assert course.feel(finger(1, speed * 0.19), felt.until) == NoSensation()
+        assert course.feel(finger(1, speed * 0.19), felt.until) == NoStimulus()
     course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
     for step in range(1, 20):
         felt = course.feel(finger(1, 0.009 * 0.01 * step), 0.01 * step)
-    assert isinstance(felt, NoSensation)
+    assert isinstance(felt, NoStimulus)
 
 
 def test_texture_starts_with_the_movement() -> None:
@@ -332,9 +332,9 @@ def test_texture_starts_with_the_movement() -> None:
     """
     course = Texture(slow=0.01, fast=0.25, range=16.0).start(finger(1, 0.0), 0, level_db_sl=20)
     course.feel(finger(1, 0.001), 0.01)
-    assert course.feel(finger(1, 0.001), 0.2) == NoSensation()
+    assert course.feel(finger(1, 0.001), 0.2) == NoStimulus()
     felt = course.feel(finger(1, 0.004), 5.0)
-    assert isinstance(felt, Sensation)
+    assert isinstance(felt, EffectStimulus)
     assert felt.level_db_sl == 12.0
 
 
@@ -346,7 +346,7 @@ def test_texture_level_has_hysteresis() -> None:
         # By turns 0.8 dB and 1.2 dB below `fast`: on both sides of the border at 1 dB.
         way += 0.01 * 0.1 * 10 ** -((0.8 if step // 10 % 2 else 1.2) / 20)
         felt = course.feel(finger(1, way), 0.01 * step)
-        assert isinstance(felt, Sensation)
+        assert isinstance(felt, EffectStimulus)
         levels.add(felt.level_db_sl)
     assert len(levels) == 1
 
@@ -371,11 +371,11 @@ def test_detents_click_once_per_detent() -> None:
     for index, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
         now = 0.1 * index
         felt = course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now)
-        if isinstance(felt, Sensation):
+        if isinstance(felt, EffectStimulus):
             clicks.append(way)
             assert felt.pulse is not None
             felt.pulse.started_at = now
-            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == NoSensation()
+            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == NoStimulus()
     assert clicks == [5.6, 15.6, 30.6, 24]
 
 
@@ -423,9 +423,9 @@ def test_requested_effect_restarts_when_requested_again() -> None:
         def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
             return self
 
-        def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+        def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
             felt.append(now)
-            return Sensation(20.0)
+            return EffectStimulus(20.0)
 
     player = EffectPlayer(SurfaceLayout(effects={"hum": Endless()}, elsewhere=None))
     for number in range(1000):

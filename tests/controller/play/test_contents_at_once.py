@@ -13,14 +13,12 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.decision import ENDED, Decider
 from controller.play.intent import Target
-from controller.play.observer import Applied
-from controller.play.playing import PlayedContent
-from controller.play.routing import PlateSet
+from controller.play.layers import LayerContent, Layers, Sets
+from controller.play.observer import PlayReport
+from controller.play.planner import ENDED
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
 from model.answer import answer
 from model.arrays import Complex64Array
@@ -159,17 +157,17 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
     The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
     """
     async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
-        apply, count = fingers.controller.group.apply, len(fingers.committed)
+        check, count = fingers.controller._planner.layers.check, len(fingers.committed)
         (own,), refused, loop = fingers.applied[-1].contents, [], asyncio.get_running_loop()
 
-        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             others = [each for each in layers["main"] if each.number != own]
             if any(tone.level for each in others for tone in each.tones):
                 refused.append(loop.time())
-                raise CommandRefused("too much power")
-            return await apply(layers)
+                return CommandRefused("too much power")
+            return check(layers)
 
-        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
         fingers.at[2] = RIGHT
         await fingers.hold(0.3)
         felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
@@ -215,19 +213,23 @@ async def test_what_is_refused_beside_a_click_is_felt_after_it(
     regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
     layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
     async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
-        apply, refused, loop = fingers.controller.group.apply, [], asyncio.get_running_loop()
+        check, refused, loop = (
+            fingers.controller._planner.layers.check,
+            [],
+            asyncio.get_running_loop(),
+        )
         fingers.at[2] = RIGHT
         await fingers.hold(0.012)
         clicked = fingers.applied[-1].time
 
-        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             (own,) = [each for each in layers["main"] if each.number == 0] or [Layer(0)]
             if loop.time() < clicked + 0.06 and any(tone.level for tone in own.tones):
                 refused.append(loop.time())
-                raise CommandRefused("too much power")
-            return await apply(layers)
+                return CommandRefused("too much power")
+            return check(layers)
 
-        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
         fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
         await fingers.hold(0.3)
         assert refused
@@ -257,14 +259,14 @@ async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it()
 async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        apply, count = fingers.controller.group.apply, len(fingers.committed)
+        check, count = fingers.controller._planner.layers.check, len(fingers.committed)
 
-        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             if any(not each.tones and not each.renew for each in layers["main"]):
-                raise CommandRefused("an ending is too loud")
-            return await apply(layers)
+                return CommandRefused("an ending is too loud")
+            return check(layers)
 
-        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
         del fingers.at[1]
         fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
         await fingers.hold(0.3)
@@ -281,14 +283,15 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
 
     Nor does it count as felt once one of the others lifts.
     """
-    renewal = Decider.renewal
+    renewal = Layers.renewal
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
 
-        def not_one(decider: Decider, now: float) -> dict[int, PlateSet]:
-            return {n: each for n, each in renewal(decider, now).items() if n != layers[1]}
+        def not_one(all_layers: Layers, now: float) -> Sets:
+            due = renewal(all_layers, now).layers
+            return Sets({n: each for n, each in due.items() if n != layers[1]})
 
-        monkeypatch.setattr(Decider, "renewal", not_one)
+        monkeypatch.setattr(Layers, "renewal", not_one)
         count = len(fingers.applied)
         await fingers.hold(2.5)
         (applied,) = fingers.applied[count:]
@@ -650,13 +653,13 @@ def _felt(pattern: answer.Layer, fields: Complex64Array) -> complex:
     )
 
 
-def _frequencies(applied: Applied) -> tuple[float | None, ...]:
+def _frequencies(applied: PlayReport) -> tuple[float | None, ...]:
     return tuple(one.content.frequency for one in applied.contents.values())
 
 
-def _worst(applied: Applied) -> float:
+def _worst(applied: PlayReport) -> float:
     return min(each.promised_contrast_db or 0.0 for each in applied.targets)
 
 
-def _id(one: PlayedContent) -> int:
+def _id(one: LayerContent) -> int:
     return one.content.targets[0][0].key.id

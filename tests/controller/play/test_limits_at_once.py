@@ -153,13 +153,13 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
     alone = a_selector().select(CONTACTS, HapticIntent((click,)), FREE)
     hardly = replace(FREE, max_power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
     selector = a_selector()
-    selector.select(CONTACTS, HapticIntent((click,)), hardly, triggered_at=0.0)
+    selector.select(CONTACTS, HapticIntent((click,)), hardly, now=0.0)
     both = HapticIntent((lasting, click))
-    (held_back,) = selector.select(CONTACTS, both, hardly, triggered_at=0.01).not_served
+    (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).not_served
     assert held_back.contact == CONTACTS[0]
     assert "contents of other fingers" in str(held_back.held_back)
     after = HapticIntent((lasting,))
-    found = selector.select(CONTACTS, after, hardly, triggered_at=selector.due)
+    found = selector.select(CONTACTS, after, hardly, now=selector.due)
     assert (found.not_served, len(found.contents)) == ((), 1)
 
 

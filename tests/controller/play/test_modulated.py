@@ -1,6 +1,7 @@
 """A modulated content beside a steady one, over the wire at the fingertips."""
 
 import asyncio
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,16 +13,16 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.content import Content, Targets
 from controller.play.intent import Pulse, Target
-from controller.play.playing import PlayedContent, Playing
-from controller.play.routing import PlateSet
+from controller.play.layers import LayerContent, Layers
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from model.answer.answer import Layer
 from model.answer.fingers import Placement
+from model.answer.timing import Timing
 from model.config.shapes import Rectangle
 from model.vibration.excitation import Tone
 from paper_table import smooth_rig
-from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
+from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 
 LAYOUT = SurfaceLayout(
@@ -134,17 +135,17 @@ async def test_voices_of_one_finger_end_together() -> None:
 async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
     """A carrier without one side band would be another content: the finger feels none."""
     async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
-        group = fingers.controller.group
-        apply, refusals = group.apply, []
+        layers_of_all = fingers.controller._planner.layers
+        check, refusals = layers_of_all.check, []
 
-        async def refusing(layers):  # type: ignore[no-untyped-def]
+        def refusing(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             (played,) = layers.values()
             if sum(any(tone.level for tone in each.tones) for each in played) >= 3:
                 refusals.append(layers)
-                raise CommandRefused("no more")
-            return await apply(layers)
+                return CommandRefused("no more")
+            return check(layers)
 
-        group.apply = refusing  # type: ignore[method-assign]
+        layers_of_all.check = refusing
         fingers.at[1] = LEFT
         await fingers.hold(0.5)
         assert refusals
@@ -152,7 +153,6 @@ async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
         assert targets[1].held_back == "no more"
         assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1
         assert {one.content.key[0].id for one in fingers.applied[-1].contents.values()} == {2}
-        group.apply = apply  # type: ignore[method-assign]
 
 
 def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() -> None:
@@ -166,10 +166,9 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
         return Content(targets, Placement((LEFT,)), pattern, voice=voice)
 
     voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
-    playing = Playing(smooth_rig(), 4, lambda key: 0.0)
+    playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     contents = {
-        number: PlayedContent(one, PlateSet({}, 0.0), one.pattern, drive={})
-        for number, one in enumerate(voices)
+        number: LayerContent(one, one.pattern, drive={}) for number, one in enumerate(voices)
     }
     playing.start(contents, frozenset(contents))
     every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
@@ -184,9 +183,9 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     pattern = Layer({"SW": Tone(100.0, 1e-6)})
     lasting = Content(shared, Placement((LEFT,)), pattern)
     clicking = Content(((contacts[0], click),), Placement((LEFT,)), pattern)
-    playing = Playing(smooth_rig(), 4, lambda key: 0.0)
+    playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     contents = {
-        number: PlayedContent(one, PlateSet({}, 0.0), pattern, drive={})
+        number: LayerContent(one, pattern, drive={})
         for number, one in ((1, clicking), (0, lasting))
     }
     playing.start(contents, frozenset({0}))

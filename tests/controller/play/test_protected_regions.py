@@ -15,7 +15,6 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
@@ -170,14 +169,14 @@ async def test_a_click_that_is_refused_leaves_what_others_share(
     """Of the finger whose content it is: only the click is left out."""
     async with fingers_on(table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
-        sent, apply = len(fingers.committed), fingers.controller.group.apply
+        sent, check = len(fingers.committed), fingers.controller._planner.layers.check
 
-        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             if any(tone.level for each in layers["main"] if not each.renew for tone in each.tones):
-                raise CommandRefused("too much power")
-            return await apply(layers)
+                return CommandRefused("too much power")
+            return check(layers)
 
-        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
         _tick(fingers, one.content.targets[0][0])
         await fingers.hold(0.1)
         assert {n: each.content for n, each in fingers.applied[-1].contents.items()} == {

@@ -284,9 +284,9 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
         for id, requested_at in ((1, 0.0), (2, since))
     )
     if since:
-        selector.select(contacts[:1], HapticIntent((first,)), limits, triggered_at=0.0)
+        selector.select(contacts[:1], HapticIntent((first,)), limits, now=0.0)
     both = HapticIntent((first, second))
-    selection = selector.select(contacts, both, limits, triggered_at=since)
+    selection = selector.select(contacts, both, limits, now=since)
     amplitudes = [each.pattern.excitation["SW"].amplitude for each in selection.contents]
     assert amplitudes == pytest.approx([1e-6, left])
     assert selection.predictions[1].level_db_sl == pytest.approx(12 + 20 * math.log10(left / 1e-6))

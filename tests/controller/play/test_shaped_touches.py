@@ -13,8 +13,8 @@ from chain import Chain, Sent
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.decision import ENDED
 from controller.play.intent import HapticIntent, Target
+from controller.play.planner import ENDED
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.sets import Envelope

@@ -312,6 +312,22 @@ FRAMES = st.builds(
 )
 
 
+def test_a_change_is_known_since_it_came_first_until_it_is_answered() -> None:
+    """A finger that moves on changes nothing of that; of those that have lifted the first is."""
+    tracker, key = ContactTracker(PLATE), ContactKey("a", 1)
+    tracker.update(frame(1.0, (1, 0.5, 0.5)))
+    tracker.update(frame(1.1, (1, 0.6, 0.5)))
+    assert tracker.changed == {key: 1.0}
+    tracker.changed.clear()
+    tracker.update(frame(1.2, (1, 0.6, 0.5)))
+    assert tracker.changed == {}
+    tracker.update(frame(1.3, (1, 0.7, 0.5), (2, 0.1, 0.1)))
+    tracker.update(frame(1.4, (2, 0.1, 0.1)))
+    assert tracker.changed == {ContactKey("a", 2): 1.3, None: 1.3}
+    tracker.expire(1.6)
+    assert tracker.changed == {None: 1.3}
+
+
 @given(st.lists(FRAMES | st.floats(0, 2)))
 def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -> None:
     """Contacts are on the plate, bounded and unique; changes add up to them."""

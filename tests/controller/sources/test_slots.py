@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.slots import Report, SlotReader
+from controller.sources.slots import PanelReport, SlotReader
 from model.errors import InputError
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]
@@ -27,7 +27,7 @@ CODES = {
 RANGES = {0x35: (0, 1000), 0x36: (-100, 100), 0x3A: (0, 255), 0x30: (0, 255)}
 
 
-def report(reader: SlotReader, words: str) -> Report:
+def report(reader: SlotReader, words: str) -> PanelReport:
     """The report of events such as `slot 0 id 7 x 100 y 50`."""
     pairs = words.split()
     for code, value in zip(pairs[::2], pairs[1::2], strict=True):

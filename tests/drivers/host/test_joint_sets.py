@@ -1,7 +1,7 @@
 """Commits of several lines: at one moment, or none of them; and tokens that fall far behind."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import pytest
@@ -9,6 +9,7 @@ import pytest
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
 from drivers.host.jobs import JointStart
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import MESSAGES
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire
@@ -62,6 +63,34 @@ async def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
     await busy
     first, second = [*started(ends[0]), *started(ends[1])]
     assert abs(first - second) < 0.0002
+
+
+@pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])
+@in_virtual_time
+async def test_a_set_is_checked_once_unless_what_plays_may_be_another(
+    meanwhile: str, checks: int
+) -> None:
+    """What a ledger would admit is admitted within 5 ms, if nothing was sent or received since."""
+    group = await group_of(MemoryLine("serial", "a"), watchdog=1.0)
+    amplifier, checked = group.amplifiers["a"], list[float]()
+    admit = amplifier.ledger.admit
+
+    def noted(layers: Sequence[Layer], now: float, *, delay: float) -> tuple[LayerSet, ...]:
+        checked.append(now)
+        return admit(layers, now, delay=delay)
+
+    amplifier.ledger.admit = noted  # type: ignore[method-assign]
+    layers = {"a": [LAYER]}
+    assert group.sets.refusal_of(layers) is None
+    if meanwhile == "6 ms":
+        await asyncio.sleep(0.006)
+    elif meanwhile == "a reply":
+        await amplifier.read_status()
+    await group.apply(layers)
+    assert len(checked) == checks
+    refusal = group.sets.refusal_of({"a": [Layer(0, (Tone(0, 100.0, 2.0),))]})
+    assert refusal is not None
+    assert refusal.channel == 0
 
 
 @in_virtual_time

@@ -1,0 +1,296 @@
+"""The cycle of the control loop: plan, send what changes, then feed the amplifiers' watchdogs."""
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from contextlib import suppress
+
+from controller.play.intent import IntentSource
+from controller.play.layers import RELEASE_RAMP, Sets
+from controller.play.observer import Observer, play_report, silence_report
+from controller.play.planner import Plan, Planner
+from controller.sources.contacts import Change, ContactTracker
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import TouchFrame
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+)
+from drivers.host.group import Group
+from drivers.protocol.timing import HEARTBEAT
+from model.answer.timing import Timing
+from model.counting import counted
+from model.rig.rig import Rig
+from registry import clock
+
+# s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
+IDLE_INTERVAL = 0.5
+
+_logger = logging.getLogger(__name__)
+
+
+class Cycle:
+    """The cycle of the control loop of one plate; fingers are followed amid it, too.
+
+    group: all amplifiers, which are opened and armed elsewhere; observers: called in order.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        group: Group,
+        *,
+        intent_source: IntentSource,
+        timing: Timing,
+        observer: Observer,
+    ) -> None:
+        self._rig = rig
+        self.group = group
+        """All amplifiers together."""
+        self.observers = [observer]
+        self._intent_source, self._timing = intent_source, timing
+        self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
+        self.rejects = RejectCounter(_logger)
+        """What of touches was rejected, at the sources and as contacts: the only such counter."""
+        self.clicks_too_late = 0
+        """Short vibrations that came too late to be felt while armed, since the start.
+
+        They were over, or had lost their touch, before the amplifiers were to play them; with
+        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
+        do not allow.
+        """
+        self._planner_if_open: Planner | None = None
+        self._plan: Plan | None = None  # that is on its way to the amplifiers
+        self._wake = asyncio.Event()
+        self._heartbeat_due = 0.0
+        self._sending = asyncio.Lock()  # held while a turn sends
+        self._is_closed = False
+        self._is_armed_anew = False  # until the next turn, which sends again what is to play
+        self._expiry: asyncio.TimerHandle | None = None
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether a change of contacts is on its way to the amplifiers."""
+        planner, plan = self._planner_if_open, self._plan
+        if planner is None:
+            return False
+        if plan is not None and self.group.members.last_sent_at < plan.since:
+            return True
+        return planner.is_waiting
+
+    async def run(self) -> None:
+        """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
+
+        It sends only while they are armed. An observer is told of a loss, all others are stopped
+        by then; a loss while disarmed shows in the next request, as the supervisor checks.
+        """
+        while not self._is_closed:
+            await self.step()
+            self._report(lambda each: each.cycle_completed())
+            await self._wait_for_event()
+
+    async def step(self) -> None:
+        """Run the loop once: plan, send what changes, then the heartbeat if it is due."""
+        self._expire()
+        self._wake.clear()
+        planner, now = self._planner_if_open, clock.now()
+        if planner is None:
+            return
+        if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
+            self._is_armed_anew = False
+            planner.forget()
+        plan = planner.plan(now)
+        try:
+            async with self._sending:
+                with suppress(LinkDegraded):  # what plays is unknown, and planned anew; others feed
+                    if plan is not None and self.group.is_armed:
+                        await self._send(planner, plan)
+                # Not after a set that was given up: the next cycle silences it first.
+                if self._is_heartbeat_due:
+                    # From its beginning: the watchdog has run since its request was sent.
+                    due = self._heartbeat_due = clock.now() + HEARTBEAT
+                    try:
+                        await self.group.beat()
+                    finally:
+                        if self._heartbeat_due == due:  # none replies again since
+                            rest = HEARTBEAT / 2  # on a slow wire
+                            self._heartbeat_due = max(due, clock.now() + rest)
+        except (Preempted, LinkDegraded):
+            pass  # what plays is unknown, and planned anew
+        except LinkError as error:
+            lost = str(error)
+            self._report(lambda each: each.link_lost(lost))
+        except DriverError as error:
+            reason = str(error)
+            self._report(lambda each: each.refused(reason))
+
+    async def _send(self, planner: Planner, plan: Plan) -> None:
+        """Send what a plan changes, and report the outcome; raises DriverError.
+
+        While an amplifier is degraded nothing starts or is prolonged.
+        """
+        if self.group.members.degraded:
+            plan = planner.only_ends(plan)
+        self._plan = plan
+        try:
+            outcome = await self._play(planner, plan.sets)
+            if isinstance(outcome, CommandRefused):
+                plan = planner.refused(plan, outcome, now=clock.now())
+                outcome = await self._play(planner, plan.sets)
+        finally:
+            self._plan = None
+        if reason := plan.sets.reason:
+            self._report(lambda each: each.refused(reason))
+        if plan.is_reported:
+            sent_at = outcome if isinstance(outcome, float) else None
+            self._report_playing(planner, plan, sent_at=sent_at)
+
+    async def _play(self, planner: Planner, sets: Sets) -> float | CommandRefused | None:
+        """Play sets on all amplifiers, from one moment on; returns when [s] the last byte was sent.
+
+        None where nothing is to be sent, or why they were refused. Whatever is raised instead
+        leaves it unknown what plays.
+        """
+        if not sets:
+            return None
+        try:
+            if sets.silence is not None:
+                sent_at = await self.group.silence(sets.silence)
+                planner.layers.may_play = frozenset()
+                return sent_at
+            if self.group.sets.is_incomplete:
+                await self.group.silence(RELEASE_RAMP)  # before the next pattern
+            played = await self.group.apply(sets.by_amplifier)
+        except BaseException as error:
+            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
+            if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
+                return error
+            planner.forget()
+            raise
+        planner.confirm(sets, played, now=clock.now())
+        return played.sent_at
+
+    def _count_too_late(self, clicks: int) -> None:
+        if self.group.is_armed:
+            self.clicks_too_late += clicks
+            _logger.warning(
+                "%s came too late to be felt: replies are late", counted(clicks, "click")
+            )
+
+    def _feed_at_once(self) -> None:
+        self._heartbeat_due = clock.now()
+        self._wake.set()
+
+    def deliver(self, frame: TouchFrame) -> None:
+        """Process a touch frame; to be called in the loop's thread."""
+        # Contacts that came since the last cycle have not been decided yet.
+        is_undecided = self.group.is_armed and self._wake.is_set()
+        change = self._tracker.update(frame, keeps_taps=is_undecided)
+        if change:
+            self._follow(change)
+        self._schedule_expiry()
+        for reason in change.rejected:
+            self.rejects.count(reason, f"touch of {frame.source}")
+
+    def lift(self, prefix: str) -> None:
+        """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
+        for source in self._tracker.sources_of(prefix):
+            try:
+                self.deliver(TouchFrame(source, clock.now(), ()))
+            except Exception:
+                _logger.exception("loop: fingers of %s not lifted", source)
+
+    def request_update(self) -> None:
+        """Query the intent source again, because its intent changed without a touch."""
+        if self._planner_if_open is not None:
+            self._planner_if_open.look_again()
+        self._wake.set()
+
+    @property
+    def _is_heartbeat_due(self) -> bool:
+        """Whether to feed the watchdogs now; pending silence has priority."""
+        if not self.group.is_armed or self._planner.is_silence_pending:
+            return False
+        return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
+
+    @property
+    def _planner(self) -> Planner:
+        if self._planner_if_open is None:
+            raise CommandError("controller must be open; call open() first")
+        return self._planner_if_open
+
+    def _follow(self, change: Change) -> None:
+        """Act on a change of contacts, also while amplifiers are being awaited."""
+        planner = self._planner_if_open
+        if planner is not None:  # else the amplifiers were never open
+            planner.note(change)
+        self._wake.set()
+        if planner is not None and planner.is_silence_pending:
+            self.group.abort_exchange()
+        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
+
+    def _schedule_expiry(self) -> None:
+        """Check for expired sources when the next one times out.
+
+        A timer that is due before stays: nothing is set anew for every frame of a source.
+        """
+        due = self._tracker.next_expiry
+        if self._expiry is not None:
+            if self._expiry.when() <= due < math.inf:
+                return
+            self._expiry.cancel()
+            self._expiry = None
+        if due < math.inf:
+            pause = max(0.0, due - clock.now())
+            self._expiry = asyncio.get_running_loop().call_later(pause, self._time_out)
+
+    def _time_out(self) -> None:
+        self._expiry = None
+        self._expire()
+        self._schedule_expiry()
+
+    def _expire(self) -> None:
+        """Lift fingers that no source has confirmed in time: here alone, and before every plan."""
+        if (change := self._tracker.expire(clock.now())).up:
+            self._follow(change)
+
+    def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
+        """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
+        now = clock.now()
+        if plan.selection.contents and plan.sets.silence is None:
+            playing = planner.layers.contents
+            applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=self._timing)
+            self._report(lambda each: each.pattern_applied(applied))
+            return
+        silenced = silence_report(plan, sent_at=sent_at, now=now)
+        self._report(lambda each: each.silenced(silenced))
+
+    async def _wait_for_event(self) -> None:
+        """Wait for a change, a heartbeat, or the expiry of an intent."""
+        if self._wake.is_set():
+            return
+        now = clock.now()
+        until = now + IDLE_INTERVAL
+        if self._planner_if_open is not None:
+            until = min(until, self._planner_if_open.due)
+        if self.group.is_armed:
+            until = min(until, self._heartbeat_due, self.group.members.lost_from)
+        pause = max(0.0, until - now)
+        timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
+        try:
+            await self._wake.wait()
+        finally:
+            timer.cancel()
+
+    def _report(self, event: Callable[[Observer], None]) -> None:
+        """Report an event to all observers; their exceptions are only logged."""
+        for observer in self.observers:
+            try:
+                event(observer)
+            except Exception:
+                _logger.exception("loop: observer failed")

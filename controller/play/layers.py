@@ -1,0 +1,421 @@
+"""The layers of the amplifiers: contents in, the sets out; what each layer plays, and until when.
+
+The ledgers are asked before a set is made: what they do not admit is played along plain ramps, then
+without the newest content, and nothing where none is left. A vibration ends by itself if the host
+or a touch source falls silent, so it is renewed only while sources confirm the contacts that it is
+for.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+from controller.play.capabilities import PlaybackCapabilities
+from controller.play.content import Content
+from controller.play.intent import FADED_AFTER
+from controller.play.routing import (
+    Drive,
+    PlateLayer,
+    SetBuilder,
+    restarted_by,
+    tones_by_era,
+)
+from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
+from drivers.errors import CommandRefused
+from drivers.host.joint_sets import Played
+from drivers.playing.contents import Layer
+from drivers.protocol.sets import is_vibrating
+from drivers.protocol.table import QUANTITIES
+from model.answer import answer
+from model.answer.timing import Timing
+from model.rig.rig import Rig
+
+# With no finger left on the plate the end may be short: zero within 20 ms of the lift.
+RELEASE_RAMP = 0.010
+
+# Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
+# limit of one set a second does not interrupt it. It is renewed at half its time.
+_MIN_VALID_FOR = 2.0
+_MARGIN = 0.2  # s; after the contact is lifted, for late frames
+_MIN_LEFT = 0.001  # s; of a pulse that is about to end
+_VALID_FOR = QUANTITIES["valid_for"]
+
+Check = Callable[[Mapping[str, Sequence[Layer]]], CommandRefused | None]
+"""Why the ledgers would not admit layers, by amplifier, now; None if they would."""
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LayerContent:
+    """A content in its layer.
+
+    pattern: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
+    [s]: when its onset has ended. confirmed_until [s]: when its first target would have been
+    lifted, as known when it was sent; between renewal_due and renewable_until it is renewed if all
+    targets have been confirmed since. ends_at: when it has ended by itself unless it was renewed.
+    """
+
+    content: Content
+    pattern: answer.Layer
+    drive: Drive = field(default_factory=dict)
+    settled_at: float = math.inf
+    confirmed_until: float = math.inf
+    renewal_due: float = math.inf
+    renewable_until: float = math.inf
+    ends_at: float = math.inf
+
+    @property
+    def continued(self) -> Drive:
+        """What plays, at the frequencies that were asked for, which wire and amplifier round."""
+        requested = self.pattern.excitation
+        return {
+            name: replace(tone, frequency=requested[name].frequency)
+            for name, tone in self.drive.items()
+            if name in requested
+        }
+
+    @property
+    def settled_after(self) -> float:
+        """How long [s] after the commit its ramp or onset has ended."""
+        onset = self.pattern.onset
+        last = next(iter(onset.values())).duration if onset else 0.0
+        return max(self.pattern.ramp, last)
+
+
+@dataclass(frozen=True)
+class Sets:
+    """What is sent to all amplifiers for one moment; nothing where there is neither.
+
+    layers: those that change, by number; started: of these, those that play another content;
+    silence: ramp [s] along which all layers fall silent instead; settled_after [s]: when the last
+    ramp or onset has ended. skipped: contents that a ledger does not admit, for a reason; retry_at
+    [s]: when it may.
+    """
+
+    layers: Mapping[int, PlateLayer] = field(default_factory=dict)
+    started: frozenset[int] = frozenset()
+    silence: float | None = None
+    settled_after: float = 0.0
+    skipped: Sequence[Content] = ()
+    reason: str = ""
+    retry_at: float = math.inf
+
+    @cached_property
+    def by_amplifier(self) -> dict[str, list[Layer]]:
+        """The layers of each amplifier, by name."""
+        of_each: dict[str, list[Layer]] = {}
+        for layers in self.layers.values():
+            for name, layer in layers.items():
+                of_each.setdefault(name, []).append(layer)
+        return of_each
+
+    def __bool__(self) -> bool:
+        """Whether anything is to be sent."""
+        return bool(self.layers) or self.silence is not None
+
+
+class Layers:
+    """The layers of all amplifiers of a rig; capabilities: of these together.
+
+    check: by the ledgers; expiry_of: when [s] a contact is lifted unless a frame arrives. Times are
+    arguments.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        capabilities: PlaybackCapabilities,
+        timing: Timing,
+        *,
+        check: Check = lambda layers: None,
+        expiry_of: Callable[[ContactKey], float],
+    ) -> None:
+        self._rig, self._count = rig, capabilities.layers
+        self.check, self._expiry_of = check, expiry_of
+        self.builder = SetBuilder(rig, capabilities.envelope_support, capabilities.ramp_max, timing)
+        """Makes the sets."""
+        self.contents: Mapping[int, LayerContent] = {}
+        """What plays, by layer."""
+        self.due = math.inf
+        """When [s] the next content is to be renewed, or has ended by itself."""
+        self.may_play: frozenset[int] = frozenset()
+        """Layers that may play, since all were silent."""
+        self.is_silent = False
+        """Whether all layers are silent, for certain."""
+        self._fades_until = -math.inf  # s; what was ended or replaced
+        self._over: tuple[Content, ...] = ()  # ended by themselves
+        # By finger and voice, also where what plays is unknown.
+        self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
+
+    def plan(self, contents: Sequence[Content], now: float) -> Sets:
+        """Return the sets by which layers play these contents from a time [s] on, and no others.
+
+        What plays already stays as it is.
+        """
+        left, skipped = [*contents], list[Content]()
+        reason, retry_at = "", math.inf
+        while True:
+            for is_shaped in (True, False):
+                sets, playing = self._sets(left, now, is_shaped=is_shaped)
+                refusal = self.check(sets.by_amplifier) if sets.started else None
+                if refusal is None:
+                    self._note_start(sets, playing, now)
+                    if skipped:
+                        sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
+                    return sets
+                _logger.info("loop: a ledger refuses what plays shaped, then plain: %s", refusal)
+                if self._fades(sets):
+                    self._fades_until = now + FADED_AFTER
+                reason, until = str(refusal), refusal.until
+            retry_at = self._faded_by(contents, now) if until is None else until
+            newest = max([playing[number] for number in sets.started], key=_requested_at).content
+            voices = [each for each in left if each.targets == newest.targets]
+            skipped, left = skipped + voices, [each for each in left if each not in voices]
+
+    def silence(self, ramp: float, now: float) -> Sets:
+        """Return the silence of all layers along a ramp [s]; nothing if they are silent."""
+        if self.is_silent:
+            return Sets()
+        self._replace({})
+        self.is_silent, self._layer_of, self._fades_until = True, {}, now + FADED_AFTER
+        return Sets(silence=ramp)
+
+    def renewal(self, now: float) -> Sets:
+        """Return the sets that prolong what plays, where that is due at a time [s].
+
+        What a ledger refuses for good ends by itself.
+        """
+        sets = {
+            number: self.builder.build_renewal(
+                number, ramp=one.pattern.ramp, valid_for=self._lasts(one.content, now)
+            )
+            for number, one in self.contents.items()
+            if one.renewal_due <= now < one.renewable_until
+            and self._confirmed_until(one.content) > one.confirmed_until
+        }
+        renewal = Sets(sets)
+        if sets and (refusal := self.check(renewal.by_amplifier)) is not None:
+            self.not_renewed(renewal, refusal)
+            return Sets()
+        return renewal
+
+    def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
+        """Note that layers are not prolonged; one refused for good lets them end."""
+        for number in renewal.layers:
+            due = math.inf if refusal.until is None else refusal.until
+            self._change(number, renewal_due=due)
+
+    def have_settled(self, now: float) -> bool:
+        """Whether all that may play has settled, so that endings lead from there."""
+        may_end = [self._may_end_shaped(number, now) for number in self.may_play]
+        return bool(may_end) and all(may_end)
+
+    def confirm(self, sets: Sets, played: Played, now: float) -> None:
+        """Note what the amplifiers play of sets that were committed by now [s].
+
+        What a ledger has shortened is not renewed, since that would circumvent its limit.
+        """
+        going_on = sets.layers.keys() & self.contents.keys()
+        self.may_play = self.may_play.difference(sets.layers).union(going_on)
+        for number in going_on:
+            one, lasts = self.contents[number], _shortest(played, number)
+            if number in sets.started:
+                drive = tones_by_era(played.layers, self._rig, number)
+                self._change(number, drive=drive, settled_at=now + one.settled_after)
+            self._change(
+                number,
+                confirmed_until=self._confirmed_until(one.content),
+                renewal_due=math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2,
+                renewable_until=now + lasts - _MARGIN / 2,
+                ends_at=now + lasts,
+            )
+
+    def forget(self) -> None:
+        """Discard what plays, which is unknown; fingers keep their layers."""
+        self._replace({})
+        self.is_silent, self._over = False, ()
+
+    def ended(self, now: float) -> tuple[Content, ...]:
+        """Return the contents that have ended by themselves by a time [s], once."""
+        over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
+        for number in over:
+            self._change(number, drive={})
+        contents = tuple(self.contents[number].content for number in over)
+        self._over = (*self._over, *contents)
+        return contents
+
+    def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
+        """Return those of the contents that are still wanted that have ended by themselves."""
+        if self._over:
+            self._over = tuple(each for each in self._over if each in contents)
+        return self._over
+
+    def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
+        """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
+        numbers = {n: one.content for n, one in self.contents.items() if one.content in contents}
+        kept = [*numbers.values()]
+        new = []
+        for content in contents:
+            if content in kept:
+                continue
+            number = self._layer_of.get(content.key)
+            if number is None or number in numbers:  # a pulse beside what others share
+                new.append(content)
+            else:
+                numbers[number] = content
+        every = [*sorted(self.may_play), *range(self._count)]
+        free = [number for number in dict.fromkeys(every) if number not in numbers]
+        return {**numbers, **dict(zip(free, new, strict=False))}
+
+    def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:
+        """Return the layers that start by the contents of all, and which of these restart.
+
+        A carrier and its side bands must count their phases from one moment: where one starts, all
+        of the content restart.
+        """
+        restarting = set[int]()
+        changed = [
+            number
+            for number, content in numbers.items()
+            if number not in self.contents or self.contents[number].content != content
+        ]
+        for number in changed if len(numbers) > 1 else ():
+            content = numbers[number]
+            voices = [n for n, one in numbers.items() if one.targets == content.targets]
+            if len(voices) > 1 and restarted_by(content.pattern.excitation, self._drive_of(number)):
+                restarting.update(voices)
+        if restarting:
+            changed = [n for n in numbers if n in changed or n in restarting]
+        return changed, restarting
+
+    def start(self, contents: Mapping[int, LayerContent], started: frozenset[int]) -> None:
+        """Note what is sent: the contents of all layers, and which of them start."""
+        self._replace(contents)
+        self.is_silent = False
+        self._layer_of = {one.content.key: number for number, one in [*contents.items()][::-1]}
+        self.may_play |= started
+
+    def _sets(
+        self, contents: Sequence[Content], now: float, *, is_shaped: bool
+    ) -> tuple[Sets, dict[int, LayerContent]]:
+        """Return the sets of all layers that change by these contents, and what all play then."""
+        numbers = self.numbered(contents)
+        starting, restarting = self.starting(numbers)
+        layers: dict[int, PlateLayer] = {}
+        playing = {n: one for n, one in self.contents.items() if n in numbers and n not in starting}
+        settled = [0.0]
+        for number in starting:
+            content = numbers[number]
+            layers[number], pattern = self.builder.build_pattern(
+                number,
+                content.pattern,
+                content.question,
+                playing=self._drive_of(number),
+                valid_for=self._lasts(content, now),
+                restarts=number in restarting,
+                is_shaped=is_shaped and not content.targets[0][1].is_short,
+                lasts=min(_all_left(content, now), default=math.inf),
+                among=len(starting),
+            )
+            playing[number] = LayerContent(content, pattern)
+            settled.append(playing[number].settled_after)
+        for number in self.may_play - numbers.keys():
+            has_endings = is_shaped and self._may_end_shaped(number, now)
+            layers[number] = self.builder.build_end(number, has_endings=has_endings)
+            settled.append(self.builder.end_ramp)
+        return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+
+    def _note_start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
+        """Note that sets are sent at a time [s], if there are any, and what all layers play."""
+        if sets.layers:
+            if self._fades(sets):
+                self._fades_until = now + FADED_AFTER
+            self.start(playing, sets.started)
+
+    def _fades(self, sets: Sets) -> bool:
+        """Whether anything that plays is ended or replaced."""
+        if len(sets.layers) > len(sets.started):
+            return True
+        before = self.contents.keys() & sets.started
+        return bool(before) and any(self.contents[number].drive for number in before)
+
+    def _faded_by(self, contents: Sequence[Content], now: float) -> float:
+        """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
+        pulses = [target.pulse for one in contents for _, target in one.targets]
+        started = [each for each in pulses if each is not None and each.started_at is not None]
+        ends = [each.end for each in started if each.end > now]
+        if now < self._fades_until:
+            ends.append(now)
+        return max(ends, default=math.inf) + FADED_AFTER
+
+    def _change(self, number: int, **values: Any) -> None:
+        """Give what plays in a layer other values of its fields."""
+        self._replace({**self.contents, number: replace(self.contents[number], **values)})
+
+    def _replace(self, contents: Mapping[int, LayerContent]) -> None:
+        self.contents, self.due = contents, math.inf
+        for one in contents.values():
+            self.due = min(self.due, one.renewal_due, one.ends_at if one.drive else math.inf)
+
+    def _confirmed_until(self, content: Content) -> float:
+        """Return when [s] the first target of a content is lifted unless a frame arrives."""
+        until = math.inf
+        for contact, _ in content.targets:
+            until = min(until, self._expiry_of(contact.key))
+        return until
+
+    def _lasts(self, content: Content, now: float) -> float:
+        """Return for how long [s] a content at a time [s] may last by itself.
+
+        The amplifiers end a pulse; the last one, where several play.
+        """
+        until = self._confirmed_until(content)
+        unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+        return min(unlimited, max(_all_left(content, now), default=math.inf))
+
+    def _may_end_shaped(self, number: int, now: float) -> bool:
+        """Whether a layer has settled, so that its endings lead from what plays."""
+        one = self.contents.get(number)
+        return one is not None and bool(one.pattern.ending) and now >= one.settled_at
+
+    def _drive_of(self, number: int) -> Drive:
+        """Return what plays in a layer, at the frequencies that were asked for."""
+        return self.contents[number].continued if number in self.contents else {}
+
+
+def _requested_at(one: LayerContent) -> float:
+    """When [s] a content was requested, by its pulse or its contact."""
+    contact, target = one.content.targets[0]
+    return contact.since if target.pulse is None else target.pulse.requested_at
+
+
+def _all_left(content: Content, now: float) -> list[float]:
+    """Return how long [s] each target is driven from a time [s]; infinite without a pulse."""
+    left = []
+    for _, target in content.targets:
+        pulse = target.pulse
+        if pulse is None:
+            left.append(math.inf)
+        elif pulse.started_at is None:
+            left.append(pulse.duration)
+        else:
+            left.append(max(pulse.end - now, _MIN_LEFT))
+    return left
+
+
+def _shortest(played: Played, number: int) -> float:
+    """Return the time [s] after the commit when the first amplifier ends a layer by itself.
+
+    Infinite where none does.
+    """
+    times = [
+        _VALID_FOR.from_wire(one.valid_for)
+        for layers in played.layers.values()
+        for one in layers
+        if one.layer == number and one.valid_for and is_vibrating(one)
+    ]
+    return min(times, default=math.inf)

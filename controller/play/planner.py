@@ -1,0 +1,317 @@
+"""What the control loop plans, without waiting: fingers in, the sets of all amplifiers out.
+
+plan(now):  fingers -> intent -> contents -> the layers that change, on every amplifier
+"""
+
+import logging
+import math
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+from controller.play.capabilities import PlaybackCapabilities
+from controller.play.chooser import Chooser
+from controller.play.content import Selection, no_layer_free
+from controller.play.intent import IntentSource, Pulse
+from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
+from controller.play.routing import FADE_RAMP
+from controller.play.selection import Selector
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
+from drivers.errors import CommandRefused
+from drivers.host.joint_sets import Played
+from drivers.protocol.timing import HEARTBEAT
+from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
+from model.answer.plan import prepare_answers, query
+from model.answer.timing import Timing
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from registry.plugins import failure_text
+
+ENDED = (
+    "the vibration has ended by itself: it was not renewed, or a limit of time was reached; touch "
+    "there again"
+)
+
+# s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
+_RING_DOWN = 0.4
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is felt by contacts from a moment on, and the sets for it; none where nothing changes.
+
+    from_rest: whether nothing has played for 0.4 s, so that the plate is at rest. since [s]: when
+    the first finger changed that this answers; is_touch: whether one of these came, moved or
+    pressed, instead of lifts alone or none. is_reported: not, where what is felt stays as it is.
+    """
+
+    contacts: tuple[Contact, ...]
+    selection: Selection
+    from_rest: bool
+    since: float
+    is_touch: bool = False
+    sets: Sets = field(default_factory=Sets)
+    is_reported: bool = True
+
+
+class Planner:
+    """Plans what the contacts on one plate feel; synchronous, times are arguments.
+
+    A plan never raises: it falls back to silence on any exception. check: by the ledgers; arrived:
+    called when several contents have been chosen, which a plan does not wait for; too_late: called
+    with how many clicks came too late to be felt.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        *,
+        tracker: ContactTracker,
+        capabilities: PlaybackCapabilities,
+        intent_source: IntentSource,
+        timing: Timing,
+        check: Check,
+        arrived: Callable[[], None] = lambda: None,
+        too_late: Callable[[int], None] = lambda clicks: None,
+    ) -> None:
+        self.capabilities = capabilities
+        """Of the amplifiers together."""
+        self._tracker, self._intent_source, self._timing = tracker, intent_source, timing
+        self.layers = Layers(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
+        """What they play."""
+        self._selector = Selector(
+            Chooser(table, self.layers.builder.shape), arrived=self._note_answer
+        )
+        self._selected: Selection | None = None  # the last, before limits left contents out of it
+        self._plan: Plan | None = None  # the last, None where what plays is unknown
+        self._intent_due = math.inf  # s; when the intent may change without a touch
+        self._retry_at = math.inf  # s; when a ledger may admit what it refused
+        self._arrived, self._too_late = arrived, too_late
+        self._seen: Sequence[Contact] = ()  # by the last plan
+        self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
+        self._played_until = -math.inf  # s; as far as known
+        self._requested = 0  # how many choices have been begun that take longer
+        self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
+
+    def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
+        """Answer by another table of this plate from now on; what plays stays until it changes."""
+        self._timing, layers = timing, self.layers
+        layers.builder = replace(layers.builder, timing=timing)
+        self._selector.chooser = Chooser(table, layers.builder.shape)
+
+    def prepare(self) -> None:
+        """Precompute what the first touch would have to wait for; seconds, of a large rig.
+
+        Raises InputError for a table that has no pattern for these amplifiers.
+        """
+        table, timing = self._selector.chooser.table, self._timing
+        mode = self.capabilities.drive_mode
+        prepare_answers(table, mode)
+        timing.prepare(table.frequencies.tolist())
+        plate, support = table.plate, self.capabilities.envelope_support
+        placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
+        band = self.capabilities.frequencies
+        (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
+        onset, ending = support.onset_knots > 0, support.ending_knots > 0
+        layer = timing.with_envelopes(layer, placed, onset=onset, ending=ending)
+        timing.transient_contrast_db(layer, placed)
+
+    @property
+    def due(self) -> float:
+        """When [s] to plan next even if nothing arrives.
+
+        An intent expires then, a ledger may admit what it refused, or a finger that moved rests.
+        """
+        return min(self._intent_due, self._retry_at, self._selector.due)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a change of fingers is to be answered yet, or contents are being chosen."""
+        return bool(self._tracker.changed) or self._selector.is_choosing
+
+    @property
+    def is_silence_pending(self) -> bool:
+        """Whether the last contact has lifted and silence has not been commanded yet."""
+        return not self._tracker.contacts and not self.layers.is_silent
+
+    def note(self, change: Change) -> None:
+        """Note that contacts have changed."""
+        seen = {each.key for each in self._seen} if change.up else ()
+        if unseen := sum(each.key not in seen for each in change.up):
+            self._too_late(unseen)
+
+    def look_again(self) -> None:
+        """Note that the next plan may differ though no contact has changed."""
+        self._intent_due = -math.inf
+
+    def forget(self) -> None:
+        """Discard the known playback: the next plan has a set; fingers keep their layers."""
+        self._plan, self._retry_at = None, math.inf
+        self.layers.forget()
+
+    def only_ends(self, plan: Plan) -> Plan:
+        """Return a plan without what it starts, which is planned again later, or prolongs."""
+        if not plan.is_reported:
+            return replace(plan, sets=Sets())
+        if not plan.sets.started:
+            return plan
+        self.forget()
+        layers, started = plan.sets.layers, plan.sets.started
+        ends = {number: each for number, each in layers.items() if number not in started}
+        return replace(plan, sets=Sets(ends), is_reported=False)
+
+    def confirm(self, sets: Sets, played: Played, *, now: float) -> None:
+        """Note what the amplifiers play of sets by now [s].
+
+        Pulses start when the last commit was sent.
+        """
+        for pulse in self._pulses(sets.started):
+            if pulse.started_at is None:
+                if played.sent_at > pulse.end:
+                    self._too_late(1)
+                pulse.started_at = played.sent_at
+                self._intent_due = min(self._intent_due, pulse.end)
+        self.layers.confirm(sets, played, now)
+
+    def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
+        """Return silence instead of a plan whose sets were not played, though a ledger admits them.
+
+        It is planned again when the refusal ends, where that is known.
+        """
+        if not plan.is_reported and self.layers.contents:
+            self.layers.not_renewed(plan.sets, refusal)
+            return replace(plan, sets=Sets())
+        if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
+            self._awaited.clear()
+        self._retry_at = math.inf if refusal.until is None else refusal.until
+        silence = replace(self.layers.silence(FADE_RAMP, now), reason=str(refusal))
+        return replace(plan, sets=silence, is_reported=True)
+
+    def plan(self, now: float) -> Plan | None:
+        """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
+        for each in self.layers.contents.values():
+            if each.drive:
+                self._played_until = now
+        for number, pulse in [*self._awaited.items()]:
+            if pulse.started_at is not None or now >= pulse.end:
+                del self._awaited[number]
+                if pulse.started_at is None:
+                    self._too_late(1)
+        before, contacts = self._plan, self._tracker.contacts
+        if not self._tracker.changed and before is not None and now < self.due:
+            return self._go_on(before, now) if now >= self.layers.due else None
+        self._seen = contacts
+        from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
+        try:
+            self._intent_due = math.inf
+            intent = self._intent_source.intent(contacts, now)
+            self._intent_due = intent.due(now)
+            selected = self._selector.select(contacts, intent, self.capabilities, now=now)
+            if before is not None and selected == self._selected and now < self._retry_at:
+                self._answered((), now)
+                return None
+            selection, sets = self._playable(selected), Sets()
+            if is_felt := len(selection.contents) > 0:
+                sets = self.layers.plan(selection.contents, now)
+                if sets.skipped:
+                    selection = selection.without(sets.skipped, sets.reason)
+        except Exception as error:
+            has_failed, is_felt, sets = True, False, Sets(retry_at=now + HEARTBEAT)
+            self._selector.due, self._retry_at = math.inf, sets.retry_at
+            selected = selection = Selection((), contacts, (), failure_text(error))
+            if before is not None and selected == self._selected:
+                return None
+            _logger.exception("loop: plan failed, silencing all channels")
+        self._retry_at, self._selected = sets.retry_at, selected
+        is_awaited = not is_felt and selected.is_pending and not self.layers.may_play
+        if not (is_felt or is_awaited):
+            sets = self._end(contacts, now, has_failed=has_failed)
+        for pulse in self._pulses(sets.started):
+            self._awaited[id(pulse)] = pulse
+        since, is_touch = self._answered(sets.started, now)
+        self._plan = plan = Plan(contacts, selection, from_rest, since, is_touch, sets)
+        if sets or not (is_felt or is_awaited):
+            return plan
+        return None if is_awaited or _why_not(plan) == _why_not(before) else plan  # else: only said
+
+    def _go_on(self, plan: Plan, now: float) -> Plan | None:
+        """Plan what is due where nothing changes: what has ended by itself, or is to be prolonged.
+
+        With silence if nothing plays on.
+        """
+        if contents := self.layers.ended(now):
+            selection = plan.selection.without(contents, ENDED)
+            self._plan = replace(plan, selection=selection, sets=Sets(), since=now)
+            return self._plan
+        renewal = self.layers.renewal(now)
+        return replace(plan, sets=renewal, is_reported=False) if renewal else None
+
+    def _note_answer(self) -> None:
+        self.look_again()
+        self._arrived()
+
+    def _playable(self, selection: Selection) -> Selection:
+        """Return a selection without what has ended by itself, and what has no layer."""
+        if over := self.layers.over_of(selection.contents):
+            selection = selection.without(over, ENDED)
+        count = self.capabilities.layers
+        if len(selection.contents) > count:  # of each finger all voices have one, or none
+            served = [*self.layers.numbered(selection.contents).values()]
+            keys = {each.key[0] for each in selection.contents if each not in served}
+            left = [each for each in selection.contents if each.key[0] in keys]
+            selection = selection.without(left, no_layer_free(count))
+        return selection
+
+    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> Sets:
+        """Return the end of all that plays: along endings only under fingers that stay."""
+        if not contacts:
+            return self.layers.silence(RELEASE_RAMP, now)
+        if has_failed or not self.layers.have_settled(now):
+            return self.layers.silence(FADE_RAMP, now)
+        return self.layers.plan((), now)
+
+    def _answered(self, started: Collection[int], now: float) -> tuple[float, bool]:
+        """Return since when [s] fingers have changed that are answered, and whether any but lifted.
+
+        While contents are being chosen these are those that have lifted or feel a pulse that
+        starts, and with something that lasts those that the choice before was for.
+        """
+        changed, requests = self._tracker.changed, self._selector.requests
+        answered = {**changed, **self._waiting}
+        if not self._selector.is_choosing:
+            self._waiting = {}
+            changed.clear()
+        else:
+            keys, lasts = set[ContactKey | None]([None]), False
+            for number in started:
+                for contact, target in self.layers.contents[number].content.targets:
+                    lasts = lasts or not target.is_short
+                    keys |= {contact.key} if target.is_short else set()
+            answered = {key: at for key, at in answered.items() if key in keys}
+            if requests == self._requested:
+                changed.pop(None, None)
+            else:
+                waiting = {key: at for key, at in changed.items() if key not in keys}
+                answered |= self._waiting if lasts else {}
+                self._waiting = waiting if lasts else {**waiting, **self._waiting}
+                changed.clear()
+        self._requested = requests
+        is_touch = len(answered) > (None in answered)
+        return min([now, *answered.values()]), is_touch
+
+    def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:
+        """Return the pulses that play in layers."""
+        pulses = []
+        for number in numbers:
+            for _, target in self.layers.contents[number].content.targets:
+                if target.pulse is not None:
+                    pulses.append(target.pulse)
+        return pulses
+
+
+def _why_not(plan: Plan | None) -> dict[ContactKey, str | None]:
+    """Return why targets feel nothing of their own, by contact."""
+    held_back = () if plan is None else plan.selection.not_served
+    return {each.contact.key: each.held_back for each in held_back}

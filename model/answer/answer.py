@@ -141,7 +141,7 @@ class Answer:
         for number, stream in enumerate(self.contents.streams):
             lowered = self.lowered_db(number)
             for finger in stream.targets:
-                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                contrast, median, promised, foreign = self._known_of(finger)
                 level, promised_level = tones.level_db_sl[finger]
                 found[finger] = Sensation(
                     self.asked[finger],
@@ -152,7 +152,7 @@ class Answer:
                     contrast,
                     median,
                     promised,
-                    _known(tones.foreign_db_sl[finger]),
+                    foreign,
                     lowered,
                 )
         for finger, had, is_disturbing in self.held:
@@ -165,16 +165,22 @@ class Answer:
             )
         for finger, each in enumerate(self.asked):
             if each.stimulus is None:
-                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                contrast, median, promised, foreign = self._known_of(finger)
                 found[finger] = Sensation(
                     each,
                     QUIET,
                     contrast_db=contrast,
                     median_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                    foreign_level_db_sl=foreign,
                 )
         return tuple([found[number] for number in range(len(self.asked))])
+
+    def _known_of(self, finger: int) -> list[float | None]:
+        """Contrasts at a finger, and the level of others' vibrations; None for one there is not."""
+        tones = self.tones
+        figures = (*tones.contrast_db[finger], tones.foreign_db_sl[finger])
+        return [None if each != each else each for each in figures]
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:

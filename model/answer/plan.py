@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from model.answer.answer import MIN_CONTRAST_DB, Answer
+from model.answer.answer import MIN_CONTRAST_DB, SAME_LEVEL, Answer
 from model.answer.fingers import (
     ANY,
     MIN_LEVEL_DB_SL,
@@ -129,12 +129,13 @@ def _changed(found: Answer) -> list[str]:
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
         if is_modulated and list(found.tones.owners).count(number) == 1:
             steady.append(f"vibration of {_at(found.asked[first])} is steady")
-        if stream.limit_db_sl is None and found.lowered_db(number):
-            is_short = stream.duration is not None
-            level = found.tones.level_db_sl[first][not is_short]
+        lasts = stream.duration is None
+        is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL
+        if stream.limit_db_sl is None and not is_reached:
+            level = found.tones.level_db_sl[first][lasts]
             why = (
                 "all that the ERAs' stroke and the amplifiers allow"
-                if found.stroke_factor < 1 - NEARLY or not is_short
+                if found.stroke_factor < 1 - NEARLY or lasts
                 else "so that quiet fingers feel half of it at most"
             )
             at = _at(found.asked[first])

@@ -188,7 +188,7 @@ class Answer:
         layers, least = [], self.contents.least_ramp
         for number, stream in enumerate(self.contents.streams):
             excitation, *sides = self._excitations(number)
-            duration = self.contents.durations[number]
+            duration = None if self.contents.is_shaped else stream.duration
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(
@@ -206,13 +206,15 @@ class Answer:
 
     def placement(self, layer: Layer) -> Placement:
         """Where the fingers of a layer are, and all others."""
-        others = [n for n in range(len(self.asked)) if n not in layer.fingers]
-        asked = self.asked
-        return Placement(
-            tuple([asked[n].at for n in layer.fingers]),
-            tuple([asked[n].at for n in others]),
-            tuple([asked[n].load for n in (*layer.fingers, *others)]),
-        )
+        own, others, loads = [], [], []
+        for number in layer.fingers:
+            own.append(self.asked[number].at)
+            loads.append(self.asked[number].load)
+        for number, finger in enumerate(self.asked):
+            if number not in layer.fingers:
+                others.append(finger.at)
+                loads.append(finger.load)
+        return Placement(tuple(own), tuple(others), tuple(loads))
 
     def lowered_db(self, number: int) -> float:
         """By how much a layer, by its number, is weaker than its stimulus asks [dB]."""

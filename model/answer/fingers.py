@@ -211,18 +211,25 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     """Raise InputError for fingers that contradict each other or are not on the plate."""
-    if all(each.stimulus is None for each in fingers):
+    loads, places, is_asked = [], [], False
+    for finger in fingers:  # without a call for each
+        loads.append(finger.load)
+        places.append(finger.at)
+        is_asked = is_asked or finger.stimulus is not None
+    if not is_asked:
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
-    check_loads([each.load for each in fingers])
-    check_on_plate("finger", [each.at for each in fingers], plate)
+    check_loads(loads)
+    check_on_plate("finger", places, plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at
         for other in fingers[:number]:
             gap = math.dist(other.at, finger.at)
+            if gap >= FINGERTIP_RADIUS:
+                continue
             is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
-            if gap < FINGERTIP_RADIUS and not (is_one and gap > 0):
+            if not (is_one and gap > 0):
                 raise InputError(
                     f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
                     f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"

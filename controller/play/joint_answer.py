@@ -62,9 +62,9 @@ def answered(
     [dB]; None to keep none. Raises InputError for fingers that are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
-    fingers = _as_layers_allow(
-        fingers_of(table, targets, quiet, capabilities, protected), len(targets), capabilities
-    )
+    fingers = fingers_of(table, targets, quiet, capabilities, protected)
+    if len(targets) > 1 or targets[0][1].modulation_hz is not None:
+        fingers = _as_layers_allow(fingers, len(targets), capabilities)
     answer_to = partial(
         answer,
         table,
@@ -110,18 +110,19 @@ def selection_of(
 
     contents: list[Content] = []
     skipped: list[Prediction] = []
-    felt = [*zip(targets, found.fingers, strict=False)]
+    felt, unfelt = [*zip(targets, found.fingers, strict=False)], set[ContactKey]()
     for (contact, _), each in felt:
         if each.verdict == HELD_BACK:
             skipped.append(_held_back(contact, each))
         elif (reason := _why_unfelt(each)) is not None:
+            unfelt.add(contact.key)
             skipped.append(not_served(contact, reason))
     for layer in found.layers:
         served = [
             (contact, target, felt[number][1])
             for number in layer.fingers
             for contact, target in (felt[number][0],)
-            if _why_unfelt(felt[number][1]) is None
+            if contact.key not in unfelt
         ]
         if not served:
             continue

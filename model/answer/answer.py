@@ -141,7 +141,7 @@ class Answer:
         for number, stream in enumerate(self.contents.streams):
             lowered = self.lowered_db(number)
             for finger in stream.targets:
-                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                contrast, median, promised, of_others = self._known_of(finger)
                 level, promised_level = tones.level_db_sl[finger]
                 found[finger] = Sensation(
                     self.asked[finger],
@@ -152,7 +152,7 @@ class Answer:
                     contrast,
                     median,
                     promised,
-                    _known(tones.foreign_db_sl[finger]),
+                    of_others,
                     lowered,
                 )
         for finger, had, is_disturbing in self.held:
@@ -165,16 +165,22 @@ class Answer:
             )
         for finger, each in enumerate(self.asked):
             if each.stimulus is None:
-                contrast, median, promised = map(_known, tones.contrast_db[finger])
+                contrast, median, promised, of_others = self._known_of(finger)
                 found[finger] = Sensation(
                     each,
                     QUIET,
                     contrast_db=contrast,
                     median_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                    foreign_level_db_sl=foreign,
                 )
         return tuple([found[number] for number in range(len(self.asked))])
+
+    def _known_of(self, finger: int) -> list[float | None]:
+        """Contrasts at a finger, and the level of others' vibrations; None for one there is not."""
+        tones = self.tones
+        figures = (*tones.contrast_db[finger], tones.foreign_db_sl[finger])
+        return [None if each != each else each for each in figures]
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
@@ -182,7 +188,7 @@ class Answer:
         layers, least = [], self.contents.least_ramp
         for number, stream in enumerate(self.contents.streams):
             excitation, *sides = self._excitations(number)
-            duration = self.contents.durations[number]
+            duration = None if self.contents.is_shaped else stream.duration
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(
@@ -200,13 +206,15 @@ class Answer:
 
     def placement(self, layer: Layer) -> Placement:
         """Where the fingers of a layer are, and all others."""
-        others = [n for n in range(len(self.asked)) if n not in layer.fingers]
-        asked = self.asked
-        return Placement(
-            tuple([asked[n].at for n in layer.fingers]),
-            tuple([asked[n].at for n in others]),
-            tuple([asked[n].load for n in (*layer.fingers, *others)]),
-        )
+        own, others, loads = [], [], []
+        for number in layer.fingers:
+            own.append(self.asked[number].at)
+            loads.append(self.asked[number].load)
+        for number, finger in enumerate(self.asked):
+            if number not in layer.fingers:
+                others.append(finger.at)
+                loads.append(finger.load)
+        return Placement(tuple(own), tuple(others), tuple(loads))
 
     def lowered_db(self, number: int) -> float:
         """By how much a layer, by its number, is weaker than its stimulus asks [dB]."""

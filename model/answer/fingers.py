@@ -32,6 +32,12 @@ ANY_BAND = (0.0, math.inf)
 NEVER, BY_NAME, ANY, MUST = SHARING = ("never", "by name", "any", "must")
 """Whether a finger may feel the vibration of another one."""
 
+_UNITS = {
+    "load": "the load of the rig's fingertip",
+    "min_contrast_db": "dB",
+    "max_foreign_db_sl": "dB SL",
+}
+
 
 @dataclass(frozen=True)
 class Stimulus:
@@ -54,8 +60,10 @@ class Stimulus:
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
-        _check_pair(self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz")
-        expect_number(self.level_db_sl, what="level_db_sl", unit="dB above the threshold")
+        if type(self.band_hz) is not tuple or [*map(type, self.band_hz)] != [float, float]:
+            _check_pair(self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz")
+        if type(self.level_db_sl) is not float:
+            expect_number(self.level_db_sl, what="level_db_sl", unit="dB above the threshold")
         low, high = self.band_hz
         if not 0 <= low <= high:  # False for NaN
             raise InputError(
@@ -107,8 +115,17 @@ class Finger:
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
-        _check_pair(self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres")
-        expect_number(self.load, what="load", unit="times the rig's fingertip")
+        # Without a call for each of the many fingers that are as they should be.
+        if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
+            _check_pair(
+                self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres"
+            )
+        for what in ("load", "min_contrast_db", "max_foreign_db_sl"):
+            given = getattr(self, what)
+            if type(given) is not float:
+                expect_number(given, what=what, unit=_UNITS[what])
+            if math.isnan(given):
+                raise InputError(f"{what} must be a number of {_UNITS[what]}, got {given}")
         if not (self.stimulus is None or isinstance(self.stimulus, Stimulus)):
             raise InputError(
                 f"stimulus must be one such as era.Stimulus(20), got {shown(self.stimulus)}"
@@ -119,8 +136,6 @@ class Finger:
             raise InputError(
                 f"sharing must be one of {', '.join(SHARING)}, got {shown(self.sharing)}"
             )
-        _check_bound(self.min_contrast_db, what="min_contrast_db", unit="dB")
-        _check_bound(self.max_foreign_db_sl, what="max_foreign_db_sl", unit="dB SL")
 
     @property
     def name(self) -> str | None:
@@ -196,29 +211,29 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     """Raise InputError for fingers that contradict each other or are not on the plate."""
-    if all(each.stimulus is None for each in fingers):
+    loads, places, is_asked = [], [], False
+    for finger in fingers:  # without a call for each
+        loads.append(finger.load)
+        places.append(finger.at)
+        is_asked = is_asked or finger.stimulus is not None
+    if not is_asked:
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
-    check_loads([each.load for each in fingers])
-    check_on_plate("finger", [each.at for each in fingers], plate)
+    check_loads(loads)
+    check_on_plate("finger", places, plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at
         for other in fingers[:number]:
             gap = math.dist(other.at, finger.at)
+            if gap >= FINGERTIP_RADIUS:
+                continue
             is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
-            if gap < FINGERTIP_RADIUS and not (is_one and gap > 0):
+            if not (is_one and gap > 0):
                 raise InputError(
                     f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
                     f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"
                 )
-
-
-def _check_bound(given: float, *, what: str, unit: str) -> None:
-    """Raise InputError for anything but a number, which may be infinite."""
-    expect_number(given, what=what, unit=unit)
-    if math.isnan(given):
-        raise InputError(f"{what} must be a number of {unit}, got {given}")
 
 
 def _check_pair(given: object, *, what: str, such_as: str) -> None:

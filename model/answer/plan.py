@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from model.answer.answer import MIN_CONTRAST_DB, Answer
+from model.answer.answer import MIN_CONTRAST_DB, SAME_LEVEL, Answer
 from model.answer.fingers import (
     ANY,
     MIN_LEVEL_DB_SL,
@@ -129,12 +129,13 @@ def _changed(found: Answer) -> list[str]:
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
         if is_modulated and list(found.tones.owners).count(number) == 1:
             steady.append(f"vibration of {_at(found.asked[first])} is steady")
-        if stream.limit_db_sl is None and found.lowered_db(number):
-            is_short = stream.duration is not None
-            level = found.tones.level_db_sl[first][not is_short]
+        lasts = stream.duration is None
+        is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL
+        if stream.limit_db_sl is None and not is_reached:
+            level = found.tones.level_db_sl[first][lasts]
             why = (
                 "all that the ERAs' stroke and the amplifiers allow"
-                if found.stroke_factor < 1 - NEARLY or not is_short
+                if found.stroke_factor < 1 - NEARLY or lasts
                 else "so that quiet fingers feel half of it at most"
             )
             at = _at(found.asked[first])
@@ -172,7 +173,9 @@ class _Answering:
     def solve(self, min_contrast_db: float) -> Answer:
         """Change the plan until the worst finger has the contrast, else take the best tried."""
         quiet = [n for n, each in enumerate(self.fingers) if each.stimulus is None]
-        plan = self._many_joined(_Plan(self._first_contents, tuple(quiet)))
+        plan = _Plan(self._first_contents, tuple(quiet))
+        if len(plan.contents) > MAX_SEPARATE:
+            plan = self._many_joined(plan)
         if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
             raise InputError(
                 f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
@@ -193,7 +196,10 @@ class _Answering:
             found = replace(found, applied=(*found.applied, below))
         if self.drive_mode == UNRESTRICTED:
             found = with_modulation(self.table, found, playable=self.limits.frequencies)
-        return as_quiet_fingers_allow(self.table, found)
+        for stream in found.contents.streams:
+            if stream.limit_db_sl is not None:
+                return as_quiet_fingers_allow(self.table, found)
+        return found
 
     def within_limits(self, found: Answer, min_contrast_db: float) -> Answer:
         """The answer lowered to what the amplifiers' limits allow.
@@ -201,7 +207,10 @@ class _Answering:
         Where a finger would not be served any more, by the rule again at the lower levels.
         """
         strokes = self.table.strokes
-        found = as_ramps_allow(self.table, found, self.limits)
+        for stream in found.contents.streams:
+            if stream.duration is not None:
+                found = as_ramps_allow(self.table, found, self.limits)
+                break
         if (factor := self.limits.factor_within(found.amplitudes, strokes)) >= 1 - NEARLY:
             return found
         if len(found.contents.streams) > 1:

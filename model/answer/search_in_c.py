@@ -42,6 +42,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""
     streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
     starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
+    is_here = contents.drive_mode == UNRESTRICTED
     for stream in streams:
         targets += stream.targets
         starts.append(len(targets))
@@ -49,8 +50,8 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
             bands += band
         priorities.append(stream.priority)
         levels.append(10 ** (stream.level_db_sl / 20))
-    is_here = contents.drive_mode == UNRESTRICTED
-    if by is None or not is_here or any(stream.duration for stream in streams):
+        is_here = is_here and stream.duration is None
+    if by is None or not is_here:
         return choose_by_numpy(table, contents, by_kernel=by is not None)
     count, n, k = len(streams), len(table.eras), len(places)
     kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))

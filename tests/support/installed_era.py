@@ -96,7 +96,9 @@ def try_files(era: InstalledEra) -> None:
     era("table", "build", "rig.yaml", "-o", "small.npz", *coarse)
     asked = ("--target", "0.06,0.05", "--quiet", "0.2,0.1")
     answer = json.loads(era("table", "query", "small.npz", *asked, "--json"))
-    expect(answer["contrast_db"] > 6.0, f"the two fingers are not told apart: {answer}")
+    expect(
+        answer["fingers"][0]["contrast_db"] > 6.0, f"the two fingers are not told apart: {answer}"
+    )
     era("plate", "map", "rig.yaml", "--drive", "SW=110", "--points", "12x9", "-o", "map.png")
     expect((era.folder / "map.png").stat().st_size > 1000, "no picture")
     era("report", "daemon.yaml", "-o", "report.zip")

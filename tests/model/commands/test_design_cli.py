@@ -144,7 +144,7 @@ def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path
         assert CliRunner().invoke(app, arguments).exit_code == 0
         lines = ["table", "query", str(table), "--batch", str(tmp_path / "own.jsonl"), "--json"]
         answers = map(json.loads, CliRunner().invoke(app, lines).stdout.splitlines())
-        promised[name] = [each["robust_worst_db"] for each in answers]
+        promised[name] = [each["promised_worst_db"] for each in answers]
     means = {name: sum(each) / 2 for name, each in promised.items()}
     result = design(
         *("--layouts", str(tmp_path / "layouts.yaml"), "--contents", "2", "--json"),

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 from click.testing import Result
-from model.answer.pattern_query import UnreachableLevel
 from typer.testing import CliRunner
 
 from model.cli import app
@@ -112,7 +111,7 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
     era, group, *words = shlex.split(lines[-1])[1:]
     assert (era, group, words[1]) == ("era", "table", str(spaced))
-    assert as_json(*words)["robust_felt_contrast_db"] > 0
+    assert as_json(*words)["promised_worst_db"] > 0
 
 
 def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path: Path) -> None:
@@ -132,16 +131,16 @@ def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path:
 
 
 def test_query_prints_levels_and_contrast(built: Path) -> None:
-    """One row per driven ERA, then measures; 99 dB SL is beyond full stroke."""
+    """One row per driven ERA, then one per finger; that 99 dB SL is out of reach is said."""
     contacts = ["--target", "0.08,0.06", "--quiet", "0.22,0.16"]
     answer = as_json("query", built, *contacts)
     lines = table("query", built, *contacts).stdout.splitlines()
-    assert [line.split()[0] for line in lines[: len(answer["drive"])]] == list(answer["drive"])
-    promised = lines[len(answer["drive"]) + 2]
-    assert f"{answer['robust_felt_contrast_db']:.1f} dB promised" in promised
+    drive, felt = answer["layers"][0]["drive"], answer["fingers"][0]
+    assert [line.split()[0] for line in lines[: len(drive)]] == list(drive)
+    assert lines[len(drive) + 1].split()[:2] == ["(0.08,", "0.06)"]
+    assert f"{felt['promised_contrast_db']:.1f} dB" in lines[len(drive) + 1]
     assert "cm²" in table("query", built, "--target", "0.08,0.06").stdout
-    with pytest.raises(UnreachableLevel):
-        table("query", built, "--target", "0.1,0.1", "--level", "99")
+    assert "is lowered to" in table("query", built, "--target", "0.1,0.1", "--level", "99").stdout
 
 
 def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:

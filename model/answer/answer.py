@@ -172,7 +172,7 @@ class Answer:
                     contrast_db=contrast,
                     median_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=foreign,
+                    foreign_level_db_sl=of_others,
                 )
         return tuple([found[number] for number in range(len(self.asked))])
 

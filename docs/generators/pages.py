@@ -15,6 +15,7 @@ import changed_tests
 import effects_page
 import error_cases
 import rig_page
+import ways
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from api_page import api_reference
@@ -82,6 +83,9 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),
     "docs/reference/effects.md": _parts("effects_page.py", effects_page.PARTS),
+    "docs/architecture.md": [
+        part(f"{ways.WRITER} {name}", write) for name, write in ways.PARTS.items()
+    ],
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
 """The writers of each file, by its path from the root."""

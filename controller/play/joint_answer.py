@@ -251,6 +251,7 @@ def _predictions(
                 felt.foreign_level_db_sl,
                 layer.frequency,
                 own.content,
+                felt.level_db_sl,
             )
             for contact, _, felt in served
         ]

@@ -31,9 +31,10 @@ class Prediction:
     mixed with others', that of another finger, or none; held_back: why not its own, None if it
     does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
     has none; contrast_db: on the plate as modelled, to the loudest quiet finger or to the contents
-    of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of others' contents here, which nine of ten plates
-    do not exceed. None where there is nothing to compare with. frequency [Hz]: None where several
-    or none play; content: name of what it feels; nominal_db_sl: its level on the plate as modelled.
+    of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of
+    others' contents here, which nine of ten plates do not exceed. None where there is nothing to
+    compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
+    nominal_db_sl: its level on the plate as modelled.
     """
 
     contact: Contact

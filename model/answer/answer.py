@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.answer.fingers import Finger, Placement
-from model.answer.over_duration import pulse_ramp
+from model.answer.over_duration import ONSET_RAMP, pulse_ramp
 from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
@@ -26,13 +26,6 @@ MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
 
 IMPERCEPTIBLE_DB_SL = -10.0
 """Level at which a finger stays unaware: ten decibels for the differences between people."""
-
-ONSET_RAMP = 0.040
-"""Duration of a plain ramp [s].
-
-Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
-at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
-"""
 
 SAME_LEVEL = 0.1
 """Difference of two levels that are one [dB]."""
@@ -141,7 +134,7 @@ class Answer:
         for number, stream in enumerate(self.contents.streams):
             lowered = self.lowered_db(number)
             for finger in stream.targets:
-                contrast, median, promised, foreign = self._known_of(finger)
+                contrast, median, promised, of_others = self._known_of(finger)
                 level, promised_level = tones.level_db_sl[finger]
                 found[finger] = Sensation(
                     self.asked[finger],
@@ -152,7 +145,7 @@ class Answer:
                     contrast,
                     median,
                     promised,
-                    foreign,
+                    of_others,
                     lowered,
                 )
         for finger, had, is_disturbing in self.held:
@@ -165,14 +158,14 @@ class Answer:
             )
         for finger, each in enumerate(self.asked):
             if each.stimulus is None:
-                contrast, median, promised, foreign = self._known_of(finger)
+                contrast, median, promised, of_others = self._known_of(finger)
                 found[finger] = Sensation(
                     each,
                     QUIET,
                     contrast_db=contrast,
                     median_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=foreign,
+                    foreign_level_db_sl=of_others,
                 )
         return tuple([found[number] for number in range(len(self.asked))])
 

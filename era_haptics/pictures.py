@@ -8,8 +8,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from era_haptics.drive import Played, excitation_of
 from era_haptics.solved_plate import SolvedPlate
 from model.answer.answer import Answer
-from model.arguments import expect
+from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.figures.drawing import map_figure
 from model.figures.table_pictures import (
     contrast_map_figure,
@@ -34,9 +35,17 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
 
 
 def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> Figure:
-    """Draw the level of a layer of an answer over the plate [dB SL], and the fingers."""
+    """Draw the level of a layer of an answer over the plate [dB SL], and the fingers.
+
+    Raises InputError for a layer that it does not have.
+    """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.query(table, target)")
+    if not is_whole(layer) or not 0 <= layer < len(answer.layers):
+        raise InputError(
+            f"layer must be the number of one of the answer's {len(answer.layers)}, from 0, got "
+            f"{shown(layer)}"
+        )
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.set_axis_off()

@@ -5,8 +5,9 @@ from functools import cached_property
 
 from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
 from era_haptics.drive import Played, excitation_of, layer_of
-from model.answer.answer import ONSET_RAMP, Answer, Layer
+from model.answer.answer import Answer, Layer
 from model.answer.fingers import Placement
+from model.answer.over_duration import ONSET_RAMP
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
-from model.answer.answer import ONSET_RAMP
+from model.answer.over_duration import ONSET_RAMP
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig

@@ -30,11 +30,11 @@ class Prediction:
     contact: as it was when the content was chosen; verdict: whether it feels its own content, that
     mixed with others', that of another finger, or none; held_back: why not its own, None if it
     does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
-    has none; contrast_db: on the plate as modelled;
-    promised_contrast_db: to the loudest quiet finger or to the contents of others here,
-    on nine of ten plates; foreign_level_db_sl: of others' contents here, which nine of ten plates
-    do not exceed. None where there is nothing to compare with. frequency [Hz]: None where several
-    or none play; content: name of what it feels.
+    has none; contrast_db: on the plate as modelled, to the loudest quiet finger or to the contents
+    of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of
+    others' contents here, which nine of ten plates do not exceed. None where there is nothing to
+    compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
+    nominal_db_sl: its level on the plate as modelled.
     """
 
     contact: Contact
@@ -46,6 +46,7 @@ class Prediction:
     foreign_level_db_sl: float | None = None
     frequency: float | None = None
     content: str | None = None
+    nominal_db_sl: float | None = None
 
 
 @dataclass(frozen=True)

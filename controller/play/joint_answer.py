@@ -65,7 +65,7 @@ def answered(
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
-    answer_to = partial(
+    request = partial(
         answer,
         table,
         drive_mode=capabilities.drive_mode,
@@ -74,14 +74,14 @@ def answered(
     )
     kept = fingers if kept_within is None else _kept(fingers, targets, before)
     if kept == fingers:
-        return answer_to(fingers)
-    found, within = answer_to(kept), kept_within or 0.0
+        return request(fingers)
+    found, within = request(kept), kept_within or 0.0
     worst, served, lowered = found.promised_worst_db, _served(found), _lowered_db(found)
     least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
     is_loud = lowered < _SHORT_OF
     if is_loud and served == len(targets) and (worst is None or worst >= least):
         return found
-    other = answer_to(fingers)
+    other = request(fingers)
     gain = _worst(other) - _worst(found)
     is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
     return other if (_served(other), is_better) > (served, False) else found
@@ -251,6 +251,7 @@ def _predictions(
                 felt.foreign_level_db_sl,
                 layer.frequency,
                 own.content,
+                felt.level_db_sl,
             )
             for contact, _, felt in served
         ]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.answer.fingers import Finger, Placement
-from model.answer.over_duration import pulse_ramp
+from model.answer.over_duration import ONSET_RAMP, pulse_ramp
 from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
@@ -26,13 +26,6 @@ MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
 
 IMPERCEPTIBLE_DB_SL = -10.0
 """Level at which a finger stays unaware: ten decibels for the differences between people."""
-
-ONSET_RAMP = 0.040
-"""Duration of a plain ramp [s].
-
-Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
-at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
-"""
 
 SAME_LEVEL = 0.1
 """Difference of two levels that are one [dB]."""

@@ -20,7 +20,13 @@ from model.ensemble.touched_plate import gram
 from model.transients.knots import RISE
 from model.transients.ringing import RINGING_TIMES, RampedRinging, ringing_time
 
-_MAX_RAMP = 0.040  # s
+ONSET_RAMP = 0.040
+"""Duration of a plain ramp [s].
+
+Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
+at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
+"""
+
 _IN_PHASE = 0.1
 """Correlation of what other plates add with the nominal plate's ringing.
 
@@ -35,7 +41,7 @@ def pulse_ramp(duration: float) -> float:
     The vibration is even over its duration then: no 40 ms of a click of 40 ms are more than 0.8 dB
     (median) stronger than the first 40, along a ramp of half of it 1.5, as long as it 3 dB.
     """
-    return min(_MAX_RAMP, duration / 4)
+    return min(ONSET_RAMP, duration / 4)
 
 
 def shaped_gain(duration: float) -> float:

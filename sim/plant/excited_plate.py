@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.answer import ONSET_RAMP
 from model.answer.fingers import Placement, Stimulus, check_fingers, together
+from model.answer.over_duration import ONSET_RAMP
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError

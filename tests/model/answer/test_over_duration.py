@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.promise.clicks import clicks_on, given
 from model.answer.fingers import Finger, Placement, Stimulus
-from model.answer.over_duration import OverDuration, pulse_ramp, shaped_gain
+from model.answer.over_duration import OverDuration, on_drawn_plates, pulse_ramp, shaped_gain
 from model.answer.plan import answer, query
 from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.strength import Limits
@@ -173,6 +173,12 @@ def test_quiet_fingers_limit_a_raise() -> None:
             assert quiet_level == pytest.approx(14.0, abs=0.01) or quiet_level > 14.0
             assert "quiet fingers" in found.applied[-1]
     assert lowered == 2
+
+
+def test_other_plates_ring_in_phase_by_a_tenth() -> None:
+    """By hand: 2 heard and 3 that another plate adds, half of it over the click: 4 + 0.6 + 2.25."""
+    found = on_drawn_plates(np.array([[4.0, 13.0, 1.0]]), np.array([4.0]), 0.5)
+    assert found == pytest.approx(np.array([[4.0, 6.85, 4.0]]))
 
 
 def test_promise_over_a_click_is_kept() -> None:

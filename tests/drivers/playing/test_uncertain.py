@@ -127,10 +127,9 @@ def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
     ended = Command(0, 2200, 5000, 0, ending=Envelope(10, ()))
     outputs.play([LayerSet(0, 0, 100, (ended,))], 1, (0.0, 0.01), is_exact=True)
     outputs.silence((0.11, 0.112), 0.05, "Disarm")
-    for level in (0.0, 0.5):
-        outputs.check_sensors([level], {}, 0.113, report_low=report)
-    assert not found
-    outputs.check_sensors([0.1], {}, 0.17, report_low=report)
+    assert not outputs.sure((0.113, 0.113))
+    assert outputs.sure((0.17, 0.17))
+    outputs.check_levels([0.1], (0.17, 0.17), report)
     assert found == ["silent"]
 
 

@@ -53,12 +53,12 @@ class _Touch:
     contact: Contact
     quiet: Mapping[str, Position]
     until: float = math.inf
-    patterns: list["_Playing"] = field(default_factory=list)
+    patterns: list["_PlayedPattern"] = field(default_factory=list)
     reason: str | None = None
 
 
 @dataclass(eq=False)
-class _Playing:
+class _PlayedPattern:
     """What plays from its commit to the next command [s], with its measurements.
 
     touches: those that feel a content; steady, onset: vibration by finger over the longest rest of
@@ -100,7 +100,7 @@ class TouchRecorder:
         self._tasks = tasks
         self._on_row = on_row
         self._start = clock.now()
-        self._playing: _Playing | None = None
+        self._playing: _PlayedPattern | None = None
         self._changes: list[float] = []  # when fingers landed, moved or lifted
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
@@ -157,9 +157,9 @@ class TouchRecorder:
             elif touch is not None:  # not lifted meanwhile
                 touches.append(touch)
         if touches:
-            self._playing = _Playing(applied, touches)
+            self._playing = _PlayedPattern(applied, touches)
         for touch in touches:
-            touch.patterns.append(cast(_Playing, self._playing))
+            touch.patterns.append(cast(_PlayedPattern, self._playing))
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)

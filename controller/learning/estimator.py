@@ -21,7 +21,7 @@ from controller.learning.messages import (
     Estimate,
     Note,
     Ready,
-    Refreshed,
+    RefreshedAnswers,
     Reply,
     Request,
     Start,
@@ -31,7 +31,7 @@ from controller.learning.messages import (
 from model.answer.plan import prepare_answers
 from model.errors import InputError
 from model.files.array_file import remove_partial
-from model.identification.in_service import Known
+from model.identification.in_service import PlateEstimate
 from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
@@ -54,7 +54,7 @@ class Estimator:
         self._start, self._now = start, now
         self._base = start.table.fingerprint
         self.only_alarms = why_only_alarms(start.rig)
-        known = Known.of_rig(start.rig, start.sensors)
+        known = PlateEstimate.of_rig(start.rig, start.sensors)
         if self.only_alarms:
             known = replace(known, is_explained=False)
         self.note = ""
@@ -115,7 +115,7 @@ class Estimator:
         if not self._is_refreshed and now >= self._refreshed_at + _REFRESH_INTERVAL:
             self._refreshed_at, self._is_refreshed = now, True
             whole = self._prepared(self._learned.current, whole=True)
-            done.append(Refreshed(whole, self._robust()))
+            done.append(RefreshedAnswers(whole, self._robust()))
         return done
 
     def save(self) -> Note | None:

@@ -20,13 +20,13 @@ from model.arrays import Complex64Array
 from model.compiled.kernels import kernels, run
 from model.compiled.structures import (
     FOUND,
-    Drawn,
     FoundTones,
     GivenQuestion,
     GivenRaster,
-    Method,
-    Plates,
+    PlateDraws,
     Rules,
+    TouchedPlates,
+    WeightSearch,
 )
 from model.drive_modes import UNRESTRICTED, coherent
 from model.drive_modes.forms import LEVEL_MARGIN
@@ -97,10 +97,10 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     )
 
 
-_Fingers: TypeAlias = tuple[Drawn, Drawn, Complex64Array]
+_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array]
 """Plates that judge and those of the promise, and the stiffness of fingers that press lightly."""
 
-_Kept: TypeAlias = tuple[Plates, GivenRaster, Rules, dict[int, _Fingers]]
+_Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
 """What kernels read of a table; and of so many fingers."""
 
 _kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
@@ -124,7 +124,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         *(PERCENTILE, PROMISED_PERCENTILE),
         *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
-        (Method * 3)(*map(_method, coherent.WITHIN_STROKE)),
+        (WeightSearch * 3)(*map(_method, coherent.WITHIN_STROKE)),
     )
     rules.point(
         rim=CENTRE_AND_RIM,
@@ -135,8 +135,8 @@ def _kept_of(table: LocalizationTable) -> _Kept:
     return plates_structure(table.on_eras), given_raster(table), rules, {}
 
 
-def _method(of: coherent.Method) -> Method:
-    return Method(
+def _method(of: coherent.LawsonMethod) -> WeightSearch:
+    return WeightSearch(
         *(of.steps, of.is_limited, of.variance, of.gain),
         *(coherent.LEVEL_RESERVE, coherent.MAX_GROWTH, coherent.MAX_MULTIPLIER),
     )

@@ -17,7 +17,7 @@ from model.answer.plan import answer
 from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_first
 from model.design.problem import DesignProblem, NamedLayouts
-from model.design.search import Found, LayoutSearch
+from model.design.search import LayoutSearch, ScoredLayout
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
@@ -48,7 +48,7 @@ _LEVEL_MARGIN = 0.1  # dB
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Assessment:
     """Answers at contact sets (s,): promised felt contrast [dB] of the worst finger.
 
     quiet (s,): numbers of quiet fingers; level_db_sl (s,): promised level of the weakest content.
@@ -83,7 +83,7 @@ class Judged:
         return float((self.level_db_sl >= STRONG_DB_SL - _LEVEL_MARGIN).mean())
 
 
-def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Judged:
+def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
     """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
 
     For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
@@ -92,7 +92,7 @@ def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Judged:
     table = build_table(rig, drive_mode="phased")
     contrast, level = np.array([_answer(table, contacts, contents) for contacts in sets]).T
     quiet = np.array([len(contacts) - contents for contacts in sets])
-    return Judged(quiet, contrast, level)
+    return Assessment(quiet, contrast, level)
 
 
 def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tuple[float, float]:
@@ -119,8 +119,8 @@ class Layout:
 
     problem: DesignProblem
     name: str
-    found: Found
-    judged: Judged | None = None
+    found: ScoredLayout
+    judged: Assessment | None = None
 
     @property
     def count(self) -> int:
@@ -128,7 +128,7 @@ class Layout:
         return len(self.found.positions)
 
     @property
-    def answers(self) -> Judged:
+    def answers(self) -> Assessment:
         """Answers of one that was judged."""
         assert self.judged is not None  # noqa: S101
         return self.judged
@@ -155,7 +155,7 @@ class Design:
     by_count: dict[int, Layout]
     by_stiffness: dict[float, Layout]
     sensitivities: FloatArray
-    own: Judged | None
+    own: Assessment | None
     sets: list[FloatArray]
 
     @property
@@ -302,7 +302,7 @@ def _judged(layouts: Sequence[Layout], runner: Runner) -> list[Layout]:
     return [replace(each, judged=answers[key]) for key, each in zip(keys, layouts, strict=True)]
 
 
-def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[Found]:
+def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[ScoredLayout]:
     """Layouts of one start of one problem, the last of the number of ERAs that is sought."""
     number, start = task
     problem = problems[number]
@@ -314,13 +314,15 @@ def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[Fou
     return [each for each in found if each.is_supported]
 
 
-def _score(problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]) -> list[Found]:
+def _score(
+    problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]
+) -> list[ScoredLayout]:
     """Scores of given layouts of one problem."""
     number, layouts = task
     return _search_of(problems[number]).scored(layouts)
 
 
-def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Judged:
+def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Assessment:
     """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
     problem, positions = problems[task[0]], task[1]
     rig = problem.rig if positions is None else problem.rig_with(positions)

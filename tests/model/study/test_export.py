@@ -13,7 +13,7 @@ from model.answer.fingers import Placement
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
-from model.structure.plate import AirGap, Laminate, Layer
+from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import export
 from model.study.export import export_csv, export_mat
 from model.table.file import save_table
@@ -62,7 +62,7 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
 def test_export_mat_holds_layers_and_air(table, tmp_path):
     """A laminate is a struct with its layers, each with its material and rows by frequency."""
     metal, rows = table.plate.material, ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
-    layers = (Layer(metal, 0.001), Layer(metal, 0.0005, by_frequency=rows))
+    layers = (LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=rows))
     plate = replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
     export_mat(replace(table, plate=plate), tmp_path / "t.mat")
     struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"].plate

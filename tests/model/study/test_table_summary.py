@@ -10,7 +10,7 @@ import pytest
 from model.answer.fingers import Placement
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
-from model.structure.plate import Laminate, Layer
+from model.structure.plate import Laminate, LaminateLayer
 from model.study.overview import (
     CONTACT_SETS,
     Overview,
@@ -182,7 +182,7 @@ def test_summary_counts_levels_and_shares(table):
     values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
     errors = np.zeros((2, 12))
     weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, errors, one_to_hundred)
-    layers = tuple(Layer(table.plate.material, thickness) for thickness in (1e-3, 2e-3))
+    layers = tuple(LaminateLayer(table.plate.material, thickness) for thickness in (1e-3, 2e-3))
     quieter = replace(quieter, plate=replace(table.plate, laminate=Laminate(layers)))
     summary = summarize(quieter, Overview(weak, [one_to_hundred] * 3))
     assert summary["plate_m"][2] == pytest.approx(3e-3)  # not of one material that bends alike

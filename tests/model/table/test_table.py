@@ -19,7 +19,7 @@ from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
+from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.study.exact_plates import Plates, felt_on
 from model.table.build import TableProblem, build_table
 from model.table.following import table_following
@@ -259,7 +259,7 @@ def test_a_frequency_that_a_table_lacks_is_refused(table: LocalizationTable) -> 
 
 def test_other_plates_are_refused(rig: Rig, table: LocalizationTable) -> None:
     """Other ERAs or strokes, sides, masses or layers, or a thickness 20 % larger: build."""
-    plate, half = rig.plate, Layer(rig.plate.material, rig.plate.thickness / 2)
+    plate, half = rig.plate, LaminateLayer(rig.plate.material, rig.plate.thickness / 2)
     layered = replace(plate, laminate=Laminate((half, half)))
     heavier = replace(half, material=replace(half.material, rho=2 * half.material.rho))
     plates = (

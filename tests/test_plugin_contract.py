@@ -3,6 +3,7 @@
 import asyncio
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
+from controller.effects.layout_file import load_layout
 from controller.effects.player import EffectPlayer
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.touch import open_source
@@ -282,6 +284,37 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
         assert set(named.split(", ")) == claimants
     install("four", kind, "other", kind.works.replace("'fine'", "'other'"))
     assert kind.look_up("other")
+
+
+def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path: Path) -> None:
+    """Of an effect whose name is its kind; one that is no kind needs one."""
+    (effects,) = (kind for kind in KINDS if kind.group == "effects")
+    install("one", effects, "buzz", effects.works)
+    layout = tmp_path / "layout.yaml"
+    for name, problem in (("buzz", "kind of effect buzz is claimed by"), ("bell", "needs a kind;")):
+        layout.write_text(f"effects: {{{name}: {{}}}}\n", "utf-8")
+        with pytest.raises(InputError, match=rf"effects\.{name}: {problem}"):
+            load_layout(layout, None)
+
+
+@of_every_kind
+def test_example_has_a_name_that_the_project_does_not_have(kind: Kind, install: Install) -> None:
+    """Or the how-to page that installs it would be refused."""
+    files = (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml")
+    points = [tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"] for file in files]
+    names = [name for each in points for name in each.get(f"era_haptics.{kind.group}", ())]
+    assert names
+    for name in names:
+        problem = ""
+        install(f"example_{len(name)}", kind, name, kind.works)
+        try:
+            kind.look_up(name)
+        except kind.error as error:
+            problem = str(error)
+        assert "(era-haptics," not in problem, (
+            f"{kind.what} {name} is built in: rename that in examples/plugins, on its how-to page "
+            "in docs/how-to, and in its test in tests/examples"
+        )
 
 
 @of_every_kind

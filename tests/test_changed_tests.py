@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import changed_tests
 from changed_tests import ALSO, ROOT, also, nearest
 
 
@@ -28,6 +29,16 @@ def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
     assert {each for each in beside | direct if reached[each] <= 1} == beside | direct
     assert {each for each, distance in reached.items() if distance == 0} >= beside
     assert {each for each, distance in reached.items() if distance == 1} >= direct - beside
+
+
+def test_what_only_the_project_file_or_an_example_leads_to_comes_last() -> None:
+    """Behind the tests of the changed module's folder, and behind those that import it."""
+    module, example = "controller/effects/kinds.py", "examples/plugins/effect/heartbeat.py"
+    order = [*nearest(["pyproject.toml", example, module, "docs/reference/effects.md"])]
+    own = {path for path in order if path.startswith("tests/controller/effects/")}
+    near = {*nearest([module, "docs/reference/effects.md"])}
+    assert len(own) < len(near) < len(order)
+    assert ({*order[: len(own)]}, {*order[: len(near)]}) == (own, near)
 
 
 def test_module_of_tests_and_page_lead_to_their_tests() -> None:
@@ -62,12 +73,28 @@ def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> 
         "test_b.py",
         "test_a.py",
     ]
-    for until, outcome in (("inf", "2 passed"), ("0", "2 without time")):
+    for until, outcome, status in (("inf", "2 passed", 0), ("0", "2 without time", 3)):
         more = {"PYTHONPATH": str(ROOT / "tests" / "support"), "ERA_TESTS_UNTIL": until}
         more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to load
         done = subprocess.run(
-            command, cwd=tmp_path, env=os.environ | more, capture_output=True, text=True, check=True
+            command,
+            cwd=tmp_path,
+            env=os.environ | more,
+            capture_output=True,
+            text=True,
+            check=False,
         )
+        assert done.returncode == status
         assert re.findall(r"^test_(.)\.py::", done.stdout, re.MULTILINE) == ["b", "a"]
         assert outcome in done.stdout.splitlines()[-1]
         assert ("test_b.py test_a.py" in done.stdout.splitlines()) == (until == "0")
+
+
+def test_command_fails_where_no_test_had_time(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """And its last line says so, which nothing passed would not."""
+    monkeypatch.setattr(changed_tests, "changed_since", lambda commit: ["tests/test_vocabulary.py"])
+    monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", "0"])
+    assert changed_tests.main() == 3
+    assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")

@@ -158,4 +158,6 @@ def _words(plain: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.writelines(f"{line}\n" for line in retired_identifiers())
+    found = [f"{line}\n" for line in retired_identifiers()]
+    sys.stdout.writelines(found)
+    sys.exit(bool(found))

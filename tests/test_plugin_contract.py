@@ -287,34 +287,26 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
 
 
 def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path: Path) -> None:
-    """Of an effect whose name is its kind; one that is no kind needs one."""
-    (effects,) = (kind for kind in KINDS if kind.group == "effects")
-    install("one", effects, "buzz", effects.works)
-    layout = tmp_path / "layout.yaml"
-    for name, problem in (("buzz", "kind of effect buzz is claimed by"), ("bell", "needs a kind;")):
-        layout.write_text(f"effects: {{{name}: {{}}}}\n", "utf-8")
-        with pytest.raises(InputError, match=rf"effects\.{name}: {problem}"):
-            load_layout(layout, None)
+    """Of an effect whose name is its kind, which needs none beside it."""
+    install("one", KINDS[1], "buzz", KINDS[1].works)
+    (layout := tmp_path / "layout.yaml").write_text("effects: {buzz: {}}\n", "utf-8")
+    with pytest.raises(InputError, match=r"effects\.buzz: kind of effect buzz is claimed by"):
+        load_layout(layout, None)
 
 
 @of_every_kind
 def test_example_has_a_name_that_the_project_does_not_have(kind: Kind, install: Install) -> None:
     """Or the how-to page that installs it would be refused."""
-    files = (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml")
-    points = [tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"] for file in files]
-    names = [name for each in points for name in each.get(f"era_haptics.{kind.group}", ())]
-    assert names
-    for name in names:
-        problem = ""
-        install(f"example_{len(name)}", kind, name, kind.works)
-        try:
-            kind.look_up(name)
-        except kind.error as error:
-            problem = str(error)
-        assert "(era-haptics," not in problem, (
-            f"{kind.what} {name} is built in: rename that in examples/plugins, on its how-to page "
-            "in docs/how-to, and in its test in tests/examples"
-        )
+    for file in (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml"):
+        points = tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"]
+        for name in points.get(f"era_haptics.{kind.group}", ()):
+            install(file.parent.name, kind, name, None)
+            with pytest.raises(kind.error) as caught:
+                kind.look_up(name)
+            assert "(era-haptics," not in str(caught.value), (
+                f"{kind.what} {name} is built in: rename that in {file.parent}, on its how-to page "
+                "in docs/how-to, and in its test in tests/examples"
+            )
 
 
 @of_every_kind

@@ -208,22 +208,14 @@ def test_plate_that_is_not_explained_is_refused_and_nothing_written(
 
 @pytest.mark.parametrize("command", [["check"], ["identify", "-o", "rig2.yaml"]])
 def test_plate_with_a_part_that_does_not_scale_is_refused_before_it_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+    tmp_path: Path, typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
-    """Also of a known thickness, which would not help, and with a part of any kind.
-
-    No port is opened, where none is.
-    """
+    """Before a port is opened, where none is; also of a known thickness, which would not help."""
     monkeypatch.delitem(SCALED, "loss_exponent")
     known = "uncertainty: {thickness: 0}\nplate:\n  loss_exponent: 0.2\n"
-    path = write_rig(tmp_path / "rig.yaml", ("plate:\n", known), mesh="auto")
-    options = ("--url", "serial:///dev/none", "--yes")
-    result = CliRunner().invoke(app, ["rig", command[0], str(path), *command[1:], *options])
-    assert isinstance(result.exception, InputError)
-    problem = str(result.exception)
-    assert problem.startswith("plate.loss_exponent: ")
-    assert "era rig identify" in problem
-    assert "uncertainty.thickness" not in problem
+    write_rig(tmp_path / "rig.yaml", ("plate:\n", known), mesh="auto")
+    with pytest.raises(InputError, match=r"^plate\.loss_exponent: (?!.*set unc).*era rig identify"):
+        typed(*command, "--url", "serial:///dev/none", "--yes", on=plate)
 
 
 @pytest.mark.parametrize("ending", ["csv", "uff"])

@@ -70,6 +70,7 @@ _SECONDS = 45.0  # for tests, of a minute
 _UNTIL = "ERA_TESTS_UNTIL"
 _NO_TIME = "without time"
 _NOTHING_RAN = 3
+_MODULES = (".py", ".pyi")
 _LAST = ("pyproject.toml", "examples/")
 """What many tests name or import that its change does not concern."""
 
@@ -122,16 +123,15 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
     last = [path for path in changed if path.startswith(_LAST)]
     near = _reached([path for path in changed if path not in last])
     distances = _reached(last) | near
-    modules = [path for path in changed if _is_module(path) and path not in last]
+    modules = [each for each in {*changed} - {*last, *_tests()} if each.endswith(_MODULES)]
     beside = {test for path in modules for test in _tests_beside(path)}
 
     def place(test: str) -> tuple[bool, bool, bool, int, int, bool, str]:
         common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
         shared = max(len(Path(each).parts) for each in common)
-        is_far = test not in near, test not in beside
         return (
-            *(test not in changed, *is_far, distances[test], -shared),
-            *(Path(test).name in SLOWEST, test),
+            *(test not in changed, test not in near, test not in beside, distances[test]),
+            *(-shared, Path(test).name in SLOWEST, test),
         )
 
     order = sorted((path for path in _tests() if path in distances), key=place)
@@ -142,10 +142,8 @@ def _reached(changed: Sequence[str]) -> dict[str, int]:
     """The least distance of each module and test from changed files."""
     start: dict[str, int] = {}
     for path in changed:
-        first, second = [_node(path)], [*_tests_beside(path)]
-        if path in _tests():
-            second = []
-        elif _is_module(path):
+        first, second = [_node(path)], [] if path in _tests() else [*_tests_beside(path)]
+        if path.endswith(_MODULES):
             first, second = [*first, *second], []
         else:
             package = str(Path(path).parent).replace("/", ".")
@@ -154,10 +152,6 @@ def _reached(changed: Sequence[str]) -> dict[str, int]:
         start = dict.fromkeys(second, 1) | start | dict.fromkeys(first, 0)
     distances = _distances(start)
     return dict.fromkeys(_tests(), 1) | distances if "conftest" in start else distances
-
-
-def _is_module(path: str) -> bool:
-    return path.endswith((".py", ".pyi")) and path not in _tests()
 
 
 @cache
@@ -256,8 +250,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Fail where no test had time, which a worker of xdist does not know."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    counted = set() if reporter is None else {*reporter.stats}
-    if _NO_TIME in counted and not counted & {"passed", "failed", "error", "xfailed"}:
+    ran = {"passed", "failed", "error", "xfailed"}
+    if reporter and _NO_TIME in reporter.stats and not reporter.stats.keys() & ran:
         session.exitstatus = _NOTHING_RAN
 
 

@@ -158,6 +158,4 @@ def _words(plain: str) -> str:
 
 
 if __name__ == "__main__":
-    found = [f"{line}\n" for line in retired_identifiers()]
-    sys.stdout.writelines(found)
-    sys.exit(bool(found))
+    sys.exit("\n".join(retired_identifiers()) or None)

@@ -89,6 +89,7 @@ lint: .venv/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+	$(BIN)/python tests/support/vocabulary.py
 	$(PAGES) --check
 
 # Every page, part of a page, client stub and C header that is written from the code.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import changed_tests
 from changed_tests import ALSO, ROOT, also, nearest
 
 
@@ -21,13 +22,21 @@ def importing(module: str) -> set[str]:
 
 @pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
 def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
-    """And those before all others, which only import what imports it."""
+    """And those before all others, which only import what imports it.
+
+    What the project's file or an example leads to besides comes last.
+    """
     reached = nearest([path])
     beside = {each for each in reached if Path(each).parent == Path("tests") / Path(path).parent}
     direct = importing(path.removesuffix(".py").replace("/", "."))
     assert {each for each in beside | direct if reached[each] <= 1} == beside | direct
     assert {each for each, distance in reached.items() if distance == 0} >= beside
     assert {each for each, distance in reached.items() if distance == 1} >= direct - beside
+    order = [*nearest(["pyproject.toml", "examples/plugins/effect/heartbeat.py", path])]
+    assert {Path(each).parts[:2] for each in order[: len(beside)]} == {
+        ("tests", Path(path).parts[0])
+    }
+    assert {*order[: len(reached)]} == {*reached} < {*order}
 
 
 def test_module_of_tests_and_page_lead_to_their_tests() -> None:
@@ -66,8 +75,24 @@ def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> 
         more = {"PYTHONPATH": str(ROOT / "tests" / "support"), "ERA_TESTS_UNTIL": until}
         more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to load
         done = subprocess.run(
-            command, cwd=tmp_path, env=os.environ | more, capture_output=True, text=True, check=True
+            command,
+            cwd=tmp_path,
+            env=os.environ | more,
+            capture_output=True,
+            text=True,
+            check=False,
         )
+        assert done.returncode == (3 if until == "0" else 0)
         assert re.findall(r"^test_(.)\.py::", done.stdout, re.MULTILINE) == ["b", "a"]
         assert outcome in done.stdout.splitlines()[-1]
         assert ("test_b.py test_a.py" in done.stdout.splitlines()) == (until == "0")
+
+
+def test_command_fails_where_no_test_had_time(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """And its last line says so, which nothing passed would not."""
+    monkeypatch.setattr(changed_tests, "changed_since", lambda commit: ["tests/test_vocabulary.py"])
+    monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", "0"])
+    assert changed_tests.main() == 3
+    assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")

@@ -3,6 +3,7 @@
 import asyncio
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
+from controller.effects.layout_file import load_layout
 from controller.effects.player import EffectPlayer
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.touch import open_source
@@ -282,6 +284,29 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
         assert set(named.split(", ")) == claimants
     install("four", kind, "other", kind.works.replace("'fine'", "'other'"))
     assert kind.look_up("other")
+
+
+def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path: Path) -> None:
+    """Of an effect whose name is its kind, which needs none beside it."""
+    install("one", KINDS[1], "buzz", KINDS[1].works)
+    (layout := tmp_path / "layout.yaml").write_text("effects: {buzz: {}}\n", "utf-8")
+    with pytest.raises(InputError, match=r"effects\.buzz: kind of effect buzz is claimed by"):
+        load_layout(layout, None)
+
+
+@of_every_kind
+def test_example_has_a_name_that_the_project_does_not_have(kind: Kind, install: Install) -> None:
+    """Or the how-to page that installs it would be refused."""
+    for file in (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml"):
+        points = tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"]
+        for name in points.get(f"era_haptics.{kind.group}", ()):
+            install(file.parent.name, kind, name, None)
+            with pytest.raises(kind.error) as caught:
+                kind.look_up(name)
+            assert "(era-haptics," not in str(caught.value), (
+                f"{kind.what} {name} is built in: rename that in {file.parent}, on its how-to page "
+                "in docs/how-to, and in its test in tests/examples"
+            )
 
 
 @of_every_kind

@@ -110,6 +110,7 @@ def identify(
     from model.identification.identify import identify as fit
     from model.identification.measurement import DeviceSettings
     from model.identification.promise import expected_contrast
+    from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
     if device is None:
@@ -131,6 +132,7 @@ def identify(
             seed,
         )
     with rig_of_file(rig_file) as (document, rig):
+        check_measurable(rig.plate)
         source = Path(document.source)
         check_rig_output(output, rig_file, source)
         require_untouched(is_known=untouched, has_terminal=not as_json)

@@ -122,8 +122,10 @@ def _measured(
 ) -> "tuple[Rig, MeasuredPlate, Responses]":
     """Measure the plate by the sensors of its amplifiers."""
     from controller.diagnosis.plate_measurement import observation_of
+    from model.structure.modal_elasticity import check_measurable
 
     with rig_of_file(rig_file) as (_, rig):
+        check_measurable(rig.plate)
         require_untouched(is_known=is_untouched, has_terminal=is_shown)
         plate = measured_by_amplifiers(rig, urls, level=level, is_quick=False, is_shown=is_shown)
     return rig, plate, observation_of(plate.measurement, rig)

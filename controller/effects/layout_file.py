@@ -108,7 +108,8 @@ def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[
             section = effect_kind(kind if isinstance(kind, str) else repr(kind))
         except InputError as error:
             where = (*path, "kind") if "kind" in parameters else path
-            validation.add(where, f"{error}" if "kind" in parameters else f"needs a kind; {error}")
+            is_named = "kind" in parameters or name in effect_kinds()
+            validation.add(where, f"{error}" if is_named else f"needs a kind; {error}")
             continue
         effects[name] = validation.nested(path, section, without="kind")
     return effects

@@ -35,6 +35,7 @@ _SENT: Mapping[str, Record] = {
     "event": EVENT_RECORD,
     "nak": NAK_RECORD,
 }
+_READING_HEAD = "// Of a value in its unit, as WORD_OF_TEMPERATURE(25) of 25 degrees.\n"
 _TYPES = {"u16": "uint16_t", "i16": "int16_t", "u32": "uint32_t"}
 
 
@@ -51,7 +52,8 @@ def _record(name: str, record: Record) -> Iterator[str]:
             yield from _record(_row(field), field.record)
     members = [*_members(each for each in record.fields if not _is_reading(each))]
     if readings := "".join(map(_reading, filter(_is_reading, record.fields))):
-        yield f"struct readings {{\n{readings}}};\n\n"
+        yield f"struct readings {{\n{readings}}};\n"
+        yield f"{_READING_HEAD}{''.join(map(_word_of, filter(_is_reading, record.fields)))}\n"
         members.append("    struct readings readings;\n")
     yield f"struct wire_{name} {{\n{''.join(members)}}};\n"
     if any(isinstance(field, Numbers | Rows) for field in record.fields):
@@ -74,9 +76,15 @@ def _is_reading(field: Field) -> TypeGuard[Number]:
 
 def _reading(field: Number) -> str:
     """Return the line of a reading, with its unit and meaning."""
-    step = f"{field.quantity.step:g} {field.quantity.unit}".strip()
     meaning = field.meaning + "; 0: not measured" * field.is_added
-    return f"    {_TYPES[field.quantity.wire]} {field.name}; // {step}, {meaning}\n"
+    return f"    {_TYPES[field.quantity.wire]} {field.name}; // {field.quantity.scale}, {meaning}\n"
+
+
+def _word_of(field: Number) -> str:
+    """Return the macro of a reading's word, from its value in the unit."""
+    quantity, name = field.quantity, field.name.upper()
+    origin = f" + {quantity.zero}" if quantity.zero else ""
+    return f"#define WORD_OF_{name}(value) ((value) * {quantity.per_unit}{origin})\n"
 
 
 def _members(fields: Iterable[Field]) -> Iterator[str]:

@@ -93,8 +93,8 @@ def quantities() -> str:
     """Return the steps and ranges, a row for all quantities that have the same."""
     groups: dict[tuple[object, ...], list[str]] = {}
     for each in QUANTITIES.values():
-        step = f"{each.step:.6g} {each.unit}".strip()
-        groups.setdefault((each.wire, each.minimum, each.maximum, step), []).append(each.name)
+        row = each.wire, each.minimum, each.maximum, each.scale
+        groups.setdefault(row, []).append(each.name)
     rows = ((", ".join(names), *row) for row, names in groups.items())
     return _table(("quantity", "type", "lowest", "highest", "one step is"), rows)
 

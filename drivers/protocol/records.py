@@ -42,7 +42,8 @@ View = Literal["status", "page"]
 class WireQuantity:
     """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
 
-    wire: u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
+    wire: u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360; zero: the
+    integer that stands for 0 of the unit.
     """
 
     name: str
@@ -52,6 +53,7 @@ class WireQuantity:
     minimum: int
     maximum: int
     wraps: bool = False
+    zero: int = 0
 
     def __post_init__(self) -> None:
         if self.unit not in UNITS:
@@ -68,19 +70,26 @@ class WireQuantity:
     @property
     def low(self) -> float:
         """Smallest value, in the unit."""
-        return self.minimum / self.per_unit
+        return self.from_wire(self.minimum)
 
     @property
     def high(self) -> float:
         """Largest value, in the unit."""
-        return self.maximum / self.per_unit
+        return self.from_wire(self.maximum)
+
+    @property
+    def scale(self) -> str:
+        """One step for people, and which integer is the lowest value if steps count from there."""
+        step = f"{self.step:.6g} {self.unit}".strip()
+        origin = f"{self.minimum} is {self.low:g} {self.unit}".strip()
+        return f"{step}; {origin}" if self.zero else step
 
     def to_wire(self, value: float) -> int:
         """Encode a value [unit] as an integer, rounded to the nearest step.
 
         Raises CommandError for NaN, infinities and values out of range; nothing is clipped.
         """
-        scaled = value * self.per_unit
+        scaled = value * self.per_unit + self.zero
         if self.minimum <= scaled <= self.maximum:
             return round(scaled)
         if not math.isfinite(value):
@@ -97,11 +106,11 @@ class WireQuantity:
 
     def from_wire(self, integer: int) -> float:
         """Decode an integer to a value [unit]."""
-        return integer / self.per_unit
+        return (integer - self.zero) / self.per_unit
 
     def quantise(self, value: float) -> float:
         """Return the value [unit] that arrives when this one is sent."""
-        return self.to_wire(value) / self.per_unit
+        return self.from_wire(self.to_wire(value))
 
 
 def bits_of(word: int) -> list[int]:
@@ -136,7 +145,11 @@ class Number:
 
     def __post_init__(self) -> None:
         if self.is_added and self.quantity.minimum < 1:
-            raise ValueError(f"{self.name} must begin at 1, since 0 is not stated")
+            raise ValueError(
+                f"{self.name} must begin at 1, since 0 is not stated, got {self.quantity.minimum}; "
+                f"give its quantity the zero {self.quantity.zero + 1 - self.quantity.minimum}, and "
+                "a range from there"
+            )
 
     @property
     def words(self) -> int:
@@ -166,8 +179,10 @@ class Number:
     def in_unit(self, values: Values) -> float | None:
         """Return its value in the unit, an int without one; None where it is not stated."""
         value: int | None = values[self.name]
-        if value is None or not self.quantity.unit:
-            return value
+        if value is None:
+            return None
+        if not self.quantity.unit:
+            return value - self.quantity.zero
         return self.quantity.from_wire(value)
 
 

@@ -93,9 +93,12 @@ FEATURES: Mapping[str, int] = {
 """Bits; output: full level is a linear amplifier's full output, else the stroke of a motion."""
 
 
-def _word(name: str, low: int, high: int, per_unit: int = 1, unit: str = "") -> WireQuantity:
+def _word(
+    name: str, low: int, high: int, per_unit: int = 1, unit: str = "", zero: int = 0
+) -> WireQuantity:
+    low, high = low + zero, high + zero
     wire = "i16" if low < 0 else "u16" if high < 1 << 16 else "u32"
-    return WireQuantity(name, wire, per_unit, unit, low, high, wraps=name == "phase")
+    return WireQuantity(name, wire, per_unit, unit, low, high, name == "phase", zero)
 
 
 _QUANTITIES = (
@@ -147,7 +150,7 @@ def _numbers(*names: str) -> tuple[Number, ...]:
     return tuple(Number(name, QUANTITIES[quantity or name]) for name, _, quantity in split)
 
 
-def _reading(
+def reading(
     name: str,
     meaning: str,
     low: int,
@@ -157,13 +160,14 @@ def _reading(
     *views: View,
     is_added: bool = False,
 ) -> Number:
-    """Return a field of Status that is a reading, which declares its quantity.
+    """Return a field of Status that is a reading, with a quantity of its own.
 
     meaning: what it is of, behind its name. `era amp status`, the API and the metrics have it under
-    its name and unit, with the decimals of a step; views: what else shows it.
+    its name and unit, with the decimals of a step; low, high: in steps; views: what else shows it.
+    A range from 0 or below is sent from 1 on where it is added, since 0 is not stated there.
     """
-    QUANTITIES[name] = _word(name, low, high, per_unit, unit)
-    return Number(name, QUANTITIES[name], is_added, meaning, views)
+    zero = 1 - low if is_added and low < 1 else 0
+    return Number(name, _word(name, low, high, per_unit, unit, zero), is_added, meaning, views)
 
 
 _TONES = Record(*_numbers("frequency", "level", "phase"))
@@ -181,16 +185,17 @@ LAYER = Record(
 _LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
-    _reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
-    _reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
+    reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
+    reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
     *_numbers("token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
-    # Later readings: _reading(..., "status", "page", is_added=True), the views where it is shown.
+    # Later readings: reading(..., "status", "page", is_added=True), the views where it is shown.
 )
 READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.meaning]
 """Fields of Status that are values in a unit for people."""
+QUANTITIES |= {each.name: each.quantity for each in READINGS}
 
 
 _CAPABILITIES = Record(

@@ -39,6 +39,9 @@ struct readings {
     int16_t temperature; // 0.1 °C, of the amplifier
     uint16_t high_voltage; // 1 V, of the supply; 0: not measured
 };
+// Of a value in its unit, as WORD_OF_TEMPERATURE(25) of 25 degrees.
+#define WORD_OF_TEMPERATURE(value) ((value) * 10)
+#define WORD_OF_HIGH_VOLTAGE(value) ((value) * 1)
 
 struct wire_status {
     uint16_t state, fault, flags, latch, watchdog_left, token;

@@ -27,7 +27,12 @@ from model.structure.attachments import (
     coupled_forces,
     footprints_of,
 )
-from model.structure.modal_elasticity import ModalElasticity, check_scales, lowest_elastic
+from model.structure.modal_elasticity import (
+    WITHOUT_PART,
+    ModalElasticity,
+    check_scales,
+    lowest_elastic,
+)
 from model.structure.plate import LOSS_FREQUENCY
 
 LEAST_LOSS = 1e-9
@@ -74,7 +79,7 @@ class ForwardModel:
     def __post_init__(self) -> None:
         """Refuse a plate of which neither responses nor slopes would be right."""
         stds = (self.space.std[self.space.groups[kind]] for kind in ("thickness", "modulus"))
-        check_scales(self.rig.plate, *(1 + std for std in stds))
+        check_scales(self.rig.plate, *(1 + std for std in stds), remedy=WITHOUT_PART)
 
     @cached_property
     def omega(self) -> FloatArray:

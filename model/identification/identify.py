@@ -18,6 +18,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.structure.modal_elasticity import check_measurable
 
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
@@ -59,9 +60,10 @@ class Identification:
 def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identification:
     """Identify a rig by a measurement on it; the same for the same data and seed.
 
-    Raises InputError for a plate that was not linear or has changed during the measurement, for
-    gains that no drive or sensor has (another unit, a wrong sign), and where it leaves unknown what
-    answers depend on, with the tone and the sensor that would show it.
+    Raises InputError for a rig with a part that does not scale, for a plate that was not linear or
+    has changed during the measurement, for gains that no drive or sensor has (another unit, a wrong
+    sign), and where it leaves unknown what answers depend on, with the tone and the sensor that
+    would show it.
     """
     _check(rig, measurement)
     setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
@@ -99,6 +101,7 @@ def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identifica
 
 
 def _check(rig: Rig, measurement: Measurement) -> None:
+    check_measurable(rig.plate)  # what is left uncertain of modes is written as thickness
     names = [era.name for era in rig.eras]
     for sensor in measurement.sensors:
         if sensor.era and sensor.era not in names:

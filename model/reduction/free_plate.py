@@ -137,7 +137,7 @@ class FreePlate:
         stiffness (f, r): of modes [rad²/s²] at omega (f,) at that modulus, losses included;
         loss_factor (f,): of truncated ones. Raises InputError for a plate that does not scale so.
         """
-        check_scales(self.plate, thickness, modulus)
+        check_scales(self.plate, thickness, modulus, remedy="solve that plate")
         square = np.asarray(thickness)[..., None] ** 2
         q = np.asarray((1 + 1j * loss_factor) * modulus * square, dtype=complex)
         return FreeReceptance(

@@ -116,11 +116,21 @@ class ModalElasticity:
         return np.asarray(1j * self.losses + self.dispersion.at(omega))
 
 
-def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
+WITHOUT_PART = (
+    "measuring finds them anew; leave it out of the rig file, and let era rig identify find the "
+    "plate that has it"
+)
+"""Remedy of what varies thickness and modulus whatever the rig says of them."""
+
+
+def check_scales(
+    plate: Plate, *factors: FloatArray | float, remedy: str = "set uncertainty.thickness to 0"
+) -> None:
     """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
 
     What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
-    whose mass or stiffness does not go with them (`model.structure.plate.SCALED`).
+    whose mass or stiffness does not go with them (`model.structure.plate.SCALED`). remedy: the end
+    of the message.
     """
     stays = [
         each.name
@@ -130,9 +140,13 @@ def check_scales(plate: Plate, *factors: FloatArray | float) -> None:
     if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(
             f"plate.{stays[0]}: thickness and modulus must be those that were solved, since this "
-            "part does not scale with them; set uncertainty.thickness to 0; what varies them all "
-            "the same (era rig check, era calibrate, a daemon that learns) needs a rig without it"
+            f"part does not scale with them; {remedy}"
         )
+
+
+def check_measurable(plate: Plate) -> None:
+    """Raise InputError for a plate with a part that stays: no measurement finds such a plate."""
+    check_scales(plate, np.inf, remedy=WITHOUT_PART)
 
 
 def modal_receptance(

@@ -53,7 +53,7 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
             "a table can follow one factor on all moduli and one on all thicknesses; but for that "
             f"{'; '.join(different)}; build it again"
         )
-    check_scales(before, thicker, stiffer)
+    check_scales(before, thicker, stiffer, remedy="build the table again")
     faster = thicker * np.sqrt(stiffer)
     max_scale = _MAX_SCALE if before.air_gap is None else _MAX_SCALE_ON_AIR
     if max(abs(thicker - 1), abs(faster - 1)) > max_scale:

@@ -5,6 +5,7 @@ import pytest
 import hand_written as hand
 from amplifier_eds import eds_text
 from drivers.by_hand.reaching import status_rows
+from drivers.errors import CommandError
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from drivers.protocol.table import MESSAGES, QUANTITIES, STATUS
@@ -34,13 +35,15 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
     status = await end.hosts["a"].read_status()
     assert end.levels("a") == [0.5, 0.0]
     assert {each: status[each] for each in status if each not in _FIRST} == STATED[age]
-    shown = {"older": None, "same": 24.0, "newer": "no key"}[age]
+    shown = {"older": None, "same": 0.0, "newer": "no key"}[age]
     assert status_rows(status).get("later_voltage_v", "no key") == shown
     assert (await group.stop())["a"].is_confirmed
 
 
 _FIRST = frozenset(STATUS.names)
-_OLDER = 9 + 4 + 8 + sum(each.words for each in STATUS.added)
+_UNSTATED = [0] * sum(each.words for each in STATUS.added)
+"""What the table has added, of an amplifier that states only what is later than the table."""
+_OLDER = 9 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
 _CHECKS = ("capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths")
 
@@ -55,7 +58,7 @@ def test_conformance_takes_another_edition(kind: str, age: str) -> None:
 def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A conversation written by hand breaks no rule, with a word more of the amplifier or not."""
     status = hand.status
-    words = {"older": [], "same": [WORD], "newer": [WORD]}[age]
+    words = [] if age == "older" else [*_UNSTATED, WORD]
     monkeypatch.setattr(hand, "status", lambda *given, **more: [*status(*given, **more), *words])
     assert Talk().armed().fed(2).playing().says(**HALF).found == []
 
@@ -64,7 +67,9 @@ def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
     """Those of 4 channels and 8 layers, and the one that is added under the next subindex."""
     objects = ObjectServer(Amplifier("a", channels=4), 1)
     if age == "older":
-        assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER])
+        assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER]), (
+            "each row of READINGS has its value in sim/amplifier/readings.py"
+        )
         with pytest.raises(SdoAbort):
             objects.read(0x2002, _OLDER + 1, 0.0)
     else:
@@ -77,7 +82,21 @@ def test_pages_and_files_have_what_is_added(age: str) -> None:
     """At the end of its row, of the sheet, and of what the firmware sends."""
     assert " · later_voltage (added) |" in records()
     assert f"[2002sub{_OLDER + 1:X}]\nParameterName=later_voltage\n" in eds_text()
-    assert "from->later_voltage);\n}" in records_header().partition("put_status(")[2]
+    readings, _, put = records_header().partition("put_status(")
+    assert "readings.later_voltage);\n}" in put
+    assert "uint16_t later_voltage; // 0.01 V; 1 is -12 V, " in readings
+    assert "#define WORD_OF_LATER_VOLTAGE(value) ((value) * 100 + 1201)\n" in readings
+
+
+@pytest.mark.parametrize(
+    ("word", "volts"), [(0, None), (1, -12.0), (1201, 0.0), (1202, 0.01), (7201, 60.0)]
+)
+def test_reading_that_is_added_may_be_zero_or_less(word: int, volts: float | None) -> None:
+    """Steps count from the lowest value, which is 1; both ends agree."""
+    assert LATER.in_unit(Record(LATER).unpack([word], is_strict=True)) == volts
+    assert volts is None or LATER.quantity.to_wire(volts) == word
+    with pytest.raises(CommandError, match="-12 to 60 V"):
+        LATER.quantity.to_wire(-12.01)
 
 
 def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
@@ -97,7 +116,7 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
         assert record.pack(values) == [*words[:4]]
     with pytest.raises(Refusal):
         record.unpack([7, 0x8001, 0], is_strict=False)
-    with pytest.raises(ValueError, match="begin at 1"):
+    with pytest.raises(ValueError, match=r"begin at 1.*got 0.*the zero 1,"):
         Number("flags", QUANTITIES["flags"], is_added=True)
 
 

@@ -20,6 +20,7 @@ from model.calibration.responses_file import write_responses_csv, write_response
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.structure.plate import SCALED
 from rig_files import write_rig
 from rig_on_wire import WIRES, far_side
 from sim.amplifier.contract import Amplifier
@@ -203,6 +204,18 @@ def test_plate_that_is_not_explained_is_refused_and_nothing_written(
     assert result.exit_code == 1
     assert (told["explained"], told["expected_contrast"], told["files"]) == (False, [], [])
     assert new.read_text() == before
+
+
+@pytest.mark.parametrize("command", [["check"], ["identify", "-o", "rig2.yaml"]])
+def test_plate_with_a_part_that_does_not_scale_is_refused_before_it_is_measured(
+    tmp_path: Path, typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    """Before a port is opened, where none is; also of a known thickness, which would not help."""
+    monkeypatch.delitem(SCALED, "loss_exponent")
+    known = "uncertainty: {thickness: 0}\nplate:\n  loss_exponent: 0.2\n"
+    write_rig(tmp_path / "rig.yaml", ("plate:\n", known), mesh="auto")
+    with pytest.raises(InputError, match=r"^plate\.loss_exponent: (?!.*set unc).*era rig identify"):
+        typed(*command, "--url", "serial:///dev/none", "--yes", on=plate)
 
 
 @pytest.mark.parametrize("ending", ["csv", "uff"])

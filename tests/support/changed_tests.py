@@ -3,8 +3,9 @@
     python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
 A test is near what has changed by its folder, then by the number of imports between both. A file
-that is no module has the tests that name it and those of its folder. What is not reached and what
-the minute has no time for is printed. pytest loads this file as a plug-in, too.
+that is no module has the tests that name it and those of its folder. What only `pyproject.toml` or
+an example leads to comes last. What is not reached and what the minute has no time for is printed;
+exit status 3 where no test had time. pytest loads this file as a plug-in, too.
 """
 
 import argparse
@@ -68,6 +69,10 @@ _MAX_FILES = 60  # collecting more leaves no time to run them
 _SECONDS = 45.0  # for tests, of a minute
 _UNTIL = "ERA_TESTS_UNTIL"
 _NO_TIME = "without time"
+_NOTHING_RAN = 3
+_MODULES = (".py", ".pyi")
+_LAST = ("pyproject.toml", "examples/")
+"""What many tests name or import that its change does not concern."""
 
 
 def table() -> str:
@@ -110,15 +115,35 @@ def _git(*arguments: str) -> str:
 def nearest(changed: Sequence[str]) -> dict[str, int]:
     """The files of tests that changed files reach, by path: 0 in their folder, then by imports.
 
-    Of a file that is no module those are 0 that name it, then come those of its folder. Of as many
-    imports those of a near folder come first, and those that take long last; before all of them
-    come tests that are changed themselves.
+    Of a file that is no module those are 0 that name it, then come those of its folder. The order:
+    tests that are changed themselves; those of the folders of changed modules; the nearest by
+    imports, of as many those of a near folder first, and those that take long last; what is reached
+    from _LAST alone.
     """
+    last = [path for path in changed if path.startswith(_LAST)]
+    near = _reached([path for path in changed if path not in last])
+    distances = _reached(last) | near
+    modules = [each for each in {*changed} - {*last, *_tests()} if each.endswith(_MODULES)]
+    beside = {test for path in modules for test in _tests_beside(path)}
+
+    def place(test: str) -> tuple[bool, bool, bool, int, int, bool, str]:
+        common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
+        shared = max(len(Path(each).parts) for each in common)
+        return (
+            *(test not in changed, test not in near, test not in beside, distances[test]),
+            *(-shared, Path(test).name in SLOWEST, test),
+        )
+
+    order = sorted((path for path in _tests() if path in distances), key=place)
+    return {path: distances[path] for path in order}
+
+
+def _reached(changed: Sequence[str]) -> dict[str, int]:
+    """The least distance of each module and test from changed files."""
     start: dict[str, int] = {}
     for path in changed:
-        is_module = path.endswith((".py", ".pyi"))
-        first, second = [_node(path)], [*_tests_beside(path)]
-        if is_module:
+        first, second = [_node(path)], [] if path in _tests() else [*_tests_beside(path)]
+        if path.endswith(_MODULES):
             first, second = [*first, *second], []
         else:
             package = str(Path(path).parent).replace("/", ".")
@@ -126,16 +151,7 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
             first += _tests_that_name(Path(path).name)
         start = dict.fromkeys(second, 1) | start | dict.fromkeys(first, 0)
     distances = _distances(start)
-    if "conftest" in start:
-        distances = dict.fromkeys(_tests(), 1) | distances
-
-    def place(test: str) -> tuple[bool, int, int, bool, str]:
-        common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
-        shared = max(len(Path(each).parts) for each in common)
-        return test not in changed, distances[test], -shared, Path(test).name in SLOWEST, test
-
-    order = sorted((path for path in _tests() if path in distances), key=place)
-    return {path: distances[path] for path in order}
+    return dict.fromkeys(_tests(), 1) | distances if "conftest" in start else distances
 
 
 @cache
@@ -168,7 +184,7 @@ def _tests_that_name(file: str) -> Iterator[str]:
 def _distances(start: Mapping[str, int]) -> dict[str, int]:
     """The least number of imports from each module or test to one of the first."""
     importers = _importers()
-    distances, found = dict(start), [*start]
+    distances, found = dict(start), sorted(start, key=lambda each: start[each])
     for node in found:
         for importer in sorted(importers.get(node, ())):
             if importer not in distances:
@@ -231,8 +247,16 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.line(" ".join(dict.fromkeys(late)))
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where no test had time, which a worker of xdist does not know."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    ran = {"passed", "failed", "error", "xfailed"}
+    if reporter and _NO_TIME in reporter.stats and not reporter.stats.keys() & ran:
+        session.exitstatus = _NOTHING_RAN
+
+
 def _run(files: Sequence[str], *, until: float) -> int:
-    """Run tests until a time; return pytest's status."""
+    """Run tests until a time; return pytest's status, or that of no test that had time."""
     options = ["-p", "changed_tests", "-q", "-r", "fE", "-m", "not long and not alone"]
     spread = ["--numprocesses", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     environment = os.environ | {"PYTHONPATH": "tests/support", _UNTIL: str(until)}
@@ -264,6 +288,12 @@ def main() -> int:
         f"{len(_tests()) - len(reached)} that none do, and all that is long or loads the machine.\n"
         f"Next: {', '.join([*also(changed), 'make test'])}\n"
     )
+    if status == _NOTHING_RAN:
+        sys.stdout.write(
+            f"No test had time within {options.seconds:g} s: nothing is tested. Run them without "
+            f"other load, or with more time: python {Path(__file__).relative_to(ROOT)} --seconds "
+            f"{4 * options.seconds:g}\n"
+        )
     return 0 if status == pytest.ExitCode.NO_TESTS_COLLECTED else status
 
 

@@ -1,31 +1,32 @@
-"""Status with one word more than the table has: what a later edition of the protocol adds."""
+"""Status with one word more than the table has: what a later edition of the protocol adds.
+
+It is a reading that may be 0 or less, -12 to 60 V in steps of 10 mV: 1 on the wire is -12 V.
+"""
 
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from drivers.protocol.records import Number, Record, Values, WireQuantity
-from drivers.protocol.table import STATUS
+from drivers.protocol.records import Record, Values
+from drivers.protocol.table import STATUS, reading
 from drivers.wires.wire import reply_words
 from sim.amplifier.contract import Amplifier
 
-LATER = Number(
-    "later_voltage", WireQuantity("later_voltage", "u16", 100, "V", 1, 65535), is_added=True
-)
-WORD = 2400
-"""That it states: 24 V."""
+LATER = reading("later_voltage", "of another supply", -1200, 6000, 100, "V", is_added=True)
+WORD = 1201
+"""That it states: 0 V."""
 AGES = ("older", "same", "newer")
 """Of an amplifier beside its host, its judge or the witness."""
 
 
 def make_of_age(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make simulated amplifiers an edition older or newer than who reads them, or the same."""
+    later = Record(*STATUS.fields, LATER)
     if age == "newer":
-        pack = STATUS.pack
-        monkeypatch.setattr(STATUS, "pack", lambda values: [*pack(values), WORD])
+        monkeypatch.setattr(STATUS, "pack", lambda values: later.pack(values | {LATER.name: WORD}))
         return
-    for name, value in vars(Record(*STATUS.fields, LATER)).items():
+    for name, value in vars(later).items():
         monkeypatch.setattr(STATUS, name, value)
     status = Amplifier.status
     if age == "same":

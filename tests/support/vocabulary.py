@@ -158,4 +158,4 @@ def _words(plain: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.writelines(f"{line}\n" for line in retired_identifiers())
+    sys.exit("\n".join(retired_identifiers()) or None)

@@ -13,7 +13,10 @@ void board_high_voltage(bool on)
 
 struct readings board_readings(void)
 {
-    return (struct readings){.temperature = 250, .high_voltage = is_high_voltage ? 1800 : 0};
+    return (struct readings){
+        .temperature = WORD_OF_TEMPERATURE(25),
+        .high_voltage = is_high_voltage ? WORD_OF_HIGH_VOLTAGE(1800) : 0,
+    };
 }
 
 enum fault board_fault(uint8_t *channel)

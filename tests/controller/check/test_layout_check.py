@@ -21,6 +21,7 @@ from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.dial import Dial
 from controller.effects.effect import Effect
+from controller.effects.kinds import BUILT_IN
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_file import load_layout
 from controller.effects.ramp import Ramp
@@ -129,17 +130,18 @@ def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
         assert layout.band_problems(table().frequencies) == [f"button: {problem}"]
 
 
-@pytest.mark.parametrize(
-    ("effect", "level", "duration"),
-    [
-        (Click(), 20.0, 0.040),
-        (Buzz(), 20.0, None),
-        (Ramp(start_level=6.0), 20.0, 1.0),
-        (Texture(fast=0.5), 20.0, None),
-        (Detents(spacing=0.05), 20.0, 0.030),
-        (Dial(), 20.0, 0.030),
-    ],
-)
+STRONGEST: list[tuple[Effect, float, float | None]] = [
+    (Click(), 20.0, 0.040),
+    (Buzz(), 20.0, None),
+    (Ramp(start_level=6.0), 20.0, 1.0),
+    (Texture(fast=0.5), 20.0, None),
+    (Detents(spacing=0.05), 20.0, 0.030),
+    (Dial(), 20.0, 0.030),
+]
+"""An effect of each kind, its level and the duration of its pulses."""
+
+
+@pytest.mark.parametrize(("effect", "level", "duration"), STRONGEST)
 def test_strongest_target_of_every_kind(
     effect: Effect, level: float, duration: float | None
 ) -> None:
@@ -258,6 +260,14 @@ CASES = {
     "detents": Case(Detents(), 0.030, way=step, held=0.2),
     "dial": Case(Dial(), 0.030, way=step, held=0.2),
 }
+
+
+def test_every_kind_has_its_rows() -> None:
+    """In both lists of this file; a texture is felt where a finger moves, not where it stops."""
+    assert {type(effect) for effect, *_ in STRONGEST} == {*BUILT_IN}, "a row in STRONGEST each"
+    assert {type(case.effect) for case in CASES.values()} | {Texture} == {*BUILT_IN}, (
+        "a row in CASES each, but for kinds that only a moving finger feels"
+    )
 
 
 @cache

@@ -86,26 +86,26 @@ def test_scaling_is_wrong_with_a_frame_alone(
 
 def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
     """Tables of an uncertain thickness, those that follow another, identification, calibration."""
-    with pytest.raises(InputError, match=r"plate\.frame_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*set uncertainty"):
         TableProblem(rig, FREQUENCIES, Grid(2, 2))
     known = replace(rig, uncertainty=Uncertainty.none())
     table = build_table(known, frequencies=FREQUENCIES[:2])
     assert table_following(table, known).plate == known.plate
-    with pytest.raises(InputError, match=r"plate\.frame_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*set uncertainty"):
         _ = replace(table, uncertainty=rig.uncertainty).attached
     for other in (
         rig.plate.scaled(thickness=1.001),
         rig.plate.scaled(modulus=1.001),
         replace(rig.plate, frame_mass=2 * FRAME),
     ):
-        with pytest.raises(InputError, match=r"plate\.frame_mass"):
+        with pytest.raises(InputError, match=r"plate\.frame_mass.*build"):
             table_following(table, replace(known, plate=other))
     free = solve_free_plate(rig.plate, rig.mesh)
     sensors = [Sensor("SW", era="SW")]
     space = space_of(rig, ["SW"], rig.uncertainty)
-    with pytest.raises(InputError, match=r"plate\.frame_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
         ForwardModel(rig, sensors, FREQUENCIES, space, free)
-    with pytest.raises(InputError, match=r"plate\.frame_mass"):
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
         sensed_plate(known, POINTS, FREQUENCIES)
     assert ForwardModel(
         known, sensors, FREQUENCIES, space_of(known, ["SW"], known.uncertainty), free

@@ -81,7 +81,7 @@ def felt_contrast(rig: Rig, promise: Promise) -> float:
     points = np.array([PLACES[name] for name in promise.sensors])
     respond = direct_responder(rig.plate, rig.mesh)
     frequencies, found = tone_amplitudes(
-        promise.pattern.excitation, rig.eras, lambda f: respond(rig.eras, f, points)
+        promise.layer.excitation, rig.eras, lambda f: respond(rig.eras, f, points)
     )
     felt = np.linalg.norm(found / detection_threshold(frequencies)[:, None], axis=0)
     return float(20 * np.log10(felt[0] / felt[1:].max()))
@@ -122,7 +122,7 @@ def test_promises_of_a_known_plate_are_the_direct_solution(
         assert min(promise.contrast_db, 25.0) == pytest.approx(exact, abs=0.5)
         assert min(promise.median_db, 25.0) == pytest.approx(exact, abs=0.5)
         strokes = {era.name: era.stroke for era in rig.eras}
-        tones = promise.pattern.excitation.items()
+        tones = promise.layer.excitation.items()
         assert max(t.amplitude / strokes[n] for n, t in tones) == pytest.approx(LEVEL)
 
 

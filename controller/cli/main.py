@@ -248,7 +248,7 @@ def _report_usage(error: typer.TyperException) -> int:
         typer.echo(message, err=True)
     else:
         stop = "" if message.endswith((".", "?")) else "."
-        _print_error(f"error: {message}{stop} See  {context.command_path} --help")
+        _print_error(f"error: {message}{stop} See {context.command_path} --help")
     return BAD_INPUT
 
 

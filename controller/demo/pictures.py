@@ -73,7 +73,8 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
     """Draw a panel per touch: level over the plate, fingers and driven ERAs."""
     columns = min(3, len(rows))
     lines = -(-len(rows) // columns)
-    figure = Figure(figsize=(4.4 * columns + 0.8, 4.1 * lines), layout="constrained")
+    height = 4.4 * table.plate.width / table.plate.length + 0.8
+    figure = Figure(figsize=(4.4 * columns + 0.8, height * lines), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in panels:
         axes.set_axis_off()

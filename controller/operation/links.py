@@ -264,7 +264,8 @@ class Supervisor(Operator):
         if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.members.lost_by:
             return  # of one that is lost the next heartbeat says so
         change: LinkChange = "restored"
-        level, remedy = logging.INFO, "era disarm, or era stop"
+        remedy: str | None
+        level, remedy = logging.INFO, None
         cause = "all amplifiers reply again and play what they should"
         if degraded:
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from controller.play.intent import IntentSource
-from controller.play.layers import RELEASE_RAMP, Sets
+from controller.play.layers import RELEASE_RAMP
 from controller.play.observer import Observer, play_report, silence_report
 from controller.play.planner import Plan, Planner
 from controller.sources.contacts import Change, ContactTracker
@@ -138,10 +138,10 @@ class Cycle:
             plan = planner.only_ends(plan)
         self._plan = plan
         try:
-            outcome = await self._play(planner, plan.sets)
+            outcome = await self._play(planner, plan)
             if isinstance(outcome, CommandRefused):
                 plan = planner.refused(plan, outcome, now=clock.now())
-                outcome = await self._play(planner, plan.sets)
+                outcome = await self._play(planner, plan)
         finally:
             self._plan = None
         if reason := plan.sets.reason:
@@ -150,13 +150,13 @@ class Cycle:
             sent_at = outcome if isinstance(outcome, float) else None
             self._report_playing(planner, plan, sent_at=sent_at)
 
-    async def _play(self, planner: Planner, sets: Sets) -> float | CommandRefused | None:
-        """Play sets on all amplifiers, from one moment on; returns when [s] the last byte was sent.
+    async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
+        """Play the sets of a plan on all amplifiers, from one moment on.
 
-        None where nothing is to be sent, or why they were refused. Whatever is raised instead
-        leaves it unknown what plays.
+        Returns when [s] the last byte was sent, None where nothing is to be sent, or why they were
+        refused. Whatever is raised instead leaves it unknown what plays.
         """
-        if not sets:
+        if not (sets := plan.sets):
             return None
         try:
             if sets.silence is not None:
@@ -170,7 +170,7 @@ class Cycle:
             is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
                 return error
-            planner.forget()
+            planner.not_played(plan)
             raise
         planner.confirm(sets, played, now=clock.now())
         return played.sent_at

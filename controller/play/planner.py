@@ -5,7 +5,7 @@ plan(now):  fingers -> intent -> contents -> the layers that change, on every am
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.play.capabilities import PlaybackCapabilities
@@ -41,18 +41,28 @@ _logger = logging.getLogger(__name__)
 class Plan:
     """What is felt by contacts from a moment on, and the sets for it; none where nothing changes.
 
-    from_rest: whether nothing has played for 0.4 s, so that the plate is at rest. since [s]: when
-    the first finger changed that this answers; is_touch: whether one of these came, moved or
-    pressed, instead of lifts alone or none. is_reported: not, where what is felt stays as it is.
+    from_rest: whether nothing has played for 0.4 s, so that the plate is at rest. made_at [s];
+    answered: when [s] the fingers changed that this answers, None: the first that lifted.
+    is_reported: not, where what is felt stays as it is.
     """
 
     contacts: tuple[Contact, ...]
     selection: Selection
     from_rest: bool
-    since: float
-    is_touch: bool = False
+    made_at: float
+    answered: Mapping[ContactKey | None, float]
     sets: Sets = field(default_factory=Sets)
     is_reported: bool = True
+
+    @property
+    def since(self) -> float:
+        """When [s] the first finger changed that this answers; when it was made, if none did."""
+        return min([self.made_at, *self.answered.values()])
+
+    @property
+    def is_touch(self) -> bool:
+        """Whether one of these fingers came, moved or pressed, instead of lifts alone or none."""
+        return len(self.answered) > (None in self.answered)
 
 
 class Planner:
@@ -151,13 +161,19 @@ class Planner:
         self._plan, self._retry_at = None, math.inf
         self.layers.forget()
 
+    def not_played(self, plan: Plan) -> None:
+        """Forget what plays, since a plan has not been played: its fingers wait for the next."""
+        self.forget()
+        if plan.is_reported:
+            self._tracker.wait_again(plan.answered)
+
     def only_ends(self, plan: Plan) -> Plan:
         """Return a plan without what it starts, which is planned again later, or prolongs."""
         if not plan.is_reported:
             return replace(plan, sets=Sets())
         if not plan.sets.started:
             return plan
-        self.forget()
+        self.not_played(plan)
         layers, started = plan.sets.layers, plan.sets.started
         ends = {number: each for number, each in layers.items() if number not in started}
         return replace(plan, sets=Sets(ends), is_reported=False)
@@ -210,7 +226,7 @@ class Planner:
             self._intent_due = intent.due(now)
             selected = self._selector.select(contacts, intent, self.capabilities, now=now)
             if before is not None and selected == self._selected and now < self._retry_at:
-                self._answered((), now)
+                self._answered(())
                 return None
             selection, sets = self._playable(selected), Sets()
             if is_felt := len(selection.contents) > 0:
@@ -230,8 +246,8 @@ class Planner:
             sets = self._end(contacts, now, has_failed=has_failed)
         for pulse in self._pulses(sets.started):
             self._awaited[id(pulse)] = pulse
-        since, is_touch = self._answered(sets.started, now)
-        self._plan = plan = Plan(contacts, selection, from_rest, since, is_touch, sets)
+        answered = self._answered(sets.started)
+        self._plan = plan = Plan(contacts, selection, from_rest, now, answered, sets)
         if sets or not (is_felt or is_awaited):
             return plan
         return None if is_awaited or _why_not(plan) == _why_not(before) else plan  # else: only said
@@ -243,7 +259,7 @@ class Planner:
         """
         if contents := self.layers.ended(now):
             selection = plan.selection.without(contents, ENDED)
-            self._plan = replace(plan, selection=selection, sets=Sets(), since=now)
+            self._plan = replace(plan, selection=selection, sets=Sets(), made_at=now, answered={})
             return self._plan
         renewal = self.layers.renewal(now)
         return replace(plan, sets=renewal, is_reported=False) if renewal else None
@@ -272,8 +288,8 @@ class Planner:
             return self.layers.silence(FADE_RAMP, now)
         return self.layers.plan((), now)
 
-    def _answered(self, started: Collection[int], now: float) -> tuple[float, bool]:
-        """Return since when [s] fingers have changed that are answered, and whether any but lifted.
+    def _answered(self, started: Collection[int]) -> dict[ContactKey | None, float]:
+        """Return when [s] the fingers changed that are answered, None: the first that lifted.
 
         While contents are being chosen these are those that have lifted or feel a pulse that
         starts, and with something that lasts those that the choice before was for.
@@ -298,8 +314,7 @@ class Planner:
                 self._waiting = waiting if lasts else {**waiting, **self._waiting}
                 changed.clear()
         self._requested = requests
-        is_touch = len(answered) > (None in answered)
-        return min([now, *answered.values()]), is_touch
+        return answered
 
     def _pulses(self, numbers: Iterable[int]) -> list[Pulse]:
         """Return the pulses that play in layers."""

@@ -1,7 +1,7 @@
 """The contacts on the plate, from any sequence of touch frames."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -182,6 +182,12 @@ class ContactTracker:
         self._note_lifts(up, now)
         self._note_next()
         return Change(up=up) if up else _UNCHANGED
+
+    def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
+        """Note contacts as changed since times [s], whose answer has not been played after all."""
+        for key, at in answered.items():
+            waiting = key if key in self._contacts else None  # it has lifted meanwhile
+            self.changed[waiting] = min(at, self.changed.get(waiting, at))
 
     def _contact(
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float

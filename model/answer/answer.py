@@ -127,6 +127,10 @@ class Answer:
     thresholds: Float32Array
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
 
+    def __repr__(self) -> str:
+        """What each finger gets, without the numbers that it follows from."""
+        return f"Answer(fingers={self.fingers}, applied={self.applied})"
+
     @cached_property
     def fingers(self) -> tuple[Sensation, ...]:
         """What each finger gets, in the order in which they were given."""

@@ -152,7 +152,7 @@ def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
     rows = [("residual after the end", found["residual_db"], "dB nominal")]
     if (awareness := found["is_imperceptible_to_quiet"]) is not None:
         rows.append(("contrast in the first 100 ms", found["transient_contrast_db"], "dB nominal"))
-        yield f"quiet fingers: {'not felt' if awareness else 'may be felt'}"
+        yield f"quiet fingers: {'feel nothing' if awareness else 'may feel it'}"
     else:
         rows += [
             (

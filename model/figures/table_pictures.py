@@ -200,6 +200,7 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
                 textcoords="offset points",
                 ha="left" if era.x < table.plate.length / 2 else "right",
                 fontsize=9,
+                path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.75)],
             )
     if len(frequencies) == 1:
         axes.text(

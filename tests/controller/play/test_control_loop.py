@@ -86,3 +86,18 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
         assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]
         assert len(chain.far_end.requests("Ping")) > 3
     assert "no disk space for this row" in caplog.text
+
+
+@in_virtual_time
+async def test_latency_counts_from_the_touch_though_its_first_set_is_lost() -> None:
+    """No reply for 80 ms from the moment that a finger comes down: a touch, not quicker than so."""
+    async with set_running() as chain:
+        chain.far_end.fault("drop", toward="host")
+        begin = now()
+        await chain.leave(0.08, FINGER)
+        chain.far_end.recover()
+        await chain.leave(0.2, FINGER)
+        applied = chain.applied[0]
+        assert applied.is_touch
+        assert applied.latency == pytest.approx(applied.time - begin)
+        assert applied.latency >= 0.08

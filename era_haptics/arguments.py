@@ -68,5 +68,5 @@ def _numbers(given: Any) -> FloatArray:
     """Numbers as an array; of three dimensions, which no argument has, for anything else."""
     try:
         return np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.full((1, 1, 1), np.nan)

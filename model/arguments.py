@@ -22,8 +22,8 @@ MAX_VALUE = 1e18
 
 
 def expect_number(value: object, *, what: str, unit: str) -> None:
-    """Raise InputError for anything but a real number."""
-    if not isinstance(value, Real):
+    """Raise InputError for anything but a real number that a float holds."""
+    if (isinstance(value, int) and abs(value) > MAX_VALUE) or not isinstance(value, Real):
         raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
 
 

@@ -217,7 +217,7 @@ class Planner:
                     self._too_late(1)
         before, contacts = self._plan, self._tracker.contacts
         if not self._tracker.changed and before is not None and now < self.due:
-            return self._go_on(before, now) if now >= self.layers.due else None
+            return self._go_on(before, now)
         self._seen = contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
@@ -227,7 +227,7 @@ class Planner:
             selected = self._selector.select(contacts, intent, self.capabilities, now=now)
             if before is not None and selected == self._selected and now < self._retry_at:
                 self._answered(())
-                return None
+                return self._go_on(before, now)
             selection, sets = self._playable(selected), Sets()
             if is_felt := len(selection.contents) > 0:
                 sets = self.layers.plan(selection.contents, now)
@@ -250,13 +250,16 @@ class Planner:
         self._plan = plan = Plan(contacts, selection, from_rest, now, answered, sets)
         if sets or not (is_felt or is_awaited):
             return plan
-        return None if is_awaited or _why_not(plan) == _why_not(before) else plan  # else: only said
+        is_said = is_awaited or _why_not(plan) == _why_not(before)
+        return self._go_on(plan, now) if is_said else plan
 
     def _go_on(self, plan: Plan, now: float) -> Plan | None:
         """Plan what is due where nothing changes: what has ended by itself, or is to be prolonged.
 
-        With silence if nothing plays on.
+        With silence if nothing plays on. However often fingers change, as they do while one moves.
         """
+        if now < self.layers.due:
+            return None
         if contents := self.layers.ended(now):
             selection = plan.selection.without(contents, ENDED)
             self._plan = replace(plan, selection=selection, sets=Sets(), made_at=now, answered={})

@@ -21,6 +21,13 @@ from model.structure.plate import Plate
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
 """Below the smallest amplitude of a channel, and above what a plate survives."""
 
+MIN_DURATION, MAX_DURATION = 0.001, 1e6
+"""Durations of a stimulus that has an end [s]: no time step of a plate is nearly as long or short.
+"""
+
+MAX_PRIORITY = (1 << 31) - 1
+"""Highest priority of a finger, and the lowest with a minus."""
+
 SHAPED_FROM = 0.2
 """Shortest duration [s] of a stimulus with a shaped onset, which settles in half of it."""
 
@@ -76,10 +83,15 @@ class Stimulus:
             )
         if not (self.name is None or isinstance(self.name, str)):
             raise InputError(f"name of a stimulus must be text, got {shown(self.name)}")
+        if not isinstance(self.is_limit, bool):
+            raise InputError(f"is_limit must be True or False, got {shown(self.is_limit)}")
         if self.duration is not None:
             expect_number(self.duration, what="duration", unit="seconds")
-            if not 0 < self.duration < math.inf:
-                raise InputError(f"duration must be above 0 s and finite, got {self.duration:g}")
+            if not MIN_DURATION <= self.duration <= MAX_DURATION:  # False for NaN
+                raise InputError(
+                    f"duration must be from {MIN_DURATION:g} to {MAX_DURATION:g} s, got "
+                    f"{self.duration:g}; leave it out of a stimulus that lasts"
+                )
         if self.modulation_hz is not None:
             expect_number(self.modulation_hz, what="modulation_hz", unit="Hz")
             if not MIN_MODULATION <= self.modulation_hz <= MAX_MODULATION:
@@ -131,8 +143,15 @@ class Finger:
                 f"stimulus must be one such as era.Stimulus(20), got {shown(self.stimulus)}"
             )
         if isinstance(self.priority, bool) or not isinstance(self.priority, int):
-            raise InputError(f"priority must be a whole number, got {self.priority!r}")
-        if self.sharing not in SHARING:
+            raise InputError(f"priority must be a whole number, got {shown(self.priority)}")
+        if abs(self.priority) > MAX_PRIORITY:
+            raise InputError(
+                f"priority must be from {-MAX_PRIORITY} to {MAX_PRIORITY}, got "
+                f"{shown(self.priority)}"
+            )
+        if not isinstance(self.is_protected, bool):
+            raise InputError(f"is_protected must be True or False, got {shown(self.is_protected)}")
+        if str(self.sharing) not in SHARING:  # an array has no truth
             raise InputError(
                 f"sharing must be one of {', '.join(SHARING)}, got {shown(self.sharing)}"
             )

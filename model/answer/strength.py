@@ -45,20 +45,27 @@ NO_LIMITS = Limits()
 def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """Return an answer whose stimuli that are limits are as strong as the others allow.
 
-    These have IMPERCEPTIBLE_DB_SL of all of them together at most, on nine of ten plates.
+    Quiet fingers have IMPERCEPTIBLE_DB_SL of all of them together at most, on nine of ten plates.
+    For those that feel a vibration of their own none is raised above that, nor lowered.
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
     if not limited:
         return found
+    heard = tones.foreign_db_sl
+    if len(limited) < len(streams):  # of these alone
+        alone = np.full(len(streams), _SILENT_DB)
+        alone[limited] = 0.0
+        heard = with_gains(table, found, alone).tones.foreign_db_sl
     gains_db = np.zeros(len(streams))
     for number in limited:
         stream = streams[number]
         level = min(tones.level_db_sl[finger][0] for finger in stream.targets)
-        others = [tones.foreign_db_sl[finger] for finger in found.contents.others(number)]
-        room = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
-        heard = room - max(others, default=-math.inf)
-        gains_db[number] = min((stream.limit_db_sl or 0.0) - level, heard)
+        highest = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
+        quiet, others = found.contents.quiet, found.contents.others(number)
+        allowed = highest - max([heard[finger] for finger in quiet], default=-math.inf)
+        raised = highest - max([heard[finger] for finger in others], default=-math.inf)
+        gains_db[number] = min((stream.limit_db_sl or 0.0) - level, allowed, max(raised, 0.0))
     return with_gains(table, found, gains_db)
 
 
@@ -113,7 +120,10 @@ def gains_within(found: Answer, limits: Limits, strokes: Mapping[str, float]) ->
 
 
 def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> Answer:
-    """Return an answer whose short stimuli are raised along ramps that the slew allows."""
+    """Return an answer whose short stimuli are raised along ramps that the slew allows.
+
+    None is raised where one is as strong as the others allow, which they feel as long.
+    """
     contents, tones, strokes = found.contents, found.tones, table.strokes
     if not any(contents.durations):
         return found
@@ -122,4 +132,6 @@ def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> A
         return found
     longer = replace(found, contents=replace(contents, least_ramp=ramp))
     rows, owners = np.array(tones.rows, dtype=int), np.array(tones.owners, dtype=int)
-    return with_tones(table, longer, rows, tones.weights, owners, None)
+    is_free = all(stream.limit_db_sl is None for stream in contents.streams)
+    gains = None if is_free else np.array(tones.gains)
+    return with_tones(table, longer, rows, tones.weights, owners, gains)

@@ -293,6 +293,26 @@ async def test_renewal_keeps_to_a_rate_limit_of_one_set_a_second() -> None:
         assert chain.refused == []
 
 
+@in_virtual_time
+async def test_vibration_of_a_finger_that_moves_whenever_the_loop_turns_is_renewed() -> None:
+    """By half a millimetre, which changes nothing else: there is no gap."""
+    async with set_running() as chain:
+        number, x, y = FINGER
+        step, chain.at = chain.controller.step, {number: (x, y)}
+
+        async def turn() -> None:
+            await asyncio.sleep(0.002)
+            chain.put((number, x + 0.0005 * (chain.at[number][0] == x), y))
+            await step()
+
+        chain.controller.step = turn  # type: ignore[method-assign]
+        await asyncio.sleep(6.0)
+        sent = vibrations(chain)
+        assert len(sent) > 3
+        assert all(later <= time + valid_for(one) for (time, one), (later, _) in pairwise(sent))
+        assert level(chain) == FULL
+
+
 @pytest.mark.parametrize("on_time", [1.5, 2.5, 3.0, 5.5])
 @in_virtual_time
 async def test_renewal_keeps_to_the_on_time_limit(on_time: float) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from model.answer.fingers import Finger, Placement, Stimulus, check_fingers, together
 from model.answer.plan import answer, query
+from model.answer.strength import Limits
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
@@ -48,7 +49,11 @@ def test_fingers_that_contradict_each_other_are_refused(placed):
         {"level_db_sl": math.nan},
         {"level_db_sl": 201.0},
         {"level_db_sl": -300.0},
+        {"level_db_sl": 10**400},
         {"duration": 0.0},
+        {"duration": 1e-9},
+        {"duration": 10**400},
+        {"is_limit": "no"},
         {"duration": math.inf},
         {"duration": 0.04, "modulation_hz": 20.0},
         {"drive_mode": "loud"},
@@ -60,6 +65,25 @@ def test_stimuli_that_no_table_has_are_refused(more):
     """Levels, durations and modes that there are not, and frequencies that the table lacks."""
     with pytest.raises(InputError):
         query(smooth_table(), Placement((TARGET,)), **more)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"priority": 10**400},
+        {"priority": 1 << 31},
+        {"priority": -(1 << 31) - 1},
+        {"load": 10**400},
+        {"min_contrast_db": math.nan},
+        {"sharing": np.array([1, 2])},
+        {"is_protected": "no"},
+    ],
+    ids=lambda given: next(iter(given)),
+)
+def test_what_no_finger_asks_is_refused(given):
+    """Numbers that no plate or kernel has, and values that are no answer to the question."""
+    with pytest.raises(InputError):
+        answer(smooth_table(), [Finger(TARGET, Stimulus(), **given)])
 
 
 @pytest.mark.parametrize(
@@ -98,6 +122,36 @@ def test_a_limit_is_as_strong_as_quiet_fingers_allow():
             else:
                 assert felt.level_db_sl == pytest.approx(26.0, abs=1e-3)
             assert felt.lowered_db == pytest.approx(26.0 - felt.promised_level_db_sl, abs=1e-3)
+
+
+@pytest.mark.parametrize("slew", [math.inf, 0.3, 0.1])
+def test_a_click_that_is_a_limit_stays_so_along_the_ramp_that_the_slew_needs(slew: float):
+    """Quiet fingers have -10 dB SL at most; it does not return to the level of its search."""
+    click = Finger(TARGET, Stimulus(26.0, duration=0.04, is_limit=True))
+    for quiet in contact_sets(6, fingers=2, seed=5):
+        if min(math.dist(at, TARGET) for at in quiet) < 0.02:
+            continue
+        found = answer(
+            smooth_table(), [click], quiet=quiet, drive_mode="phased", limits=Limits(slew=slew)
+        )
+        assert max(each.foreign_level_db_sl for each in found.fingers[1:]) <= -10.0 + 1e-3
+
+
+def test_a_limit_is_not_lowered_for_what_others_play():
+    """Of the other vibration nothing counts; beside no quiet finger both have their levels."""
+    limit = Finger(TARGET, Stimulus(26.0, is_limit=True))
+    other = Finger((0.05, 0.17), Stimulus(20.0))
+    found = answer(smooth_table(), [limit, other], drive_mode="phased")
+    assert [each.verdict in ("own", "mixed") for each in found.fingers] == [True, True]
+    assert found.fingers[0].promised_level_db_sl >= 12.0 - 1e-3
+    near = (0.14, 0.09)
+    alone = answer(smooth_table(), [limit], quiet=[near, other.at], drive_mode="phased")
+    beside = answer(
+        smooth_table(), [limit, other], quiet=[near], drive_mode="phased", min_contrast_db=-99.0
+    )
+    assert beside.fingers[2].foreign_level_db_sl > -10.0
+    levels = [found.fingers[0].promised_level_db_sl for found in (alone, beside)]
+    assert levels[1] > levels[0] - 3.0
 
 
 def test_frequencies_are_those_of_the_band():

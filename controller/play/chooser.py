@@ -19,7 +19,6 @@ from controller.play.joint_answer import (
     Shape,
     answered,
     selection_of,
-    unshaped,
 )
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, amplitudes_of, verdict_of
@@ -56,8 +55,10 @@ class Requested:
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are to feel nothing of what these targets feel."""
-        keys = {contact.key for contact, _ in targets}
-        return tuple([each for each in self.contacts if each.key not in keys])
+        left = {each.key: each for each in self.contacts}
+        for contact, _ in targets:
+            left.pop(contact.key, None)
+        return tuple(left.values())
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class Chooser:
     """Chooses by a table; shape: adds envelopes to what is joint."""
 
     table: LocalizationTable
-    shape: Shape = unshaped
+    shape: Shape | None = None
 
     def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
         """Choose what is asked for, what lasts first."""
@@ -101,7 +102,8 @@ class Chooser:
 
         Beside these what it replaces fades, too.
         """
-        free, pulses = self._chosen(requested, targets, capabilities), _contents(requested.kept)
+        free = self._chosen(requested, targets, capabilities)
+        pulses = _contents(requested.kept) if requested.kept else []
         if not pulses:
             return free, False
         fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
@@ -158,7 +160,7 @@ class Chooser:
                 targets,
                 quiet,
                 before=before,
-                shape=self.shape if is_long else unshaped,
+                shape=self.shape if is_long else None,
                 protected=by,
                 is_in_phase=is_long,
             )

@@ -163,7 +163,8 @@ class Layers:
                 sets, playing = self._sets(left, now, is_shaped=is_shaped)
                 refusal = self.check(sets.by_amplifier) if sets.started else None
                 if refusal is None:
-                    self._note_start(sets, playing, now)
+                    if sets.layers:
+                        self.start(sets, playing, now)
                     if skipped:
                         sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
                     return sets
@@ -191,11 +192,14 @@ class Layers:
         """
         sets = {
             number: self.builder.build_renewal(
-                number, ramp=one.pattern.ramp, valid_for=self._lasts(one.content, now)
+                number,
+                ramp=one.pattern.ramp,
+                valid_for=self._lasts(content, _all_left(content, now), now),
             )
             for number, one in self.contents.items()
+            for content in (one.content,)
             if one.renewal_due <= now < one.renewable_until
-            and self._confirmed_until(one.content) > one.confirmed_until
+            and self._confirmed_until(content) > one.confirmed_until
         }
         renewal = Sets(sets)
         if sets and (refusal := self.check(renewal.by_amplifier)) is not None:
@@ -292,12 +296,14 @@ class Layers:
             changed = [n for n in numbers if n in changed or n in restarting]
         return changed, restarting
 
-    def start(self, contents: Mapping[int, LayerContent], started: frozenset[int]) -> None:
-        """Note what is sent: the contents of all layers, and which of them start."""
-        self._replace(contents)
+    def start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
+        """Note that sets are sent at a time [s], and what all layers play."""
+        if self._fades(sets):
+            self._fades_until = now + FADED_AFTER
+        self._replace(playing)
         self.is_silent = False
-        self._layer_of = {one.content.key: number for number, one in [*contents.items()][::-1]}
-        self.may_play |= started
+        self._layer_of = {one.content.key: number for number, one in [*playing.items()][::-1]}
+        self.may_play |= sets.started
 
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
@@ -310,15 +316,16 @@ class Layers:
         settled = [0.0]
         for number in starting:
             content = numbers[number]
+            left = _all_left(content, now)
             layers[number], pattern = self.builder.build_pattern(
                 number,
                 content.pattern,
                 content.question,
                 playing=self._drive_of(number),
-                valid_for=self._lasts(content, now),
+                valid_for=self._lasts(content, left, now),
                 restarts=number in restarting,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
-                lasts=min(_all_left(content, now), default=math.inf),
+                lasts=min(left, default=math.inf),
                 among=len(starting),
             )
             playing[number] = LayerContent(content, pattern)
@@ -329,19 +336,12 @@ class Layers:
             settled.append(self.builder.end_ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
 
-    def _note_start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
-        """Note that sets are sent at a time [s], if there are any, and what all layers play."""
-        if sets.layers:
-            if self._fades(sets):
-                self._fades_until = now + FADED_AFTER
-            self.start(playing, sets.started)
-
     def _fades(self, sets: Sets) -> bool:
         """Whether anything that plays is ended or replaced."""
         if len(sets.layers) > len(sets.started):
             return True
-        before = self.contents.keys() & sets.started
-        return bool(before) and any(self.contents[number].drive for number in before)
+        before = [one for number, one in self.contents.items() if number in sets.started]
+        return any(one.drive for one in before)
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
         """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
@@ -368,14 +368,14 @@ class Layers:
             until = min(until, self._expiry_of(contact.key))
         return until
 
-    def _lasts(self, content: Content, now: float) -> float:
+    def _lasts(self, content: Content, left: Sequence[float], now: float) -> float:
         """Return for how long [s] a content at a time [s] may last by itself.
 
-        The amplifiers end a pulse; the last one, where several play.
+        left [s]: of each target. The amplifiers end a pulse; the last one, where several play.
         """
         until = self._confirmed_until(content)
         unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        return min(unlimited, max(_all_left(content, now), default=math.inf))
+        return min(unlimited, max(left, default=math.inf))
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""

@@ -146,7 +146,7 @@ def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceR
     )
 
 
-def _ignore(*_: object) -> None:
+def ignore(*_: object) -> None:
     """Do nothing."""
 
 
@@ -157,10 +157,10 @@ class Observer:
     Their exceptions are logged and go no further.
     """
 
-    contacts_changed: Callable[[tuple[Contact, ...], Change], None] = _ignore
-    pattern_applied: Callable[[PlayReport], None] = _ignore
-    silenced: Callable[[SilenceReport], None] = _ignore
-    refused: Callable[[str], None] = _ignore
-    link_lost: Callable[[str], None] = _ignore
-    cycle_completed: Callable[[], None] = _ignore
+    contacts_changed: Callable[[tuple[Contact, ...], Change], None] = ignore
+    pattern_applied: Callable[[PlayReport], None] = ignore
+    silenced: Callable[[SilenceReport], None] = ignore
+    refused: Callable[[str], None] = ignore
+    link_lost: Callable[[str], None] = ignore
+    cycle_completed: Callable[[], None] = ignore
     """Called after each cycle of the loop, at least once a second."""

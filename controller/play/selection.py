@@ -157,9 +157,9 @@ class Selector:
         intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         fingers = {contact.key: contact.since for contact, _ in lasting}
         came, self._fingers = fingers.items() - self._fingers.items(), fingers
-        if came and self._lasting.targets and not intended.is_met_by(self._lasting):
-            # Who has come back may be elsewhere.
-            self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
+        back = self._lasting.target_keys & dict(came).keys()
+        if back and not intended.is_met_by(self._lasting):  # who has come back may be elsewhere
+            self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
         arrived = self._thread.take()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
@@ -313,15 +313,22 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
     """Return what was chosen, without the contents of all fingers but some, by key."""
     if keys >= chosen.target_keys:
         return chosen
+    targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], []
+    for contact, target in chosen.targets:
+        if contact.key in keys:
+            targets.append((contact, target))
+        else:
+            quiet.append(contact)
+    for content in chosen.contents:
+        for contact, _ in content.targets:
+            if contact.key in keys:
+                contents.append(content)
+                break
     return replace(
         chosen,
-        targets=tuple([each for each in chosen.targets if each[0].key in keys]),
-        quiet=(*chosen.quiet, *[each for each, _ in chosen.targets if each.key not in keys]),
-        contents=tuple(
-            content
-            for content in chosen.contents
-            if any(contact.key in keys for contact, _ in content.targets)
-        ),
+        targets=tuple(targets),
+        quiet=tuple(quiet),
+        contents=tuple(contents),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
 

@@ -161,8 +161,12 @@ class Shaper:
     def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
         """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
         known = self._fingers
-        found = {each: known.get(each) for each in positions}  # of which others may drop some
-        new = [each for each, one in found.items() if one is None]
+        found, new = dict[Position, tuple[FloatArray, FloatArray]](), list[Position]()
+        for each in positions:
+            if (one := known.get(each)) is None:
+                new.append(each)
+            else:
+                found[each] = one  # which others may drop
         if new:
             weights, shapes = self._read_fingertips(new)
             made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
@@ -170,7 +174,8 @@ class Shaper:
             known.update(made)
         for each in [*known][:-_KEPT]:
             known.pop(each, None)
-        weights, shapes = map(np.stack, zip(*[found[each] for each in positions], strict=True))
+        own = map(found.__getitem__, positions)
+        weights, shapes = map(np.stack, zip(*own, strict=True))
         return weights, shapes
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:

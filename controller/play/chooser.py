@@ -55,10 +55,8 @@ class Requested:
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are to feel nothing of what these targets feel."""
-        left = {each.key: each for each in self.contacts}
-        for contact, _ in targets:
-            left.pop(contact.key, None)
-        return tuple(left.values())
+        keys = {contact.key for contact, _ in targets}
+        return tuple([each for each in self.contacts if each.key not in keys])
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ class Chooser:
             return free, False
         fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
         left = self._left_by([*pulses, *fading], capabilities)
-        total = amplitudes_of([each.pattern.excitation for each in free.contents])
+        total = amplitudes_of([each.layer.excitation for each in free.contents])
         if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
@@ -120,7 +118,7 @@ class Chooser:
         """Return what contents leave of the amplifiers' limits."""
         if not contents:
             return capabilities
-        taken = amplitudes_of([each.pattern.excitation for each in contents])
+        taken = amplitudes_of([each.layer.excitation for each in contents])
         return capabilities.left_by(taken, self.table.strokes)
 
     def _chosen(

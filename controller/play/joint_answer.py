@@ -26,7 +26,7 @@ from model.answer.answer import (
     Sensation,
 )
 from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
-from model.answer.plan import answer
+from model.answer.plan import answer, worst_of
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -80,15 +80,15 @@ def answered(
     if kept == fingers:
         return request(fingers)
     found, within = request(kept), kept_within or 0.0
-    worst, served, lowered = found.promised_worst_db, _served(found), _lowered_db(found)
+    worst, served, lowered = found.promised_worst_db, len(found.layers), _lowered_db(found)
     least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
     is_loud = lowered < _SHORT_OF
     if is_loud and served == len(targets) and (worst is None or worst >= least):
         return found
     other = request(fingers)
-    gain = _worst(other) - _worst(found)
+    gain = worst_of(other) - worst_of(found)
     is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
-    return other if (_served(other), is_better) > (served, False) else found
+    return other if (len(other.layers), is_better) > (served, False) else found
 
 
 def selection_of(
@@ -131,7 +131,11 @@ def selection_of(
         if not served:
             continue
         contact, placed = served[0][0], found.placement(layer)
-        voices = [replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations]
+        voices, own = [layer], tuple([(finger, target) for finger, target, _ in served])
+        if layer.side_bands:
+            voices = [
+                replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations
+            ]
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
@@ -144,7 +148,7 @@ def selection_of(
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
-                    tuple([(finger, target) for finger, target, _ in served]),
+                    own,
                     placed,
                     shape(placed, played, is_continued) if shape else played,
                     () if voice else _predictions(served, layer),
@@ -270,14 +274,6 @@ def _lowered_db(found: Answer) -> float:
     return max([each.lowered_db for each in found.fingers], default=0.0)
 
 
-def _served(found: Answer) -> int:
-    return len(found.layers)
-
-
-def _worst(found: Answer) -> float:
-    return math.inf if found.promised_worst_db is None else found.promised_worst_db
-
-
 def felt_db_sl(felt: Sensation) -> float:
     """Return the level of a finger: promised of what lasts, over its duration as modelled."""
     stimulus = felt.finger.stimulus
@@ -363,7 +359,7 @@ def _in_phase(
     """
     fields = fields[:, :, number]
     felt = _felt(layer.excitation, fields, table)
-    felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
+    felt_before = {} if before is None else _felt(before.layer.excitation, fields, table)
     (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
     turned = {}
     for name, tone in layer.excitation.items():

@@ -53,14 +53,14 @@ _logger = logging.getLogger(__name__)
 class LayerContent:
     """A content in its layer.
 
-    pattern: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
+    layer: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
     [s]: when its onset has ended. confirmed_until [s]: when its first target would have been
     lifted, as known when it was sent; between renewal_due and renewable_until it is renewed if all
     targets have been confirmed since. ends_at: when it has ended by itself unless it was renewed.
     """
 
     content: Content
-    pattern: answer.Layer
+    layer: answer.Layer
     drive: Drive = field(default_factory=dict)
     settled_at: float = math.inf
     confirmed_until: float = math.inf
@@ -69,21 +69,11 @@ class LayerContent:
     ends_at: float = math.inf
 
     @property
-    def continued(self) -> Drive:
-        """What plays, at the frequencies that were asked for, which wire and amplifier round."""
-        requested = self.pattern.excitation
-        return {
-            name: replace(tone, frequency=requested[name].frequency)
-            for name, tone in self.drive.items()
-            if name in requested
-        }
-
-    @property
     def settled_after(self) -> float:
         """How long [s] after the commit its ramp or onset has ended."""
-        onset = self.pattern.onset
+        onset = self.layer.onset
         last = next(iter(onset.values())).duration if onset else 0.0
-        return max(self.pattern.ramp, last)
+        return max(self.layer.ramp, last)
 
 
 @dataclass(frozen=True)
@@ -193,7 +183,7 @@ class Layers:
         sets = {
             number: self.builder.build_renewal(
                 number,
-                ramp=one.pattern.ramp,
+                ramp=one.layer.ramp,
                 valid_for=self._lasts(content, _all_left(content, now), now),
             )
             for number, one in self.contents.items()
@@ -290,7 +280,7 @@ class Layers:
         for number in changed if len(numbers) > 1 else ():
             content = numbers[number]
             voices = [n for n, one in numbers.items() if one.targets == content.targets]
-            if len(voices) > 1 and restarted_by(content.pattern.excitation, self._drive_of(number)):
+            if len(voices) > 1 and restarted_by(content.layer.excitation, self._drive_of(number)):
                 restarting.update(voices)
         if restarting:
             changed = [n for n in numbers if n in changed or n in restarting]
@@ -317,10 +307,10 @@ class Layers:
         for number in starting:
             content = numbers[number]
             left = _all_left(content, now)
-            layers[number], pattern = self.builder.build_pattern(
+            layers[number], played = self.builder.build_pattern(
                 number,
-                content.pattern,
-                content.question,
+                content.layer,
+                content.placement,
                 playing=self._drive_of(number),
                 valid_for=self._lasts(content, left, now),
                 restarts=number in restarting,
@@ -328,7 +318,7 @@ class Layers:
                 lasts=min(left, default=math.inf),
                 among=len(starting),
             )
-            playing[number] = LayerContent(content, pattern)
+            playing[number] = LayerContent(content, played)
             settled.append(playing[number].settled_after)
         for number in self.may_play - numbers.keys():
             has_endings = is_shaped and self._may_end_shaped(number, now)
@@ -340,8 +330,7 @@ class Layers:
         """Whether anything that plays is ended or replaced."""
         if len(sets.layers) > len(sets.started):
             return True
-        before = [one for number, one in self.contents.items() if number in sets.started]
-        return any(one.drive for one in before)
+        return any(one.drive for number, one in self.contents.items() if number in sets.started)
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
         """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
@@ -380,11 +369,20 @@ class Layers:
     def _may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""
         one = self.contents.get(number)
-        return one is not None and bool(one.pattern.ending) and now >= one.settled_at
+        return one is not None and bool(one.layer.ending) and now >= one.settled_at
 
     def _drive_of(self, number: int) -> Drive:
-        """Return what plays in a layer, at the frequencies that were asked for."""
-        return self.contents[number].continued if number in self.contents else {}
+        """Return what plays in a layer, at the frequencies that were asked for.
+
+        Wire and amplifier round these.
+        """
+        one = self.contents.get(number)
+        requested = {} if one is None else one.layer.excitation
+        return {
+            name: replace(tone, frequency=requested[name].frequency)
+            for name, tone in (one.drive.items() if one else ())
+            if name in requested
+        }
 
 
 def _requested_at(one: LayerContent) -> float:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
@@ -88,7 +89,7 @@ class _Intended:
 
 
 def _targets_of(targets: Targets) -> set[Target]:
-    return {target for _, target in targets}
+    return set(map(itemgetter(1), targets))
 
 
 def _of_any_level(targets: Targets) -> set[Target]:
@@ -313,22 +314,13 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
     """Return what was chosen, without the contents of all fingers but some, by key."""
     if keys >= chosen.target_keys:
         return chosen
-    targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], []
-    for contact, target in chosen.targets:
-        if contact.key in keys:
-            targets.append((contact, target))
-        else:
-            quiet.append(contact)
-    for content in chosen.contents:
-        for contact, _ in content.targets:
-            if contact.key in keys:
-                contents.append(content)
-                break
     return replace(
         chosen,
-        targets=tuple(targets),
-        quiet=tuple(quiet),
-        contents=tuple(contents),
+        targets=tuple([each for each in chosen.targets if each[0].key in keys]),
+        quiet=(*chosen.quiet, *[each for each, _ in chosen.targets if each.key not in keys]),
+        contents=tuple(
+            [each for each in chosen.contents if any(one.key in keys for one, _ in each.targets)]
+        ),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
 

@@ -23,7 +23,7 @@ class OscError(ValueError):
     """A message that cannot be read."""
 
 
-def osc_messages(datagram: bytes, *, most: int) -> list[bytes]:
+def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
     """Return the encoded messages of a datagram in order, for `read_message`; so many at most.
 
     What is neither a message nor a bundle is among them; what follows an element whose size exceeds
@@ -31,7 +31,7 @@ def osc_messages(datagram: bytes, *, most: int) -> list[bytes]:
     """
     found, ends = list[bytes](), list[int]()  # of the bundles that enclose an element
     at, end, is_whole = 0, len(datagram), True
-    while len(found) < most:
+    while len(found) < limit:
         is_bundle = end - at >= _BUNDLE_HEADER and datagram.startswith(_BUNDLE, at)
         if is_whole and is_bundle and len(ends) < _MAX_DEPTH:
             ends.append(end)

@@ -224,7 +224,7 @@ class TuioReader:
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the messages of a datagram."""
     bundle = _Bundle()
-    messages = osc_messages(datagram, most=_MAX_MESSAGES + 1)
+    messages = osc_messages(datagram, limit=_MAX_MESSAGES + 1)
     if len(messages) > _MAX_MESSAGES:
         bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
     for message in messages[:_MAX_MESSAGES]:

@@ -232,10 +232,7 @@ class Answer:
     @property
     def amplitudes(self) -> dict[str, float]:
         """Amplitude of each ERA [m], of all that plays together."""
-        every = list[Excitation]()
-        for layer in self.layers:
-            every += layer.excitation, *layer.side_bands
-        return amplitudes_of(every)
+        return amplitudes_of([each for layer in self.layers for each in layer.excitations])
 
     @property
     def promised_worst_db(self) -> float | None:
@@ -269,12 +266,12 @@ class Answer:
                     [*zip(tones.rows, tones.weights, strict=True)], *on, gain=tones.gains[0]
                 )
             ]
-        found = []
         every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
-        for row, weights, gain, owner in every:
-            if owner == content:
-                found.append(excitation_of([(row, weights)], *on, gain=gain))
-        return found
+        return [
+            excitation_of([(row, weights)], *on, gain=gain)
+            for row, weights, gain, owner in every
+            if owner == content
+        ]
 
     @property
     def _contrast_to_plate_db(self) -> float | None:

@@ -49,8 +49,6 @@ def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
-    if not limited:
-        return found
     gains_db = np.zeros(len(streams))
     for number in limited:
         stream = streams[number]

@@ -167,9 +167,7 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
 
     voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
     playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    contents = {
-        number: LayerContent(one, one.pattern, drive={}) for number, one in enumerate(voices)
-    }
+    contents = {number: LayerContent(one, one.layer, drive={}) for number, one in enumerate(voices)}
     playing.start(Sets(started=frozenset(contents)), contents, 0.0)
     every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
     assert playing.starting(every) == ([3], set())

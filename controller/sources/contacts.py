@@ -186,7 +186,10 @@ class ContactTracker:
     def _contact(
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float
     ) -> Contact:
-        """Return the contact of a touch, down since a time [s] unless it is known."""
+        """Return the contact of a touch, down since a time [s] unless it is known.
+
+        One whose panel stops reporting loads keeps its own.
+        """
         since, load = (time, 1.0) if known is None else (known.since, known.load)
         if touch.load is not None and time - since >= LANDING:
             load = followed(load, touch.load)

@@ -55,7 +55,7 @@ class LightPress:
 def followed(known: float, reported: float) -> float:
     """Return the load of a contact: the known one, unless the reported one differs enough.
 
-    Bounded. A contact whose panel stops reporting keeps its load.
+    Bounded.
     """
     if not reported > 0:  # NaN is not
         return known

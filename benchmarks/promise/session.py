@@ -279,7 +279,7 @@ def _note(
     )
     for one in contents.contents.values():
         if _id(one) == last:
-            contrast = timing.transient_contrast_db(one.pattern, one.content.question)
+            contrast = timing.transient_contrast_db(one.layer, one.content.placement)
             if contrast is not None and promised_level is not None:
                 onset = promised_level - contrast
     for id in event.after.served:

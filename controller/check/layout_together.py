@@ -16,7 +16,7 @@ from controller.effects.region import Region
 from controller.play.chooser import Requested
 from controller.play.content import Selection
 from controller.play.intent import Target
-from controller.play.table_query import fingers_of
+from controller.play.joint_answer import fingers_of
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import MIN_CONTRAST_DB, Answer
 from model.answer.plan import answer

@@ -47,8 +47,8 @@ from controller.operation.states import (
     Operation,
     Trigger,
 )
+from controller.play.joint_answer import MAX_DB_SL
 from controller.play.loop import Controller
-from controller.play.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.feeding import Stopped

@@ -174,7 +174,7 @@ class TouchRecorder:
             return
         ended.until = now
         # Its end is reported with the reply to what ended it, some time after the fingers changed.
-        began, settled = ended.applied.time, ended.applied.time + ended.applied.pattern.ramp
+        began, settled = ended.applied.time, ended.applied.time + ended.applied.layer.ramp
         changes = [each for each in self._changes if settled < each < now]
         start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
         since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
@@ -233,7 +233,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     key = touch.contact.key
     predicted = next(felt for felt in applied.targets if felt.contact.key == key)
     played = _content_of(predicted, applied)
-    pattern = played.pattern
+    pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}
     row = replace(
         row,
@@ -245,7 +245,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
             for era, each in played.drive.items()
         },
         mode=pattern.drive_mode,
-        shaped_onset=bool(_content_of(predicted, first.applied).pattern.onset),
+        shaped_onset=bool(_content_of(predicted, first.applied).layer.onset),
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
@@ -262,7 +262,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
             measured_contrast_db=own.measured_contrast_db,
             measured_level_db_sl=own.measured_level_db_sl,
             fingers=[_finger_row(each, vibration) for each in applied.targets],
-            contents=[each.pattern for each in applied.contents.values()],
+            contents=[each.layer for each in applied.contents.values()],
         )
     target, quiet = _fingers(vibration, predicted, applied.quiet)
     onset_vibration = await first.onset if first.onset else {}

@@ -87,12 +87,12 @@ class EffectPlayer:
             if play is not None and stimulus is not None:
                 felt.append((play.number, play, contact, stimulus))
         felt.sort()
-        newest = max([number for number, play, _, _ in felt if play.is_elsewhere], default=None)
+        elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
         waiting, self._waiting = self._waiting, {}
         sensing, targets = set[ContactKey](), list[Target]()
         for number, play, contact, stimulus in felt:
             sensing.add(contact.key)
-            if play.is_elsewhere and number != newest:
+            if number in elsewhere[:-1]:
                 continue  # of these only the newest is felt
             target = stimulus.target(
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
@@ -208,8 +208,8 @@ class EffectPlayer:
         # One that came down again with the same id, perhaps between two intents, is another.
         for key in [key for key, one in self._fingers.items() if since.get(key) != one.since]:
             del self._fingers[key]
-        pressed = self._already_pressed.items()
-        self._already_pressed = {key: then for key, then in pressed if since.get(key) == then}
+        if pressed := self._already_pressed.items():
+            self._already_pressed = {key: then for key, then in pressed if since.get(key) == then}
         for contact in contacts:
             finger = self._fingers.get(contact.key)
             if finger is None:

@@ -8,6 +8,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 from drivers.host.amplifier import Amplifier
@@ -63,7 +64,7 @@ class PlaybackCapabilities:
     ramp_max: float = math.inf
     layers: int = 1
 
-    @property
+    @cached_property
     def limits(self) -> Limits:
         """Those of a drive."""
         return Limits(self.frequencies, self.max_amplitudes, self.max_power, self.slew)

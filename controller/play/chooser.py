@@ -19,7 +19,6 @@ from controller.play.joint_answer import (
     Shape,
     answered,
     selection_of,
-    unshaped,
 )
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, amplitudes_of, verdict_of
@@ -78,7 +77,7 @@ class Chooser:
     """Chooses by a table; shape: adds envelopes to what is joint."""
 
     table: LocalizationTable
-    shape: Shape = unshaped
+    shape: Shape | None = None
 
     def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
         """Choose what is asked for, what lasts first."""
@@ -101,12 +100,13 @@ class Chooser:
 
         Beside these what it replaces fades, too.
         """
-        free, pulses = self._chosen(requested, targets, capabilities), _contents(requested.kept)
+        free = self._chosen(requested, targets, capabilities)
+        pulses = _contents(requested.kept) if requested.kept else []
         if not pulses:
             return free, False
         fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
         left = self._left_by([*pulses, *fading], capabilities)
-        total = amplitudes_of([each.pattern.excitation for each in free.contents])
+        total = amplitudes_of([each.layer.excitation for each in free.contents])
         if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
@@ -118,7 +118,7 @@ class Chooser:
         """Return what contents leave of the amplifiers' limits."""
         if not contents:
             return capabilities
-        taken = amplitudes_of([each.pattern.excitation for each in contents])
+        taken = amplitudes_of([each.layer.excitation for each in contents])
         return capabilities.left_by(taken, self.table.strokes)
 
     def _chosen(
@@ -158,7 +158,7 @@ class Chooser:
                 targets,
                 quiet,
                 before=before,
-                shape=self.shape if is_long else unshaped,
+                shape=self.shape if is_long else None,
                 protected=by,
                 is_in_phase=is_long,
             )

@@ -53,14 +53,14 @@ class Prediction:
 class Content:
     """What one layer plays, with the contacts as they were when it was chosen.
 
-    targets: the finger whose content it is, then those that share it; question: where they are, and
-    all others; predictions: one per target; voice: 0, or the number of a side band of the finger's
-    content, which has no predictions.
+    targets: the finger whose content it is, then those that share it; placement: where they are,
+    and all others; predictions: one per target; voice: 0, or the number of a side band of the
+    finger's content, which has no predictions.
     """
 
     targets: Targets
-    question: Placement
-    pattern: Layer
+    placement: Placement
+    layer: Layer
     predictions: tuple[Prediction, ...] = ()
     voice: int = 0
 
@@ -72,8 +72,7 @@ class Content:
     @property
     def frequency(self) -> float | None:
         """Its frequency [Hz]; None of several."""
-        frequencies = {tone.frequency for tone in self.pattern.excitation.values()}
-        return frequencies.pop() if len(frequencies) == 1 else None
+        return self.layer.frequency
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ def leaks_db_sl(
     power = {each.key: np.zeros(len(own)) for each, own in zip(contacts, points, strict=True)}
     fields = table.unit_fields(np.concatenate(points), contacts=places, loads=loads)
     for content in contents:
-        frequencies, felt = table.driven(content.pattern.excitation, fields)
+        frequencies, felt = table.driven(content.layer.excitation, fields)
         sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]
         own = {contact.key for contact, _ in content.targets}
         for each, part in zip(contacts, np.split((sensed**2).sum(axis=0), ends), strict=True):

@@ -3,12 +3,11 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable
 from contextlib import suppress
 
 from controller.play.intent import IntentSource
 from controller.play.layers import RELEASE_RAMP
-from controller.play.observer import Observer, play_report, silence_report
+from controller.play.observer import Observer, ignore, play_report, silence_report
 from controller.play.planner import Plan, Planner
 from controller.sources.contacts import Change, ContactTracker
 from controller.sources.reject_counter import RejectCounter
@@ -91,14 +90,14 @@ class Cycle:
         """
         while not self._is_closed:
             await self.step()
-            self._report(lambda each: each.cycle_completed())
+            self._report("cycle_completed")
             await self._wait_for_event()
 
     async def step(self) -> None:
         """Run the loop once: plan, send what changes, then the heartbeat if it is due."""
-        self._expire()
-        self._wake.clear()
         planner, now = self._planner_if_open, clock.now()
+        self._expire(now)
+        self._wake.clear()
         if planner is None:
             return
         if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
@@ -123,11 +122,9 @@ class Cycle:
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and planned anew
         except LinkError as error:
-            lost = str(error)
-            self._report(lambda each: each.link_lost(lost))
+            self._report("link_lost", str(error))
         except DriverError as error:
-            reason = str(error)
-            self._report(lambda each: each.refused(reason))
+            self._report("refused", str(error))
 
     async def _send(self, planner: Planner, plan: Plan) -> None:
         """Send what a plan changes, and report the outcome; raises DriverError.
@@ -145,7 +142,7 @@ class Cycle:
         finally:
             self._plan = None
         if reason := plan.sets.reason:
-            self._report(lambda each: each.refused(reason))
+            self._report("refused", reason)
         if plan.is_reported:
             sent_at = outcome if isinstance(outcome, float) else None
             self._report_playing(planner, plan, sent_at=sent_at)
@@ -232,7 +229,7 @@ class Cycle:
         self._wake.set()
         if planner is not None and planner.is_silence_pending:
             self.group.abort_exchange()
-        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
+        self._report("contacts_changed", self._tracker.contacts, change)
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.
@@ -251,12 +248,12 @@ class Cycle:
 
     def _time_out(self) -> None:
         self._expiry = None
-        self._expire()
+        self._expire(clock.now())
         self._schedule_expiry()
 
-    def _expire(self) -> None:
+    def _expire(self, now: float) -> None:
         """Lift fingers that no source has confirmed in time: here alone, and before every plan."""
-        if (change := self._tracker.expire(clock.now())).up:
+        if (change := self._tracker.expire(now)).up:
             self._follow(change)
 
     def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
@@ -265,10 +262,10 @@ class Cycle:
         if plan.selection.contents and plan.sets.silence is None:
             playing = planner.layers.contents
             applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=self._timing)
-            self._report(lambda each: each.pattern_applied(applied))
+            self._report("pattern_applied", applied)
             return
         silenced = silence_report(plan, sent_at=sent_at, now=now)
-        self._report(lambda each: each.silenced(silenced))
+        self._report("silenced", silenced)
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, or the expiry of an intent."""
@@ -287,10 +284,13 @@ class Cycle:
         finally:
             timer.cancel()
 
-    def _report(self, event: Callable[[Observer], None]) -> None:
-        """Report an event to all observers; their exceptions are only logged."""
+    def _report(self, event: str, *args: object) -> None:
+        """Report an event, a field of `Observer`, to all that observe it; exceptions are logged."""
         for observer in self.observers:
+            callback = getattr(observer, event)
+            if callback is ignore:
+                continue
             try:
-                event(observer)
+                callback(*args)
             except Exception:
                 _logger.exception("loop: observer failed")

@@ -15,18 +15,27 @@ import numpy as np
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
-from controller.play.intent import Target
-from controller.play.table_query import fingers_of
+from controller.play.intent import Target, band_of_table
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB, Answer, Layer, Sensation
-from model.answer.fingers import Finger, Placement
-from model.answer.plan import answer
-from model.arrays import Complex64Array
+from model.answer.answer import (
+    IMPERCEPTIBLE_DB_SL,
+    MIN_CONTRAST_DB,
+    OWN_CONTRAST_DB,
+    Answer,
+    Layer,
+    Sensation,
+)
+from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
+from model.answer.plan import answer, worst_of
+from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 
 KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
+
+MAX_DB_SL = 26.0
+"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
 
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2
@@ -39,11 +48,6 @@ NEIGHBOURS_LEAVE_NOTHING = (
 
 Shape = Callable[[Placement, Layer, bool], Layer]
 """Adds the envelopes of a layer; whether it continues what plays in it, without an onset."""
-
-
-def unshaped(placed: Placement, layer: Layer, is_continued: bool) -> Layer:
-    """Return a layer as it is."""
-    return layer
 
 
 def answered(
@@ -69,22 +73,22 @@ def answered(
         answer,
         table,
         drive_mode=capabilities.drive_mode,
-        shaped=is_shaped and not any(target.is_short for _, target in targets),
+        shaped=is_shaped and not targets[0][1].is_short,  # all or none
         limits=capabilities.limits,
     )
     kept = fingers if kept_within is None else _kept(fingers, targets, before)
     if kept == fingers:
         return request(fingers)
     found, within = request(kept), kept_within or 0.0
-    worst, served, lowered = found.promised_worst_db, _served(found), _lowered_db(found)
+    worst, served, lowered = found.promised_worst_db, len(found.layers), _lowered_db(found)
     least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
     is_loud = lowered < _SHORT_OF
     if is_loud and served == len(targets) and (worst is None or worst >= least):
         return found
     other = request(fingers)
-    gain = _worst(other) - _worst(found)
+    gain = worst_of(other) - worst_of(found)
     is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
-    return other if (_served(other), is_better) > (served, False) else found
+    return other if (len(other.layers), is_better) > (served, False) else found
 
 
 def selection_of(
@@ -94,7 +98,7 @@ def selection_of(
     quiet: Sequence[Contact],
     *,
     before: Mapping[tuple[ContactKey, int], Content],
-    shape: Shape = unshaped,
+    shape: Shape | None = None,
     protected: frozenset[ContactKey] = frozenset(),
     is_in_phase: bool = True,
 ) -> Selection:
@@ -127,27 +131,30 @@ def selection_of(
         if not served:
             continue
         contact, placed = served[0][0], found.placement(layer)
-        voices = [replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations]
-        is_continued = all(
+        voices, own = [layer], tuple([(finger, target) for finger, target, _ in served])
+        if layer.side_bands:
+            voices = [
+                replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations
+            ]
+        carrier = before.get((contact.key, 0))
+        is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
             and then.frequency == played.frequency
             for voice, played in enumerate(voices)
         )
-        carrier = before.get((contact.key, 0))
         for voice, played in enumerate(voices):
             if layer.side_bands or (is_in_phase and carrier is not None):
                 then = carrier if is_continued else None
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
-                    tuple([(finger, target) for finger, target, _ in served]),
+                    own,
                     placed,
-                    shape(placed, played, is_continued),
+                    shape(placed, played, is_continued) if shape else played,
                     () if voice else _predictions(served, layer),
                     voice,
                 )
             )
-    others = found.fingers[len(targets) :]
     return Selection(
         tuple(targets),
         tuple(quiet),
@@ -155,11 +162,73 @@ def selection_of(
         None if contents else skipped[0].held_back,
         tuple(skipped),
         quiet_levels={
-            contact.key: -math.inf if (level := each.foreign_level_db_sl) is None else level
-            for contact, each in zip(quiet, others, strict=True)
+            contact.key: -math.inf if math.isnan(level) else level
+            for contact, level in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True)
         },
         protected=protected,
     )
+
+
+def fingers_of(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    protected: frozenset[ContactKey] = frozenset(),
+) -> list[Finger]:
+    """Return the fingers of targets, then the quiet ones.
+
+    protected: contacts that must not notice the vibrations of others. The duration counts of a
+    single target, and of what ends before an onset would have settled.
+    """
+    found = []
+    for contact, target in (*targets, *[(each, None) for each in quiet]):
+        at = contact.x, contact.y
+        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
+        if target is None:
+            found.append(Finger(at, load=contact.load, max_foreign_db_sl=bound))
+            continue
+        is_over = len(targets) == 1 or target.is_short
+        duration = None
+        if is_over and target.pulse is not None and target.pulse.is_raised:
+            duration = target.pulse.duration
+        stimulus = Stimulus(
+            MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
+            playable_band(target.band, table.frequencies, capabilities.frequencies),
+            duration,
+            None if duration is not None else target.modulation_hz,
+            is_limit=target.level_db_sl is None,
+            name=target.content,
+        )
+        sharing = NEVER if target.is_own else ANY if target.may_share else BY_NAME
+        found.append(
+            Finger(
+                at,
+                stimulus,
+                contact.load,
+                target.priority,
+                sharing,
+                min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+                max_foreign_db_sl=bound,
+            )
+        )
+    return found
+
+
+def playable_band(
+    band: tuple[float, float] | None, frequencies: FloatArray, playable: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the lowest and highest frequency [Hz] of a band that can be played.
+
+    A band that shares no frequency of a table with what is playable is ignored.
+    """
+    low, high = playable
+    if band is not None:
+        of_table = band_of_table(band, frequencies)
+        together = max(low, of_table[0]), min(high, of_table[1])
+        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
+            low, high = together
+    return low, high
 
 
 def _as_layers_allow(
@@ -203,14 +272,6 @@ def _kept(
 def _lowered_db(found: Answer) -> float:
     """By how much the weakest finger is weaker than asked."""
     return max([each.lowered_db for each in found.fingers], default=0.0)
-
-
-def _served(found: Answer) -> int:
-    return len(found.layers)
-
-
-def _worst(found: Answer) -> float:
-    return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
 def felt_db_sl(felt: Sensation) -> float:
@@ -298,7 +359,7 @@ def _in_phase(
     """
     fields = fields[:, :, number]
     felt = _felt(layer.excitation, fields, table)
-    felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
+    felt_before = {} if before is None else _felt(before.layer.excitation, fields, table)
     (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
     turned = {}
     for name, tone in layer.excitation.items():

@@ -53,14 +53,14 @@ _logger = logging.getLogger(__name__)
 class LayerContent:
     """A content in its layer.
 
-    pattern: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
+    layer: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
     [s]: when its onset has ended. confirmed_until [s]: when its first target would have been
     lifted, as known when it was sent; between renewal_due and renewable_until it is renewed if all
     targets have been confirmed since. ends_at: when it has ended by itself unless it was renewed.
     """
 
     content: Content
-    pattern: answer.Layer
+    layer: answer.Layer
     drive: Drive = field(default_factory=dict)
     settled_at: float = math.inf
     confirmed_until: float = math.inf
@@ -69,21 +69,11 @@ class LayerContent:
     ends_at: float = math.inf
 
     @property
-    def continued(self) -> Drive:
-        """What plays, at the frequencies that were asked for, which wire and amplifier round."""
-        requested = self.pattern.excitation
-        return {
-            name: replace(tone, frequency=requested[name].frequency)
-            for name, tone in self.drive.items()
-            if name in requested
-        }
-
-    @property
     def settled_after(self) -> float:
         """How long [s] after the commit its ramp or onset has ended."""
-        onset = self.pattern.onset
+        onset = self.layer.onset
         last = next(iter(onset.values())).duration if onset else 0.0
-        return max(self.pattern.ramp, last)
+        return max(self.layer.ramp, last)
 
 
 @dataclass(frozen=True)
@@ -163,7 +153,8 @@ class Layers:
                 sets, playing = self._sets(left, now, is_shaped=is_shaped)
                 refusal = self.check(sets.by_amplifier) if sets.started else None
                 if refusal is None:
-                    self._note_start(sets, playing, now)
+                    if sets.layers:
+                        self.start(sets, playing, now)
                     if skipped:
                         sets = replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
                     return sets
@@ -191,11 +182,14 @@ class Layers:
         """
         sets = {
             number: self.builder.build_renewal(
-                number, ramp=one.pattern.ramp, valid_for=self._lasts(one.content, now)
+                number,
+                ramp=one.layer.ramp,
+                valid_for=self._lasts(content, _all_left(content, now), now),
             )
             for number, one in self.contents.items()
+            for content in (one.content,)
             if one.renewal_due <= now < one.renewable_until
-            and self._confirmed_until(one.content) > one.confirmed_until
+            and self._confirmed_until(content) > one.confirmed_until
         }
         renewal = Sets(sets)
         if sets and (refusal := self.check(renewal.by_amplifier)) is not None:
@@ -286,18 +280,20 @@ class Layers:
         for number in changed if len(numbers) > 1 else ():
             content = numbers[number]
             voices = [n for n, one in numbers.items() if one.targets == content.targets]
-            if len(voices) > 1 and restarted_by(content.pattern.excitation, self._drive_of(number)):
+            if len(voices) > 1 and restarted_by(content.layer.excitation, self._drive_of(number)):
                 restarting.update(voices)
         if restarting:
             changed = [n for n in numbers if n in changed or n in restarting]
         return changed, restarting
 
-    def start(self, contents: Mapping[int, LayerContent], started: frozenset[int]) -> None:
-        """Note what is sent: the contents of all layers, and which of them start."""
-        self._replace(contents)
+    def start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
+        """Note that sets are sent at a time [s], and what all layers play."""
+        if self._fades(sets):
+            self._fades_until = now + FADED_AFTER
+        self._replace(playing)
         self.is_silent = False
-        self._layer_of = {one.content.key: number for number, one in [*contents.items()][::-1]}
-        self.may_play |= started
+        self._layer_of = {one.content.key: number for number, one in [*playing.items()][::-1]}
+        self.may_play |= sets.started
 
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
@@ -310,18 +306,19 @@ class Layers:
         settled = [0.0]
         for number in starting:
             content = numbers[number]
-            layers[number], pattern = self.builder.build_pattern(
+            left = _all_left(content, now)
+            layers[number], played = self.builder.build_pattern(
                 number,
-                content.pattern,
-                content.question,
+                content.layer,
+                content.placement,
                 playing=self._drive_of(number),
-                valid_for=self._lasts(content, now),
+                valid_for=self._lasts(content, left, now),
                 restarts=number in restarting,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
-                lasts=min(_all_left(content, now), default=math.inf),
+                lasts=min(left, default=math.inf),
                 among=len(starting),
             )
-            playing[number] = LayerContent(content, pattern)
+            playing[number] = LayerContent(content, played)
             settled.append(playing[number].settled_after)
         for number in self.may_play - numbers.keys():
             has_endings = is_shaped and self._may_end_shaped(number, now)
@@ -329,19 +326,11 @@ class Layers:
             settled.append(self.builder.end_ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
 
-    def _note_start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
-        """Note that sets are sent at a time [s], if there are any, and what all layers play."""
-        if sets.layers:
-            if self._fades(sets):
-                self._fades_until = now + FADED_AFTER
-            self.start(playing, sets.started)
-
     def _fades(self, sets: Sets) -> bool:
         """Whether anything that plays is ended or replaced."""
         if len(sets.layers) > len(sets.started):
             return True
-        before = self.contents.keys() & sets.started
-        return bool(before) and any(self.contents[number].drive for number in before)
+        return any(one.drive for number, one in self.contents.items() if number in sets.started)
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
         """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
@@ -368,23 +357,32 @@ class Layers:
             until = min(until, self._expiry_of(contact.key))
         return until
 
-    def _lasts(self, content: Content, now: float) -> float:
+    def _lasts(self, content: Content, left: Sequence[float], now: float) -> float:
         """Return for how long [s] a content at a time [s] may last by itself.
 
-        The amplifiers end a pulse; the last one, where several play.
+        left [s]: of each target. The amplifiers end a pulse; the last one, where several play.
         """
         until = self._confirmed_until(content)
         unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        return min(unlimited, max(_all_left(content, now), default=math.inf))
+        return min(unlimited, max(left, default=math.inf))
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""
         one = self.contents.get(number)
-        return one is not None and bool(one.pattern.ending) and now >= one.settled_at
+        return one is not None and bool(one.layer.ending) and now >= one.settled_at
 
     def _drive_of(self, number: int) -> Drive:
-        """Return what plays in a layer, at the frequencies that were asked for."""
-        return self.contents[number].continued if number in self.contents else {}
+        """Return what plays in a layer, at the frequencies that were asked for.
+
+        Wire and amplifier round these.
+        """
+        one = self.contents.get(number)
+        requested = {} if one is None else one.layer.excitation
+        return {
+            name: replace(tone, frequency=requested[name].frequency)
+            for name, tone in (one.drive.items() if one else ())
+            if name in requested
+        }
 
 
 def _requested_at(one: LayerContent) -> float:

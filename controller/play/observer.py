@@ -46,9 +46,9 @@ class PlayReport:
         return [*self.contents.values()][-1]
 
     @property
-    def pattern(self) -> Layer:
+    def layer(self) -> Layer:
         """What plays of the newest content."""
-        return self.newest.pattern
+        return self.newest.layer
 
     @property
     def drive(self) -> Drive:
@@ -56,9 +56,9 @@ class PlayReport:
         return self.newest.drive
 
     @property
-    def question(self) -> Placement:
+    def placement(self) -> Placement:
         """Where the fingers of the newest content are, and all others."""
-        return self.newest.content.question
+        return self.newest.content.placement
 
     @cached_property
     def transient_contrast_db(self) -> float | None:
@@ -71,7 +71,7 @@ class PlayReport:
         is_alone = self.from_rest and len(self.contents) == 1
         if not (is_alone and self.quiet):
             return None
-        return self.timing.transient_contrast_db(self.pattern, self.question)
+        return self.timing.transient_contrast_db(self.layer, self.placement)
 
     @property
     def felt(self) -> Prediction | None:
@@ -146,7 +146,7 @@ def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceR
     )
 
 
-def _ignore(*_: object) -> None:
+def ignore(*_: object) -> None:
     """Do nothing."""
 
 
@@ -157,10 +157,10 @@ class Observer:
     Their exceptions are logged and go no further.
     """
 
-    contacts_changed: Callable[[tuple[Contact, ...], Change], None] = _ignore
-    pattern_applied: Callable[[PlayReport], None] = _ignore
-    silenced: Callable[[SilenceReport], None] = _ignore
-    refused: Callable[[str], None] = _ignore
-    link_lost: Callable[[str], None] = _ignore
-    cycle_completed: Callable[[], None] = _ignore
+    contacts_changed: Callable[[tuple[Contact, ...], Change], None] = ignore
+    pattern_applied: Callable[[PlayReport], None] = ignore
+    silenced: Callable[[SilenceReport], None] = ignore
+    refused: Callable[[str], None] = ignore
+    link_lost: Callable[[str], None] = ignore
+    cycle_completed: Callable[[], None] = ignore
     """Called after each cycle of the loop, at least once a second."""

@@ -149,7 +149,7 @@ class Planner:
     def note(self, change: Change) -> None:
         """Note that contacts have changed."""
         seen = {each.key for each in self._seen} if change.up else ()
-        if unseen := sum(each.key not in seen for each in change.up):
+        if change.up and (unseen := sum(each.key not in seen for each in change.up)):
             self._too_late(unseen)
 
     def look_again(self) -> None:

@@ -8,7 +8,7 @@ that of the command and not among the knots on the wire.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -52,8 +52,8 @@ class SetBuilder:
 
     def shape(
         self,
-        question: Placement,
-        pattern: answer.Layer,
+        placement: Placement,
+        layer: answer.Layer,
         is_continued: bool,
         *,
         is_ended: bool = True,
@@ -64,22 +64,22 @@ class SetBuilder:
         """
         has_onset = self.support.onset_knots > 0 and not is_continued
         has_ending = self.support.ending_knots > 0 and is_ended
-        pattern = replace(
-            pattern,
-            onset=pattern.onset if has_onset else None,
-            ending=pattern.ending if has_ending else None,
+        layer = replace(
+            layer,
+            onset=layer.onset if has_onset else None,
+            ending=layer.ending if has_ending else None,
         )
-        adds_onset = has_onset and pattern.onset is None
-        adds_ending = has_ending and pattern.ending is None
+        adds_onset = has_onset and layer.onset is None
+        adds_ending = has_ending and layer.ending is None
         if not (adds_onset or adds_ending):
-            return pattern
-        return self.timing.with_envelopes(pattern, question, onset=adds_onset, ending=adds_ending)
+            return layer
+        return self.timing.with_envelopes(layer, placement, onset=adds_onset, ending=adds_ending)
 
     def build_pattern(
         self,
         number: int,
-        pattern: answer.Layer,
-        question: Placement,
+        layer: answer.Layer,
+        placement: Placement,
         *,
         playing: Drive,
         valid_for: float,
@@ -96,14 +96,14 @@ class SetBuilder:
         onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
         among: layers that change at once, which share the time on the wires.
         """
-        tones, ramp = pattern.excitation, min(pattern.ramp, self.ramp_max)
+        tones, ramp = layer.excitation, min(layer.ramp, self.ramp_max)
         onset = ending = None
+        restarted = restarted_by(tones, {} if restarts else playing)
         if is_shaped:
-            restarted = restarted_by(tones, {} if restarts else playing)
             is_continued = not restarted.issuperset([tone.frequency for tone in tones.values()])
             is_ended = lasts > KNOT_STEP * ONSET_KNOTS
-            pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
-            onset, ending = pattern.onset, pattern.ending
+            layer = self.shape(placement, layer, is_continued, is_ended=is_ended)
+            onset, ending = layer.onset, layer.ending
             if onset:
                 onset = thinned(onset, knots=max(1, self.support.onset_knots // among))
         layers = route(
@@ -112,13 +112,13 @@ class SetBuilder:
             ramp=ramp,
             number=number,
             playing=playing,
-            restarts=restarts,
+            restarted=restarted,
             valid_for=valid_for,
             onset=onset,
             ending=ending,
         )
         ramp = next(iter(layers.values())).ramp
-        return layers, replace(pattern, ramp=ramp, onset=onset, ending=ending)
+        return layers, replace(layer, ramp=ramp, onset=onset, ending=ending)
 
     def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
         """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
@@ -144,7 +144,7 @@ def route(
     ramp: float,
     number: int = 0,
     playing: Drive | None = None,
-    restarts: bool = False,
+    restarted: Set[float] | None = None,
     valid_for: float = 0.0,
     onset: Envelopes | None = None,
     ending: Envelopes | None = None,
@@ -154,10 +154,10 @@ def route(
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
     amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
-    keeps its phase if all its ERAs play it already, unless it restarts. valid_for [s]: of the
-    layers. onset, ending: by ERA; an onset may lead an ERA that is not driven to silence. All other
-    limits belong to the ledgers of the amplifiers. Raises InputError for an ERA that the rig does
-    not have.
+    keeps its phase unless it is among those restarted: by default what not all its ERAs play yet.
+    valid_for [s]: of the layers. onset, ending: by ERA; an onset may lead an ERA that is not driven
+    to silence. All other limits belong to the ledgers of the amplifiers. Raises InputError for an
+    ERA that the rig does not have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -166,7 +166,7 @@ def route(
             "rig"
         )
     before: Drive = playing or {}
-    restarted = restarted_by(excitation, {} if restarts else before)
+    restarted = restarted_by(excitation, before) if restarted is None else restarted
     strokes = {era.name: era.stroke for era in rig.eras}
     onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
@@ -88,7 +89,7 @@ class _Intended:
 
 
 def _targets_of(targets: Targets) -> set[Target]:
-    return {target for _, target in targets}
+    return set(map(itemgetter(1), targets))
 
 
 def _of_any_level(targets: Targets) -> set[Target]:
@@ -157,9 +158,9 @@ class Selector:
         intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         fingers = {contact.key: contact.since for contact, _ in lasting}
         came, self._fingers = fingers.items() - self._fingers.items(), fingers
-        if came and self._lasting.targets and not intended.is_met_by(self._lasting):
-            # Who has come back may be elsewhere.
-            self._lasting = _felt(self._lasting, self._lasting.target_keys - dict(came).keys())
+        back = self._lasting.target_keys & dict(came).keys()
+        if back and not intended.is_met_by(self._lasting):  # who has come back may be elsewhere
+            self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
         arrived = self._thread.take()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
@@ -318,9 +319,7 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
         targets=tuple([each for each in chosen.targets if each[0].key in keys]),
         quiet=(*chosen.quiet, *[each for each, _ in chosen.targets if each.key not in keys]),
         contents=tuple(
-            content
-            for content in chosen.contents
-            if any(contact.key in keys for contact, _ in content.targets)
+            [each for each in chosen.contents if any(one.key in keys for one, _ in each.targets)]
         ),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )

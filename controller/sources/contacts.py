@@ -192,9 +192,12 @@ class ContactTracker:
     def _contact(
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float
     ) -> Contact:
-        """Return the contact of a touch, down since a time [s] unless it is known."""
+        """Return the contact of a touch, down since a time [s] unless it is known.
+
+        One whose panel stops reporting loads keeps its own.
+        """
         since, load = (time, 1.0) if known is None else (known.since, known.load)
-        if time - since >= LANDING:
+        if touch.load is not None and time - since >= LANDING:
             load = followed(load, touch.load)
         x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
         return Contact(key, x, y, since, load)

@@ -52,12 +52,12 @@ class LightPress:
         return None
 
 
-def followed(known: float, reported: float | None) -> float:
+def followed(known: float, reported: float) -> float:
     """Return the load of a contact: the known one, unless the reported one differs enough.
 
-    Bounded. A contact whose panel stops reporting keeps its load.
+    Bounded.
     """
-    if reported is None or not reported > 0:  # NaN is not
+    if not reported > 0:  # NaN is not
         return known
     bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
     change = max(bounded / known, known / bounded)

@@ -5,7 +5,6 @@ See the Open Sound Control 1.0 Specification (opensoundcontrol.stanford.edu/spec
 
 import re
 import struct
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -24,28 +23,30 @@ class OscError(ValueError):
     """A message that cannot be read."""
 
 
-def osc_messages(datagram: bytes, *, depth: int = _MAX_DEPTH) -> Iterator[bytes]:
-    """Yield the encoded messages of a datagram in order, for `read_message`.
+def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
+    """Return the encoded messages of a datagram in order, for `read_message`; so many at most.
 
-    What is neither a message nor a bundle is yielded, too; what follows an element whose size
-    exceeds its bundle is one such element. depth: how many bundles may enclose a message.
+    What is neither a message nor a bundle is among them; what follows an element whose size exceeds
+    its bundle is one such element.
     """
-    if len(datagram) < _BUNDLE_HEADER or not datagram.startswith(_BUNDLE) or not depth:
-        yield datagram
-        return
-    offset = _BUNDLE_HEADER
-    while offset < len(datagram):
-        size = int.from_bytes(datagram[offset : offset + 4], "big", signed=True)
-        if not 0 < size <= len(datagram) - offset - 4:
-            yield datagram[offset:]
-            return
-        yield from osc_messages(datagram[offset + 4 : offset + 4 + size], depth=depth - 1)
-        offset += 4 + size
-
-
-def _padded_length(length: int) -> int:
-    """The bytes of a string with so many before its zeros."""
-    return length + 4 - length % 4
+    found, ends = list[bytes](), list[int]()  # of the bundles that enclose an element
+    at, end, is_whole = 0, len(datagram), True
+    while len(found) < limit:
+        is_bundle = end - at >= _BUNDLE_HEADER and datagram.startswith(_BUNDLE, at)
+        if is_whole and is_bundle and len(ends) < _MAX_DEPTH:
+            ends.append(end)
+            at += _BUNDLE_HEADER
+        else:
+            found.append(datagram[at:end])
+            at = end
+        while ends and at == ends[-1]:
+            ends.pop()
+        if not ends:
+            break
+        size = int.from_bytes(datagram[at : at + 4], "big", signed=True)
+        is_whole = 0 < size <= ends[-1] - at - 4
+        at, end = (at + 4, at + 4 + size) if is_whole else (at, ends[-1])
+    return found
 
 
 # Most messages of a panel repeat: its name, the contacts that are alive, resting fingers.
@@ -56,7 +57,7 @@ def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
     Bytes of a text that are not UTF-8 are written as \\xNN.
     """
     address = message.partition(b"\0")[0]
-    at = _padded_length(len(address))
+    at = len(address) // 4 * 4 + 4  # texts are padded by one to four zeros
     tags = message[at:].partition(b"\0")[0]
     runs = _RUNS.findall(tags)
     if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
@@ -64,13 +65,13 @@ def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
     if b"".join(runs) != tags.translate(None, b",[]"):
         raise OscError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
     arguments: list[Argument] = []
-    at += _padded_length(len(tags))
+    at += len(tags) // 4 * 4 + 4
     try:
         for run in runs:  # numbers that follow each other at once
             if run in (b"s", b"S"):
                 end = message.index(b"\0", at)
                 arguments.append(message[at:end].decode(errors="backslashreplace"))
-                at += _padded_length(end - at)
+                at += (end - at) // 4 * 4 + 4
             elif run == b"b":
                 (size,) = struct.unpack_from(">I", message, at)
                 arguments.append(None)

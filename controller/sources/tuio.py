@@ -12,7 +12,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import MAX_DATAGRAM, Datagram, Peer, listen
@@ -120,7 +119,7 @@ class TuioReader:
         alive = tuple(bundle.positions) if sender.alive is None else sender.alive
         sender.positions = {id: known[id] for id in alive if id in known}
         sender.resting = 0 if alive else sender.resting + 1
-        touches = tuple(Touch(id, x, y) for id, (x, y) in sender.positions.items())
+        touches = tuple([Touch(id, x, y) for id, (x, y) in sender.positions.items()])
         return TouchFrame(name, now, touches, self._timeout, origin=f"tuio:{peer[0]}:{peer[1]}")
 
     def is_mute(self, *, since: float, now: float) -> bool:
@@ -225,7 +224,7 @@ class TuioReader:
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the messages of a datagram."""
     bundle = _Bundle()
-    messages = list(islice(osc_messages(datagram), _MAX_MESSAGES + 1))
+    messages = osc_messages(datagram, limit=_MAX_MESSAGES + 1)
     if len(messages) > _MAX_MESSAGES:
         bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
     for message in messages[:_MAX_MESSAGES]:

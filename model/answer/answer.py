@@ -196,7 +196,7 @@ class Answer:
                     onset,
                     ending,
                     self.contents.drive_mode,
-                    self._contrast_to_plate_db,
+                    None if self.contents.background is None else self._contrast_to_plate_db,
                 )
             )
         return tuple(layers)
@@ -264,12 +264,18 @@ class Answer:
     def _excitations(self, content: int) -> list[Excitation]:
         """The tones of a content, its carrier first; in other modes than `phased` they are one."""
         tones, on = self.tones, (self.eras, self.frequencies)
-        every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
-        own = [(row, weights, gain) for row, weights, gain, owner in every if owner == content]
         if self.contents.drive_mode != UNRESTRICTED:
-            drive = [(row, weights) for row, weights, _ in own]
-            return [excitation_of(drive, *on, gain=own[0][2])]
-        return [excitation_of([(row, weights)], *on, gain=gain) for row, weights, gain in own]
+            return [
+                excitation_of(
+                    [*zip(tones.rows, tones.weights, strict=True)], *on, gain=tones.gains[0]
+                )
+            ]
+        every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
+        return [
+            excitation_of([(row, weights)], *on, gain=gain)
+            for row, weights, gain, owner in every
+            if owner == content
+        ]
 
     @property
     def _contrast_to_plate_db(self) -> float | None:

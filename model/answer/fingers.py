@@ -239,7 +239,8 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
-    check_loads(loads)
+    if loads.count(1.0) < len(loads):
+        check_loads(loads)
     check_on_plate("finger", places, plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at

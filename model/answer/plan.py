@@ -172,7 +172,12 @@ class _Answering:
 
     def solve(self, min_contrast_db: float) -> Answer:
         """Change the plan until the worst finger has the contrast, else take the best tried."""
-        quiet = [n for n, each in enumerate(self.fingers) if each.stimulus is None]
+        quiet, is_modulated = list[int](), False
+        for number, finger in enumerate(self.fingers):
+            if finger.stimulus is None:
+                quiet.append(number)
+            elif finger.stimulus.modulation_hz is not None:
+                is_modulated = True
         plan = _Plan(self._first_contents, tuple(quiet))
         if len(plan.contents) > MAX_SEPARATE:
             plan = self._many_joined(plan)
@@ -192,9 +197,9 @@ class _Answering:
         if found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
             allowed = [each for each in tried if not _is_out_of_bounds(each)]
             below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
-            found = best_by(allowed, _worst_of)
+            found = best_by(allowed, worst_of)
             found = replace(found, applied=(*found.applied, below))
-        if self.drive_mode == UNRESTRICTED:
+        if is_modulated and self.drive_mode == UNRESTRICTED:
             found = with_modulation(self.table, found, playable=self.limits.frequencies)
         for stream in found.contents.streams:
             if stream.limit_db_sl is not None:
@@ -238,7 +243,7 @@ class _Answering:
                     break
             else:
                 found.append([number])
-        return tuple([tuple(each) for each in found])
+        return tuple(map(tuple, found))
 
     def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
         """The plan after the next step of the rule."""
@@ -390,7 +395,8 @@ def _is_out_of_bounds(found: Answer) -> bool:
     return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
 
 
-def _worst_of(found: Answer) -> float:
+def worst_of(found: Answer) -> float:
+    """Return the least contrast of all fingers that is promised; infinite for one alone."""
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 

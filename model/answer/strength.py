@@ -50,8 +50,6 @@ def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
-    if not limited:
-        return found
     heard = tones.foreign_db_sl
     if len(limited) < len(streams):  # of these alone
         alone = np.full(len(streams), _SILENT_DB)

@@ -26,7 +26,7 @@ def excitation_of(
     tones = {}
     for index, values in weights:  # Python's numbers: numpy's take ten times as long, one by one
         enough = (1 - NEARLY) * max(map(abs, values))
-        strongest = next(value for value in values if abs(value) >= enough)
+        (strongest, *_) = [value for value in values if abs(value) >= enough]
         factor = strongest.conjugate() / abs(strongest)
         frequency = float(frequencies[index])
         for era, value in zip(eras, values, strict=True):

@@ -3,6 +3,7 @@
 from array import array
 from collections.abc import Sequence
 from ctypes import c_void_p
+from itertools import chain
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -29,7 +30,7 @@ def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> Finger
     if by is None:
         return table.raster.fingertips(np.array(places), table.shapes)
     on, k = given_raster(table), len(places)
-    at = array("d", [coordinate for place in places for coordinate in place])
+    at = array("d", chain.from_iterable(places))
     sizes = (k, _FEW, on.r), (k, _FINE, on.r), (k, _FEW), (k, _FINE)
     found = [np.empty(size, dtype=np.float32) for size in sizes]
     to = [c_void_p(each.ctypes.data) for each in found]

@@ -161,16 +161,15 @@ class Shaper:
     def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
         """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
         known = self._fingers
-        found = {each: known.get(each) for each in positions}  # of which others may drop some
-        new = [each for each, one in found.items() if one is None]
-        if new:
+        found = dict(zip(positions, map(known.get, positions), strict=True))  # others drop some
+        if new := [each for each, one in found.items() if one is None]:
             weights, shapes = self._read_fingertips(new)
             made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
             found.update(made)
             known.update(made)
         for each in [*known][:-_KEPT]:
             known.pop(each, None)
-        weights, shapes = map(np.stack, zip(*[found[each] for each in positions], strict=True))
+        weights, shapes = map(np.stack, zip(*map(found.__getitem__, positions), strict=True))
         return weights, shapes
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:

@@ -221,7 +221,7 @@ class Felt:
     @property
     def frequency(self) -> float:
         """The only frequency that plays [Hz]."""
-        (frequency,) = {tone.frequency for tone in self.applied.pattern.excitation.values()}
+        (frequency,) = {tone.frequency for tone in self.applied.layer.excitation.values()}
         return frequency
 
     def level_db_sl(self, duration: float, *, since: float = 0.0) -> float:

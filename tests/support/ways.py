@@ -120,14 +120,14 @@ async def _touched(folder: Path) -> Way:
             recorder, played = Recorder(), asyncio.Event()
             frames = 0
 
-            def deliver(*fingers: Touch) -> None:
+            def datagram(*fingers: Touch) -> tuple[bytes, tuple[str, int], float]:
                 nonlocal frames
-                frames += 1
-                frame = TouchFrame("panel@here", clock.now(), fingers)
-                received[0](tuio_datagram(frame, frames), ("127.0.0.1", 4000), clock.now())
+                frames, now = frames + 1, clock.now()
+                frame = TouchFrame("panel@here", now, fingers)
+                return tuio_datagram(frame, frames), ("127.0.0.1", 4000), now
 
             for _ in range(40):
-                deliver(_RESTING)
+                received[0](*datagram(_RESTING))
                 await asyncio.sleep(0.05)
             seen = loop.seen
 
@@ -144,8 +144,9 @@ async def _touched(folder: Path) -> Way:
 
             observer = Observer(pattern_applied=applied)
             bench.daemon._controller.observers.append(observer)
+            coming = datagram(_RESTING, _COMING)
             with recorder:
-                loop.call_soon(deliver, _RESTING, _COMING)
+                loop.call_soon(received[0], *coming)
                 await played.wait()
     return recorder.way(is_until_written=True)
 

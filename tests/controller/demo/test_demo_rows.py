@@ -212,7 +212,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
             applied = SimpleNamespace(
                 time=clock.now(),
                 targets=(Prediction(finger, 20.0),),
-                pattern=SimpleNamespace(ramp=0.04),
+                layer=SimpleNamespace(ramp=0.04),
                 quiet=quiet,
                 from_rest=True,
             )

@@ -485,7 +485,7 @@ async def test_an_answer_is_shaped_by_the_timing_it_began_with(
         fingers.controller.replace_answers(table(), SetTiming())  # type: ignore[arg-type]
         await fingers.hold(0.3)
         (applied,) = fingers.applied
-        assert all(one.pattern.onset for one in applied.contents.values())
+        assert all(one.layer.onset for one in applied.contents.values())
 
 
 @in_virtual_time
@@ -634,7 +634,7 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
         then = before.get(content.key)
         if then is not None and then.frequency == content.frequency:
             at = places.index((content.targets[0][0].x, content.targets[0][0].y))
-            now, old = (_felt(each.pattern, fields[:, :, at]) for each in (content, then))
+            now, old = (_felt(each.layer, fields[:, :, at]) for each in (content, then))
             assert np.angle(now / old) == pytest.approx(0.0, abs=1e-3)
             kept += 1
     assert kept

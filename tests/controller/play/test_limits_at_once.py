@@ -32,7 +32,7 @@ def sums(found: Selection) -> np.ndarray:
     """Sum of the levels of all contents at each ERA (eras,)."""
     return np.array(
         [
-            sum(each.pattern.excitation[era.name].amplitude for each in found.contents) / era.stroke
+            sum(each.layer.excitation[era.name].amplitude for each in found.contents) / era.stroke
             for era in table().eras
         ]
     )
@@ -89,9 +89,7 @@ def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
     """What the first content leaves of the amplifiers' level is not enough for the second."""
     first, second = Target(CONTACTS[0].key, 14.0, priority=1), Target(CONTACTS[1].key, 14.0)
     content, _ = chosen(FREE, first, second).contents
-    most = max(
-        content.pattern.excitation[each.name].amplitude / each.stroke for each in table().eras
-    )
+    most = max(content.layer.excitation[each.name].amplitude / each.stroke for each in table().eras)
     amplitudes = {name: 1.02 * most * each for name, each in FREE.max_amplitudes.items()}
     found = chosen(replace(FREE, max_amplitudes=amplitudes), first, second)
     kept, held_back = found.predictions

@@ -13,7 +13,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.content import Content, Targets
 from controller.play.intent import Pulse, Target
-from controller.play.layers import LayerContent, Layers
+from controller.play.layers import LayerContent, Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from model.answer.answer import Layer
@@ -167,10 +167,8 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
 
     voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
     playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    contents = {
-        number: LayerContent(one, one.pattern, drive={}) for number, one in enumerate(voices)
-    }
-    playing.start(contents, frozenset(contents))
+    contents = {number: LayerContent(one, one.layer, drive={}) for number, one in enumerate(voices)}
+    playing.start(Sets(started=frozenset(contents)), contents, 0.0)
     every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
     assert playing.starting(every) == ([3], set())
 
@@ -188,7 +186,7 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
         number: LayerContent(one, pattern, drive={})
         for number, one in ((1, clicking), (0, lasting))
     }
-    playing.start(contents, frozenset({0}))
+    playing.start(Sets(started=frozenset({0})), contents, 0.0)
     numbers = playing.numbered([lasting, clicking])
     assert numbers == {0: lasting, 1: clicking}
     assert playing.starting(numbers) == ([], set())

@@ -143,7 +143,7 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     selection = selector_of(table).select((at(1, 0.1),), wanting(c1=60.0), capabilities)
     (content,) = selection.contents
     assert 12 < selection.predictions[0].level_db_sl < 60
-    loudest = max(tone.amplitude for tone in content.pattern.excitation.values())
+    loudest = max(tone.amplitude for tone in content.layer.excitation.values())
     assert loudest == pytest.approx(1e-4)
 
 
@@ -287,7 +287,7 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
         selector.select(contacts[:1], HapticIntent((first,)), limits, now=0.0)
     both = HapticIntent((first, second))
     selection = selector.select(contacts, both, limits, now=since)
-    amplitudes = [each.pattern.excitation["SW"].amplitude for each in selection.contents]
+    amplitudes = [each.layer.excitation["SW"].amplitude for each in selection.contents]
     assert amplitudes == pytest.approx([1e-6, left])
     assert selection.predictions[1].level_db_sl == pytest.approx(12 + 20 * math.log10(left / 1e-6))
 

@@ -115,7 +115,7 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
         assert (driven.onset.step, {phase for _, phase in driven.onset.knots}) == (50, {9000})
         assert level(chain) == pytest.approx(FULL / 2, abs=1e-4)
         (applied,) = chain.applied
-        assert applied.pattern.onset is not None
+        assert applied.layer.onset is not None
         assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
         assert applied.transient_contrast_db == 30.0
 
@@ -168,7 +168,7 @@ async def test_continued_tone_has_no_onset(shapes: Shapes) -> None:
         assert moved.onset is None
         assert len(levels_of(moved.ending)) == 7
         _, reported = chain.applied
-        assert reported.pattern.onset is None
+        assert reported.layer.onset is None
         assert reported.transient_contrast_db is None
 
 
@@ -187,8 +187,8 @@ async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(shapes: 
         await chain.hold(0.3, down=[FINGER, OTHER])
         assert [each.onset for each in sets(chain)[0].layer.commands] == [None] * 3
         (applied,) = chain.applied
-        assert applied.pattern.onset is None
-        assert (applied.pattern.ramp, sets(chain)[0].layer.ramp) == (0.015, 15)
+        assert applied.layer.onset is None
+        assert (applied.layer.ramp, sets(chain)[0].layer.ramp) == (0.015, 15)
         assert applied.transient_contrast_db == 10.0
 
 
@@ -201,7 +201,7 @@ async def test_ramp_replaces_an_onset_that_the_ledger_refuses(shapes: Shapes) ->
         (played,) = sets(chain)
         assert (played.layer.commands[0].onset, played.layer.commands[0].level) == (None, 2000)
         (applied,) = chain.applied
-        assert applied.pattern.onset is None
+        assert applied.layer.onset is None
         assert applied.transient_contrast_db == 10.0
         assert chain.refused == []
 

@@ -31,6 +31,10 @@ ENDED = (
     "there again"
 )
 
+RETRY = 1.0
+"""Time [s] after which a set is planned again that was refused without an end, fingers that rest
+included."""
+
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
 
@@ -95,6 +99,7 @@ class Planner:
             Chooser(table, self.layers.builder.shape), arrived=self._note_answer
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
+        self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused
         self._plan: Plan | None = None  # the last, None where what plays is unknown
         self._intent_due = math.inf  # s; when the intent may change without a touch
         self._retry_at = math.inf  # s; when a ledger may admit what it refused
@@ -194,14 +199,16 @@ class Planner:
     def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
         """Return silence instead of a plan whose sets were not played, though a ledger admits them.
 
-        It is planned again when the refusal ends, where that is known.
+        It is planned again when the refusal ends, or after RETRY where that is unknown.
         """
         if not plan.is_reported and self.layers.contents:
             self.layers.not_renewed(plan.sets, refusal)
             return replace(plan, sets=Sets())
         if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
             self._awaited.clear()
-        self._retry_at = math.inf if refusal.until is None else refusal.until
+        until = now + RETRY if refusal.until is None else refusal.until
+        self._retry_at = max(until, now + HEARTBEAT)
+        self._unplayed = plan.answered
         silence = replace(self.layers.silence(FADE_RAMP, now), reason=str(refusal))
         return replace(plan, sets=silence, is_reported=True)
 
@@ -228,6 +235,9 @@ class Planner:
             if before is not None and selected == self._selected and now < self._retry_at:
                 self._answered(())
                 return self._go_on(before, now)
+            down = {each.key for each in contacts}
+            self._tracker.wait_again({k: at for k, at in self._unplayed.items() if k in down})
+            self._unplayed = {}
             selection, sets = self._playable(selected), Sets()
             if is_felt := len(selection.contents) > 0:
                 sets = self.layers.plan(selection.contents, now)

@@ -256,6 +256,31 @@ async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it()
 
 
 @in_virtual_time
+async def test_a_finger_that_rests_feels_again_what_an_amplifier_refused_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All is silent meanwhile, for a second; the latency is that of the touch."""
+    async with fingers_on(table(), LAYOUT, at={}, held=0.1) as fingers:
+        fingers.must_be_felt, group = False, fingers.controller.group
+        apply, refused = group.apply, list[float]()
+
+        async def refuse_once(*given: Any, **more: Any) -> Any:
+            if not refused:
+                refused.append(asyncio.get_running_loop().time())
+                raise CommandRefused("not now")
+            return await apply(*given, **more)
+
+        monkeypatch.setattr(group, "apply", refuse_once)
+        fingers.at[1] = LEFT
+        await fingers.hold(0.9)
+        assert (len(fingers.refused), fingers.applied) == (1, [])
+        await fingers.hold(0.5)
+        (applied,) = fingers.applied
+        assert applied.is_touch
+        assert applied.latency == pytest.approx(1.0, abs=0.1)
+
+
+@in_virtual_time
 async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:

@@ -17,16 +17,16 @@ from controller.api.schema import (
     MIN_LEASE,
     STATE_WORDS,
     AmplifierSilence,
+    CauseAndRemedy,
     Count,
     DaemonStateName,
     EffectDescription,
     Epoch,
-    Explained,
     LatencySummary,
     LearningSummary,
     Message,
     Name,
-    Playing,
+    PatternFields,
     RigSummary,
     TableSummary,
     Topic,
@@ -59,7 +59,7 @@ class HelloResult(Message):
     )
 
 
-class StatusResult(Playing, Explained):
+class StatusResult(PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")

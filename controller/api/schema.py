@@ -103,7 +103,7 @@ class Empty(Message):
     """An empty object: no parameters, or no result."""
 
 
-class Explained(Message):
+class CauseAndRemedy(Message):
     """A state, and why."""
 
     cause: str = Field(description="why it is so")
@@ -221,7 +221,7 @@ class PlayedTone(Message):
     phase_deg: float
 
 
-class Playing(Message):
+class PatternFields(Message):
     """The contacts, and what plays for them."""
 
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
@@ -279,7 +279,7 @@ class AmplifierSilence(Message):
         return "unconfirmed, its watchdog has elapsed"
 
 
-class AmplifierReport(Explained):
+class AmplifierReport(CauseAndRemedy):
     """What an amplifier reports beside a fault, and who feels it; it plays on."""
 
     kind: ReportKind
@@ -350,7 +350,7 @@ BAD: tuple[LearningState, ...] = ("changed", "restarting", "failed")
 """States in which somebody should look after the plate or the estimator."""
 
 
-class PlateEvent(Explained):
+class PlateEvent(CauseAndRemedy):
     """What is known of the plate has changed, or whether it is followed."""
 
     state: LearningState

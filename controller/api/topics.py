@@ -17,21 +17,21 @@ from controller.api.jsonrpc import event_line
 from controller.api.schema import (
     MAX_RATE,
     STATE_WORDS,
+    CauseAndRemedy,
     ContactStatus,
     Count,
     DaemonStateName,
     Epoch,
-    Explained,
     LatencySummary,
     Message,
+    PatternFields,
     PlateEvent,
-    Playing,
     Topic,
     TouchInputStatus,
 )
 
 
-class StateEvent(Explained):
+class StateEvent(CauseAndRemedy):
     """The daemon changed its state."""
 
     old: DaemonStateName
@@ -49,7 +49,7 @@ class ContactsEvent(Message):
     contacts: list[ContactStatus]
 
 
-class PatternEvent(Playing):
+class PatternEvent(PatternFields):
     """A pattern that the amplifiers confirmed."""
 
     latency_ms: float | None = Field(

@@ -144,7 +144,7 @@ class PlateView:
 
 
 def playing_of(applied: PlayReport | None) -> dict[str, Any]:
-    """What of a `Playing` is of a pattern: its tones, what is promised and predicted, if any."""
+    """What `PatternFields` say of a pattern: its tones, what is promised and predicted, if any."""
     felt = None if applied is None else applied.felt
     contents = {} if applied is None else applied.contents
     return {

@@ -74,7 +74,7 @@ class ClientConnection(asyncio.Protocol):
 
     _transport: Any = None
 
-    def __init__(self, acceptor: "Acceptor") -> None:
+    def __init__(self, acceptor: "ConnectionAcceptor") -> None:
         self.link = KeptLink(acceptor.links)
         self._acceptor = acceptor
         self._frames: FrameHeads | None = None
@@ -175,7 +175,7 @@ CONNECTION: ContextVar[ClientConnection] = ContextVar("CONNECTION")
 
 
 @dataclass
-class Acceptor:
+class ConnectionAcceptor:
     """Accepts connections of a listening socket for a web server.
 
     make_server: makes the web server's protocol of a connection; tls: None without.

@@ -14,7 +14,7 @@ from aiohttp.http import HttpProcessingError
 
 from controller.api.admission import allow_many_descriptors
 from controller.gateway.app import Gateway
-from controller.gateway.connections import CLIENT_TIMEOUT, Acceptor
+from controller.gateway.connections import CLIENT_TIMEOUT, ConnectionAcceptor
 from controller.gateway.settings import Settings
 from model.errors import InputError
 from registry.garbage_collection import no_long_collections
@@ -60,7 +60,7 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     own = asyncio.gather(
         gateway.field.run(),
         gateway.keep_connected(),
-        Acceptor(runner.server, tls).run(listening),
+        ConnectionAcceptor(runner.server, tls).run(listening),
     )
     own.add_done_callback(lambda _: over.set())
     announce(listening.getsockname()[1])

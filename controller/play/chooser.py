@@ -34,7 +34,7 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Requested:
+class ChoiceRequest:
     """What is to be chosen among contacts: for short pulses, and what lasts, None where it is kept.
 
     protected: contacts that must not notice the contents of others; before: what is felt now, by
@@ -60,13 +60,13 @@ class Requested:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Choice:
     """What was asked, and what was chosen: for what lasts, and for each finger with a pulse.
 
     is_limited: whether what lasts has only what pulses leave that play beside it.
     """
 
-    requested: Requested
+    requested: ChoiceRequest
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
     is_limited: bool
@@ -79,7 +79,7 @@ class Chooser:
     table: LocalizationTable
     shape: Shape | None = None
 
-    def choose(self, requested: Requested, capabilities: PlaybackCapabilities) -> Chosen:
+    def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
         """Choose what is asked for, what lasts first."""
         kept, lasting, is_limited = [*requested.kept], None, False
         if requested.lasting is not None:
@@ -91,10 +91,10 @@ class Chooser:
             found = self._chosen(requested, (each,), left, kept)
             kept.append(found)
             short[each[0].key] = found
-        return Chosen(requested, lasting, short, is_limited)
+        return Choice(requested, lasting, short, is_limited)
 
     def _lasting(
-        self, requested: Requested, targets: Targets, capabilities: PlaybackCapabilities
+        self, requested: ChoiceRequest, targets: Targets, capabilities: PlaybackCapabilities
     ) -> tuple[Selection, bool]:
         """Choose what lasts, and whether it is limited by pulses that play.
 
@@ -123,7 +123,7 @@ class Chooser:
 
     def _chosen(
         self,
-        requested: Requested,
+        requested: ChoiceRequest,
         targets: Targets,
         capabilities: PlaybackCapabilities,
         beside: Sequence[Selection] | None = None,
@@ -210,7 +210,7 @@ def _alike(found: Answer, target: Target) -> Answer:
     return scaled(found, -excess) if excess > 0 else found
 
 
-def _beside(requested: Requested, found: Selection, beside: Sequence[Selection]) -> Selection:
+def _beside(requested: ChoiceRequest, found: Selection, beside: Sequence[Selection]) -> Selection:
     """Return what was chosen for a pulse with what its finger feels of others besides."""
     ((contact, _),) = found.targets
     heard = [each.quiet_levels[contact.key] for each in beside if contact.key in each.quiet_levels]
@@ -237,10 +237,10 @@ def _contents(parts: Iterable[Selection]) -> list[Content]:
     return [content for part in parts for content in part.contents]
 
 
-def unanswered(requested: Requested, reason: str) -> Chosen:
+def unanswered(requested: ChoiceRequest, reason: str) -> Choice:
     """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
     none = silent(requested, requested.lasting or (), reason)
-    return Chosen(
+    return Choice(
         requested,
         None if requested.is_rested else none,
         {each[0].key: silent(requested, (each,), reason) for each in requested.short},
@@ -248,7 +248,7 @@ def unanswered(requested: Requested, reason: str) -> Chosen:
     )
 
 
-def silent(requested: Requested, targets: Targets, reason: str) -> Selection:
+def silent(requested: ChoiceRequest, targets: Targets, reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
     quiet = requested.quiet_beside(targets)
     skipped = tuple(not_served(contact, reason) for contact, _ in targets)

@@ -12,7 +12,7 @@ from operator import itemgetter
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.chooser import Chooser, Chosen, Requested, is_alone, sum_db, unanswered
+from controller.play.chooser import Choice, ChoiceRequest, Chooser, is_alone, sum_db, unanswered
 from controller.play.content import (
     BEING_CHOSEN,
     Prediction,
@@ -45,7 +45,7 @@ _NOTHING = Selection((), ())
 
 
 @dataclass(frozen=True)
-class _Intended:
+class _Intention:
     """Who is to feel what, among contacts: what lasts, short pulses, and who must not notice."""
 
     contacts: tuple[Contact, ...]
@@ -120,7 +120,7 @@ class Selector:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self.chooser = chooser
-        self._thread: AnswerThread[Chosen] = AnswerThread(arrived, self._request_again)
+        self._thread: AnswerThread[Choice] = AnswerThread(arrived, self._request_again)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
@@ -155,7 +155,7 @@ class Selector:
         short: list[tuple[Contact, Target]] = []
         for each in served:
             (short if each[1].is_short else lasting).append(each)
-        intended = _Intended(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        intended = _Intention(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         fingers = {contact.key: contact.since for contact, _ in lasting}
         came, self._fingers = fingers.items() - self._fingers.items(), fingers
         back = self._lasting.target_keys & dict(came).keys()
@@ -202,12 +202,12 @@ class Selector:
 
     def _to_request(
         self,
-        intended: _Intended,
+        intended: _Intention,
         pulses: Mapping[ContactKey, Selection],
         now: float,
         *,
         has_waited: bool,
-    ) -> Iterator[Requested]:
+    ) -> Iterator[ChoiceRequest]:
         """Yield what is to be asked now, one after the other; pulses: of all fingers, until now.
 
         A pulse that has waited for the thread goes before what lasts, for which it would be late.
@@ -226,7 +226,9 @@ class Selector:
         for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         playing = _playing(self._short, now)
-        requested = Requested(new, intended.contacts, intended.protected, before, (felt, *playing))
+        requested = ChoiceRequest(
+            new, intended.contacts, intended.protected, before, (felt, *playing)
+        )
         if has_waited or is_kept:
             if new:
                 yield requested
@@ -246,7 +248,7 @@ class Selector:
             is_rested=is_rested,
         )
 
-    def _is_intended(self, chosen: Chosen, intended: _Intended) -> bool:
+    def _is_intended(self, chosen: Choice, intended: _Intention) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
 
         Places may have changed since, and what effects change, or a program that plays them again:
@@ -264,7 +266,7 @@ class Selector:
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
 
-    def _take(self, chosen: Chosen, *, is_late: bool = False) -> None:
+    def _take(self, chosen: Choice, *, is_late: bool = False) -> None:
         """Take what was chosen; is_late: without what lasts."""
         self._short = {**self._short, **chosen.short}
         if chosen.lasting is not None and not is_late:

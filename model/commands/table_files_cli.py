@@ -51,7 +51,7 @@ class Picture(StrEnum):
     PDF = "pdf"
 
 
-class Content(StrEnum):
+class TableContent(StrEnum):
     """Rows of a CSV file."""
 
     PATTERNS = "patterns"
@@ -95,7 +95,7 @@ def export(
     to: Annotated[Format, typer.Option("--format", help="MATLAB and Octave, or text.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
     content: Annotated[
-        Content | None,
+        TableContent | None,
         typer.Option(help="Rows of a CSV file: patterns of the map, or fields on the raster."),
     ] = None,
     as_json: JsonOption = False,
@@ -115,7 +115,7 @@ def export(
     if to is Format.MAT:
         export_mat(table, output)
     else:
-        export_csv(table, output, content=(content or Content.PATTERNS).value)
+        export_csv(table, output, content=(content or TableContent.PATTERNS).value)
     rows = [
         f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
         f"Next: {_reader(to, output)}",

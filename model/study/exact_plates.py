@@ -76,7 +76,7 @@ def draw_plates(
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class LevelAndContrast:
     """What fingers feel on d plates: amplitude to threshold at the weakest target (d,).
 
     contrast (d,): of it to that at the loudest quiet point, None without quiet fingers.
@@ -88,7 +88,7 @@ class Felt:
 
 def felt_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
-) -> Felt:
+) -> LevelAndContrast:
     """What fingers feel of an excitation on plates; powers of its tones add."""
     rows, power = powers_on(table, placed, excitation, plates)
     sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
@@ -97,8 +97,8 @@ def felt_on(
     count = len(placed.targets)
     level = means[:count].min(axis=0)
     if not placed.quiet:
-        return Felt(level, None)
-    return Felt(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
+        return LevelAndContrast(level, None)
+    return LevelAndContrast(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
 
 
 def powers_on(

@@ -14,7 +14,7 @@ import pytest
 from aiohttp import web
 
 from controller.gateway.app import Gateway
-from controller.gateway.connections import MAX_HANDSHAKES, Acceptor
+from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
 from controller.gateway.serving import listen, load_certificate, serve
 from controller.gateway.settings import Settings, read_token
 from daemon_bench import PATIENCE, until
@@ -145,7 +145,7 @@ async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> 
     """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
     listening = listen(Settings(socket=tmp_path / "era.sock", host=host, port=0))
     server = web.Server(AsyncMock())
-    accepting = asyncio.create_task(Acceptor(server, None).run(listening))
+    accepting = asyncio.create_task(ConnectionAcceptor(server, None).run(listening))
     _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
     await until(lambda: bool(server.connections))
     theirs = server.connections[0].transport

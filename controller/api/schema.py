@@ -347,7 +347,7 @@ LearningState: TypeAlias = Literal[
 """What happens to what settled patterns show of the plate."""
 
 BAD: tuple[LearningState, ...] = ("changed", "restarting", "failed")
-"""States in which somebody should look after the plate or the estimator."""
+"""States in which plate or estimator need attention."""
 
 
 class PlateEvent(CauseAndRemedy):

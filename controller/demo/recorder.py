@@ -16,10 +16,11 @@ from controller.demo.touch_row import (
     peak_contrast_db,
     steady_contrast_db,
 )
-from controller.play.content import HELD_BACK, Prediction
+from controller.play.content import Prediction
 from controller.play.layers import LayerContent
 from controller.play.observer import Observer, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
+from model.answer.answer import HELD_BACK
 from model.transients.measures import ONSET_WINDOW
 from registry import clock
 

@@ -9,16 +9,13 @@ import numpy as np
 
 from controller.play.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer import answer
-from model.answer.answer import Layer
+from model.answer.answer import HELD_BACK, OWN, Layer
 from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
 from model.table.table import LocalizationTable
 
 Targets = tuple[tuple[Contact, Target], ...]
-
-OWN, SHARED, HELD_BACK = answer.OWN, answer.SHARED, answer.HELD_BACK
 
 BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
 

@@ -85,7 +85,7 @@ class Cycle:
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
 
-        It sends only while they are armed. An observer is told of a loss, all others are stopped
+        It sends only while they are armed. A loss is reported to observers; all others are stopped
         by then; a loss while disarmed shows in the next request, as the supervisor checks.
         """
         while not self._is_closed:

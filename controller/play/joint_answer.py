@@ -14,13 +14,15 @@ from functools import cache, partial
 import numpy as np
 
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
+from controller.play.content import Content, Prediction, Selection, not_served
 from controller.play.intent import Target, band_of_table
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import (
+    HELD_BACK,
     IMPERCEPTIBLE_DB_SL,
     MIN_CONTRAST_DB,
     OWN_CONTRAST_DB,
+    SHARED,
     Answer,
     Layer,
     Sensation,

@@ -235,9 +235,10 @@ class Planner:
             if before is not None and selected == self._selected and now < self._retry_at:
                 self._answered(())
                 return self._go_on(before, now)
-            down = {each.key for each in contacts}
-            self._tracker.wait_again({k: at for k, at in self._unplayed.items() if k in down})
-            self._unplayed = {}
+            if self._unplayed:
+                down = {each.key for each in contacts}
+                self._tracker.wait_again({k: at for k, at in self._unplayed.items() if k in down})
+                self._unplayed = {}
             selection, sets = self._playable(selected), Sets()
             if is_felt := len(selection.contents) > 0:
                 sets = self.layers.plan(selection.contents, now)

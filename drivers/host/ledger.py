@@ -298,8 +298,8 @@ class Ledger:
                 largest = abs(way.last)
                 if late < way.end:
                     largest = max(largest, abs(way.first), *map(abs, way.knots))
-                if ending is not None and ending.knots:
-                    largest = max(largest, max(ending.knots)[0] / full)
+                if ending is not None:
+                    largest = max(largest, ending.peak / full)
                 if not voice.has_ended and way.last:
                     largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
                 levels[channel] += largest

@@ -194,7 +194,7 @@ class _Answering:
             for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
                 plan = self._with_less(plan, found)
             tried.append(found := self._measure(plan))
-        if found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
+        if found.tones.worst_db < min_contrast_db:  # NaN for a finger alone
             allowed = [each for each in tried if not _is_out_of_bounds(each)]
             below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
             found = best_by(allowed, worst_of)

@@ -29,7 +29,7 @@ def test_sources_pass() -> None:
 
 
 def test_ranges_of_the_header_are_used() -> None:
-    """Of a quantity that only a board or a host needs there is none."""
+    """A quantity that only a board or a host needs has none."""
     paths = [each for each in (ROOT / "firmware").rglob("*.[ch]") if each.name != "protocol.h"]
     used = "".join(each.read_text("utf-8") for each in paths)
     header = (ROOT / "firmware" / "core" / "protocol.h").read_text("utf-8")

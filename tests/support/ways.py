@@ -192,7 +192,7 @@ def steps_of(name: str) -> list[tuple[str, str]]:
 
 
 def beside(name: str) -> str:
-    """What the page says below the steps of a way: its other files, and how much is called."""
+    """What the page says below the steps of a way: its other files."""
     way = WAYS[name]()
     steps = {file for file, _ in steps_of(name)}
     others = ", ".join(f"`{file}`" for file in way.files if file not in steps)

@@ -208,7 +208,7 @@ GRANTED += ARM
     ],
 )
 def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: set[int]) -> None:
-    """Without Host, bodies without a length, other versions of HTTP, and what is none."""
+    """Without Host, bodies without a length, other versions of HTTP, and no HTTP at all."""
     response = raw(gateway, filled(data, gateway))
     assert response.status in statuses
     assert response.headers.startswith("HTTP/1.")

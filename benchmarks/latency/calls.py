@@ -7,10 +7,7 @@ a second.
 """
 
 import asyncio
-import os
 import sys
-import types
-from collections import Counter
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -29,7 +26,6 @@ from model.answer.timing import Timing
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table_cache import cached_table
-from registry import clock
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -37,8 +33,7 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 _ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(_ROOT / "tests" / "support"))
 _run_virtual: Any = import_module("virtual_loop").run_virtual
-_OWN = tuple(f"{_ROOT / name}{os.sep}" for name in ("controller", "drivers", "model", "registry"))
-_DRIVERS = f"{_ROOT / 'drivers'}{os.sep}"
+_Recorder: Any = import_module("own_calls").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
 
@@ -63,10 +58,7 @@ class FarEnd:
         """Do nothing: all that has come was handed over."""
 
     def _receive(self, data: bytes) -> None:
-        profile = sys.getprofile()
-        sys.setprofile(None)
-        self._end.receive(data, clock.now())
-        sys.setprofile(profile)
+        self._end.receive(data, asyncio.get_running_loop().time())
 
     def _reply(self, data: bytes) -> None:
         asyncio.get_running_loop().call_soon(self.line.received, data)
@@ -95,37 +87,14 @@ class MemoryLines(Lines):
         return Amplifier(far_end.line, 1, limits, name=name, is_output=is_output)
 
 
-class Count:
-    """Own calls by file, while it is entered."""
-
-    def __init__(self) -> None:
-        self.calls: Counter[str] = Counter()
-        self._pending: Counter[str] = Counter()
-
-    def __enter__(self) -> "Count":
-        sys.setprofile(self._count)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        sys.setprofile(None)
-
-    def written(self) -> None:
-        """Count what was called until now."""
-        self.calls, self._pending = self.calls + self._pending, Counter()
-
-    def _count(self, frame: types.FrameType, event: str, _: object) -> None:
-        if event == "call" and frame.f_code.co_filename.startswith(_OWN):
-            self._pending[frame.f_code.co_filename] += 1
-
-
 async def measure(rig: Rig) -> list[str]:
     """Return the cells of a rig."""
-    count, played = Count(), asyncio.Event()
+    recorder, played = _Recorder(), asyncio.Event()
     table, _ = cached_table(rig)
     controller = Controller(
         rig,
         table,
-        lines=lambda: MemoryLines(rig, count.written),
+        lines=lambda: MemoryLines(rig, recorder.written),
         intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
         timing=Timing(table),
         observer=Observer(pattern_applied=lambda applied: played.set()),
@@ -148,20 +117,19 @@ async def measure(rig: Rig) -> list[str]:
     await asyncio.sleep(_FRAME_INTERVAL)
     deliver()
     await asyncio.sleep(1.0)
-    with count:
+    with recorder:
         played.clear()
         deliver(Touch(2, x + 0.02, y))
         await played.wait()
-    touched = count.calls
-    in_drivers = sum(calls for file, calls in touched.items() if file.startswith(_DRIVERS))
+    touched = recorder.way(is_until_written=True)
+    in_drivers = sum(n for file, n in touched.calls.items() if file.startswith("drivers/"))
     await rest()
-    count.calls.clear()
-    with count:
+    with recorder:
         await rest()
-    resting = count.calls.total() / _RESTING
+    resting = recorder.way(is_until_written=True).calls.total() / _RESTING
     await controller.close()
     await running
-    return [f"{touched.total()}", f"{in_drivers}", f"{len(touched)}", f"{resting:.0f}"]
+    return [f"{touched.calls.total()}", f"{in_drivers}", f"{len(touched.files)}", f"{resting:.0f}"]
 
 
 def table(rigs: Mapping[str, str]) -> str:

@@ -96,7 +96,7 @@ class ApiService:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
         if client.number is not None:
-            self._controller.lift(f"{_origin(client)}:")
+            self._controller.cycle.lift(f"{_origin(client)}:")
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -139,10 +139,10 @@ class ApiService:
             latency_ms=self._publisher.latencies.summary(),
             lift_latency_ms=self._publisher.lift_latencies.summary(),
             lost_events=dict(self._publisher.hub.lost),
-            rejected_touches=dict(self._controller.rejects.counts),
-            rejected_examples=dict(self._controller.rejects.examples),
+            rejected_touches=dict(self._controller.cycle.rejects.counts),
+            rejected_examples=dict(self._controller.cycle.rejects.examples),
             inputs=self._publisher.inputs().inputs,
-            clicks_too_late=self._controller.clicks_too_late,
+            clicks_too_late=self._controller.cycle.clicks_too_late,
             learning=self._publisher.learning_summary(),
             slow_reason=why_slow(),
             uptime_s=now - self._started,
@@ -262,7 +262,7 @@ class ApiService:
         )
         # The same source name of two clients denotes two sources.
         name = f"{origin}:{params.source}"
-        self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
+        self._controller.cycle.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
     @api_method()
@@ -308,7 +308,7 @@ class ApiService:
                 remedy="touch the plate there, or send a touch over the API",
             )
         self._layout.play(params.effect, nearest, clock.now(), level_db_sl=params.level_db_sl)
-        self._controller.request_update()
+        self._controller.cycle.request_update()
         return Empty()
 
     @api_method(over_http=False)

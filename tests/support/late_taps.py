@@ -113,7 +113,7 @@ def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counte
                     counts[f"{wire}, {amplifiers}, seed {seed}: {name} is not silent"] += 1
             counts["clicks"] = len(clicks.pulses)
             counts["played"] = sum(each.started_at is not None for each in clicks.pulses)
-            counts["too late"] = chain.controller.clicks_too_late
+            counts["too late"] = chain.controller.cycle.clicks_too_late
             await chain.close()
             found = chain.plate_judge.violations
             counts.update(f"{wire}, {amplifiers}, seed {seed}: {one}" for one in found)

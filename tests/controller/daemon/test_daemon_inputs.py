@@ -54,7 +54,7 @@ async def test_fingers_of_a_leaving_client_are_lifted(
 ) -> None:
     """At once, of every source but one where that fails, which times out; others' stay."""
     async with ready_daemon(tmp_path) as (bench, era):
-        tracker = bench.daemon._controller._tracker
+        tracker = bench.daemon._controller.cycle.tracker
         update = tracker.update
 
         def failing(frame: TouchFrame, **options: bool) -> Change:
@@ -289,7 +289,7 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
         await era.arm("me", lease_s=60)
         begin = clock.now()
         for ago, touches in ((0.12, (Touch(1, 0.4, 0.5),)), (0.06, ())):
-            bench.daemon._controller.deliver(TouchFrame("brief", begin - ago, touches))
+            bench.daemon._controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)
 

@@ -157,7 +157,7 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
     The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
     """
     async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
-        check, count = fingers.controller._planner.layers.check, len(fingers.committed)
+        check, count = fingers.controller.cycle.planner.layers.check, len(fingers.committed)
         (own,), refused, loop = fingers.applied[-1].contents, [], asyncio.get_running_loop()
 
         def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
@@ -167,7 +167,7 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
                 return CommandRefused("too much power")
             return check(layers)
 
-        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
+        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
         fingers.at[2] = RIGHT
         await fingers.hold(0.3)
         felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
@@ -193,7 +193,7 @@ async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that(
         player = fingers.controller._intent_source
         assert isinstance(player, EffectPlayer)
         player.play("loud", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-        fingers.controller.request_update()
+        fingers.controller.cycle.request_update()
         await fingers.hold(0.2)
         raised = [each for each in fingers.applied if each.time > begin + 0.012]
         felt = [each for applied in raised for each in applied.targets if each.contact.key.id == 1]
@@ -214,7 +214,7 @@ async def test_what_is_refused_beside_a_click_is_felt_after_it(
     layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
     async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
         check, refused, loop = (
-            fingers.controller._planner.layers.check,
+            fingers.controller.cycle.planner.layers.check,
             [],
             asyncio.get_running_loop(),
         )
@@ -229,7 +229,7 @@ async def test_what_is_refused_beside_a_click_is_felt_after_it(
                 return CommandRefused("too much power")
             return check(layers)
 
-        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
+        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
         fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
         await fingers.hold(0.3)
         assert refused
@@ -247,7 +247,7 @@ async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it()
         assert isinstance(player, EffectPlayer)
         begin = asyncio.get_running_loop().time()
         player.play("click", contact, begin, level_db_sl=None)
-        fingers.controller.request_update()
+        fingers.controller.cycle.request_update()
         await fingers.hold(1.0)
         assert len(fingers.refused) == 1
         (target,) = fingers.applied[-1].targets
@@ -284,14 +284,14 @@ async def test_a_finger_that_rests_feels_again_what_an_amplifier_refused_once(
 async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        check, count = fingers.controller._planner.layers.check, len(fingers.committed)
+        check, count = fingers.controller.cycle.planner.layers.check, len(fingers.committed)
 
         def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             if any(not each.tones and not each.renew for each in layers["main"]):
                 return CommandRefused("an ending is too loud")
             return check(layers)
 
-        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
+        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
         del fingers.at[1]
         fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
         await fingers.hold(0.3)
@@ -344,7 +344,7 @@ async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
         player, contact = fingers.controller._intent_source, fingers.applied[-1].contacts[0]
         assert isinstance(player, EffectPlayer)
         player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-        fingers.controller.request_update()
+        fingers.controller.cycle.request_update()
         await fingers.hold(0.4)
         changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
         assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2
@@ -526,7 +526,7 @@ async def test_an_answer_of_a_former_layout_is_not_played(
         assert isinstance(player, EffectPlayer)
         bands = [replace(region, band=(200.0, 320.0)) for region in LAYOUT.regions]
         player.replace(replace(LAYOUT, regions=tuple(bands)))
-        fingers.controller.request_update()
+        fingers.controller.cycle.request_update()
         await fingers.hold(0.3)
         (applied,) = fingers.applied[count:]
         assert len(applied.contents) == 2
@@ -546,7 +546,7 @@ async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
         (contact,) = [each for each in fingers.applied[-1].contacts if each.key.id == 1]
         for _ in range(10):
             player.play("long", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-            fingers.controller.request_update()
+            fingers.controller.cycle.request_update()
             await fingers.hold(0.03)
         names = {
             one.content.targets[0][1].content

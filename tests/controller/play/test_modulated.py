@@ -135,7 +135,7 @@ async def test_voices_of_one_finger_end_together() -> None:
 async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
     """A carrier without one side band would be another content: the finger feels none."""
     async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
-        layers_of_all = fingers.controller._planner.layers
+        layers_of_all = fingers.controller.cycle.planner.layers
         check, refusals = layers_of_all.check, []
 
         def refusing(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:

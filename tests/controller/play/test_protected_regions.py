@@ -47,7 +47,7 @@ def _tick(fingers: Fingers, contact: Contact) -> None:
     player = fingers.controller._intent_source
     assert isinstance(player, EffectPlayer)
     player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-    fingers.controller.request_update()
+    fingers.controller.cycle.request_update()
 
 
 @in_virtual_time
@@ -169,14 +169,14 @@ async def test_a_click_that_is_refused_leaves_what_others_share(
     """Of the finger whose content it is: only the click is left out."""
     async with fingers_on(table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
-        sent, check = len(fingers.committed), fingers.controller._planner.layers.check
+        sent, check = len(fingers.committed), fingers.controller.cycle.planner.layers.check
 
         def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             if any(tone.level for each in layers["main"] if not each.renew for tone in each.tones):
                 return CommandRefused("too much power")
             return check(layers)
 
-        monkeypatch.setattr(fingers.controller._planner.layers, "check", refuse)
+        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
         _tick(fingers, one.content.targets[0][0])
         await fingers.hold(0.1)
         assert {n: each.content for n, each in fingers.applied[-1].contents.items()} == {

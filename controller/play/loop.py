@@ -179,7 +179,7 @@ class Controller:
         return amplifier
 
     async def arm(self) -> None:
-        """Switch the high voltage on, so that touches are felt; `cycle` must run or start at once."""
+        """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
         was_armed = self.group.is_armed
         await self.group.arm()
         self.cycle.begin(was_armed=was_armed)

@@ -36,7 +36,7 @@ async def test_touches_of_clients_are_delivered_in_places_of_the_sensor(tmp_path
     """Shares of a plate of 0.3048 by 0.2286 m, from its north-west corner, by client and source."""
     frames: list[TouchFrame] = []
     async with ready_daemon(tmp_path) as (bench, one), await bench.client() as other:
-        tell_first(bench.daemon._controller, "deliver", frames.append)
+        tell_first(bench.daemon._controller.cycle, "deliver", frames.append)
         await one.touch([(0.0762, 0.1143), (0.2286, 0.05715)], source="me")
         await other.touch([(0.1, 0.1)], source="me")
         touched, second = frames

@@ -263,7 +263,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             decided: list[bool] = []
             request_update = bench.daemon._controller.cycle.request_update
             monkeypatch.setattr(
-                bench.daemon._controller,
+                bench.daemon._controller.cycle,
                 "request_update",
                 lambda: (decided.append(True), request_update()),
             )

@@ -9,10 +9,9 @@ import numpy as np
 
 from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
-from controller.effects.band import band_problem
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.region import Region
-from controller.play.intent import Target
+from controller.play.intent import Target, band_problem
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.effects.band import TunedSection
 from controller.effects.click import Click
 from controller.effects.detents import Detents
-from controller.effects.effect import Effect
+from controller.effects.effect import Effect, TunedSection
 from controller.effects.layout_file import LayoutSection, RegionSection, load_layout
 from key_tables import key_rows
 from model.config.document import ConfigError

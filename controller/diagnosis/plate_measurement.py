@@ -80,7 +80,7 @@ class PlateSelfMeasurement:
             sensors = await plate_sensors(self._rig, self._player.amplifiers)
             tones = interleaved(
                 self._rig,
-                _frequency_range(can.frequencies, sensors.used),
+                _frequency_range(can.limits.frequencies, sensors.used),
                 is_quick=self._is_quick,
             )
             started = clock.now()

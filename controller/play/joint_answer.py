@@ -196,7 +196,7 @@ def fingers_of(
             duration = target.pulse.duration
         stimulus = Stimulus(
             MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
-            playable_band(target.band, table.frequencies, capabilities.frequencies),
+            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
             duration,
             None if duration is not None else target.modulation_hz,
             is_limit=target.level_db_sl is None,

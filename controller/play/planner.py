@@ -129,7 +129,7 @@ class Planner:
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
         placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
-        band = self.capabilities.frequencies
+        band = self.capabilities.limits.frequencies
         (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
         onset, ending = support.onset_knots > 0, support.ending_knots > 0
         layer = timing.with_envelopes(layer, placed, onset=onset, ending=ending)

@@ -22,6 +22,7 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
 from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.strength import Limits
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
@@ -91,8 +92,7 @@ def playable(layers: int = 8) -> PlaybackCapabilities:
     return PlaybackCapabilities(
         "phased",
         ("phased",),
-        (40.0, 320.0),
-        {era.name: era.stroke for era in table().eras},
+        Limits((40.0, 320.0), {era.name: era.stroke for era in table().eras}),
         RAMPS_ONLY,
         layers=layers,
     )

@@ -13,7 +13,7 @@ from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, TouchSimulator
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.play.chooser import ChoiceRequest
+from controller.play.chooser import ChoiceRequest, Intention
 from controller.play.content import Selection
 from controller.play.intent import Target
 from controller.play.joint_answer import fingers_of
@@ -236,7 +236,8 @@ def _felt(
     for one, level in zip(short, leaks, strict=True):
         key = one[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        requested = ChoiceRequest((one,), contacts, protected or frozenset(), {}, (beside,))
+        intended = Intention(contacts, (), (one,), protected or frozenset())
+        requested = ChoiceRequest(intended, {}, (beside,))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
         (predicted,) = chosen.predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict

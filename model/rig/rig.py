@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from numbers import Real
 from typing import Any
 
@@ -89,6 +90,11 @@ class Rig:
                 f"choose from {', '.join(eras)}"
             )
         return eras[name]
+
+    @cached_property
+    def strokes(self) -> dict[str, float]:
+        """Stroke of each ERA [m], by its name."""
+        return {era.name: era.stroke for era in self.eras}
 
     @property
     def channel_counts(self) -> Counter[str]:

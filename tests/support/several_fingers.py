@@ -92,7 +92,7 @@ def playable(layers: int = 8) -> PlaybackCapabilities:
     return PlaybackCapabilities(
         "phased",
         ("phased",),
-        Limits((40.0, 320.0), {era.name: era.stroke for era in table().eras}),
+        Limits((40.0, 320.0), table().strokes),
         RAMPS_ONLY,
         layers=layers,
     )

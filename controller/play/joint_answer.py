@@ -149,11 +149,11 @@ def selection_of(
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
+                    (contact.key, voice),
                     tuple(own),
                     placed,
                     shape(placed, played, is_continued) if shape else played,
                     () if voice else _predictions(own, sensations, layer),
-                    voice,
                 )
             )
     quiet_levels: dict[ContactKey, float] = {}

@@ -165,7 +165,7 @@ class Selector:
             if before.get(contact.key) != contact.since:
                 came.add(contact.key)
         intended = Intention(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
-        back = self._lasting.target_keys & came
+        back = came.intersection([contact.key for contact, _ in self._lasting.targets])
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
         arrived = self._thread.take() if self._thread.is_busy else None
@@ -328,14 +328,14 @@ def _together(
 
 def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
     """Return what was chosen, without the contents of all fingers but some, by key."""
-    if keys >= chosen.target_keys:
-        return chosen
     targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], list[Content]()
     for contact, target in chosen.targets:
         if contact.key in keys:
             targets.append((contact, target))
         else:
             quiet.append(contact)
+    if len(targets) == len(chosen.targets):
+        return chosen
     for content in chosen.contents:
         for contact, _ in content.targets:
             if contact.key in keys:

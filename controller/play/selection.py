@@ -152,7 +152,9 @@ class Selector:
         While the thread computes, what played and is still to be felt stays. now [s]: infinite
         where fingers do not move.
         """
-        targets = _placed(intent, contacts)
+        by_key = {target.key: target for target in intent.targets}
+        # Lists: a generator would be a call for each.
+        targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
         served, skipped = _within_layers(targets, capabilities)
         lasting, short = list[tuple[Contact, Target]](), list[tuple[Contact, Target]]()
         before, self._fingers, came = self._fingers, {}, set[ContactKey]()
@@ -225,30 +227,24 @@ class Selector:
         is_rested = bool(lasting) and is_due and is_kept
         if is_due:
             self.due = now + _RESTS_AFTER if lasting and not is_rested else math.inf
-        new: list[tuple[Contact, Target]] = []
-        for each in intended.short:
-            if each[0].key not in self._short:
-                new.append(each)
+        new = tuple([each for each in intended.short if each[0].key not in self._short])
         if is_kept and not is_rested and not new:
             return
         felt = _felt(self._lasting, self._fingers.keys())
-        playing, before = [felt], dict[tuple[ContactKey, int], Content]()
+        before = {each.key: each for each in felt.contents}
         for contact, _ in intended.short:
-            playing.append(pulses.get(contact.key, _NOTHING))
-        for selection in playing:
-            for content in selection.contents:
-                before[content.key] = content
+            before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         if new and (has_waited or is_kept):
-            asked = replace(intended, lasting=(), short=tuple(new))
+            asked = replace(intended, lasting=(), short=new)
             yield ChoiceRequest(asked, before, (felt, *self._playing(now)))
-            new = []
+            new = ()
         if is_kept and not is_rested:
             return
         takes_long = not is_alone(lasting, intended.protected)
         is_moving = takes_long and not is_rested and _is_moved_from(intended, self._lasting)
         self.due = now + _RESTS_AFTER if is_moving else math.inf
         yield ChoiceRequest(
-            replace(intended, short=tuple(new)),
+            replace(intended, short=new),
             before,
             self._playing(now),
             takes_long,
@@ -258,11 +254,8 @@ class Selector:
 
     def _playing(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
-        playing = []
-        for part in self._short.values():
-            if any(now < pulse.end for pulse in part.pulses):
-                playing.append(part)
-        return tuple(playing)
+        parts = self._short.values()
+        return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
 
     def _is_intended(self, chosen: Choice, intended: Intention) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
@@ -348,18 +341,6 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
         contents=tuple(contents),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
-
-
-def _placed(intent: HapticIntent, contacts: Sequence[Contact]) -> Targets:
-    """Return the targets of an intent that are on the plate, in the order of contacts."""
-    by_key: dict[ContactKey, Target] = {}
-    for target in intent.targets:
-        by_key[target.key] = target
-    placed = []
-    for contact in contacts:
-        if (found := by_key.get(contact.key)) is not None:
-            placed.append((contact, found))
-    return tuple(placed)
 
 
 def _within_layers(

@@ -235,7 +235,8 @@ class Ledger:
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
         late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
-        self.playback.advance(late)
+        if late >= self.playback.changes_at:
+            self.playback.advance(late)
         if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
             return
         refusal = self._refusal_of_sums(layers, late, until)

@@ -29,9 +29,16 @@ __all__ = sorted(_HOMES)
 
 def __getattr__(name: str) -> Any:
     """Load a name at its first use."""
+    from registry.posix import posix_needed
+
     if name not in _HOMES:
         raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
-    found = getattr(import_module(_HOMES[name]), name)
+    try:
+        found = getattr(import_module(_HOMES[name]), name)
+    except ModuleNotFoundError as error:
+        if needed := posix_needed(error):
+            raise ImportError(needed, name=error.name) from error
+        raise
     globals()[name] = found
     return found
 

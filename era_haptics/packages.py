@@ -37,19 +37,19 @@ def _check(package: str) -> None:
     found = find_spec(package)
     origin = Path((found and found.origin) or own)
     if not own.exists():
-        why, remedy = f"{own.parent} is missing", "install era-haptics again"
+        why = f"{own.parent} is missing"
     elif origin.resolve() != own:
-        hiding = origin.parent if origin.name == "__init__.py" else origin
-        why, remedy = f"{hiding} hides {own.parent}", "rename it or keep it in another folder"
+        why = f"{origin.parent if origin.name == own.name else origin} hides {own.parent}"
     elif _OWN not in own.read_text(encoding="utf-8"):
-        why, remedy = f"{own} is another program's", "install era-haptics again"
+        why = f"{own} is another program's"
     else:
         return
     other = _distribution(origin)
-    if other:
-        why += f", by the distribution {other}"
-        remedy = "install era-haptics into an environment of its own"
-    raise HiddenPackage(f"{why}, the package {package} of era-haptics; {remedy}", name=package)
+    raise HiddenPackage(
+        f"{why}{f', by the distribution {other}' * bool(other)}, the package {package} of "
+        "era-haptics; rename the other, or install era-haptics in an environment of its own",
+        name=package,
+    )
 
 
 def _distribution(file: Path) -> str | None:

@@ -184,8 +184,8 @@ class Cycle:
         self._heartbeat_due = clock.now()
         self._wake.set()
 
-    def begin(self, *, was_armed: bool) -> None:
-        """Send what is to play, and feed the watchdogs, since the amplifiers have been armed.
+    def note_armed(self, *, was_armed: bool) -> None:
+        """Note that the amplifiers have been armed: what is to play is sent, watchdogs are fed.
 
         was_armed: also before, so that what plays goes on. Raises CommandError without a planner.
         """

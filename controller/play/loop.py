@@ -182,7 +182,7 @@ class Controller:
         """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
         was_armed = self.group.is_armed
         await self.group.arm()
-        self.cycle.begin(was_armed=was_armed)
+        self.cycle.note_armed(was_armed=was_armed)
 
     async def disarm(self) -> None:
         """Ramp to silence, then switch the high voltage off."""

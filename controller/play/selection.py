@@ -235,8 +235,8 @@ class Selector:
         for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         if new and (has_waited or is_kept):
-            asked = replace(intended, lasting=(), short=new)
-            yield ChoiceRequest(asked, before, (felt, *self._playing(now)))
+            pulses_alone = replace(intended, lasting=(), short=new)
+            yield ChoiceRequest(pulses_alone, before, (felt, *self._playing(now)))
             new = ()
         if is_kept and not is_rested:
             return

@@ -111,7 +111,7 @@ class EffectPlayer:
         return HapticIntent(
             tuple(felt),
             "" if felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
-            until=min(ends, default=None),
+            until=min(ends, default=math.inf),
             protected=frozenset(protected),
         )
 

@@ -103,19 +103,17 @@ class HapticIntent:
     """Targets and their levels at one moment.
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
-    none. until: when [s] the intent may change though no contact has; None for never. protected:
-    contacts that must not notice the contents of others.
+    none. until: when [s] the intent may change though no contact has. protected: contacts that must
+    not notice the contents of others.
     """
 
     targets: tuple[Target, ...]
     reason: str = "no target"
-    until: float | None = None
+    until: float = math.inf
     protected: frozenset[ContactKey] = frozenset()
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""
-        if self.until is None:
-            return math.inf
         return self.until if self.until > now else now + _MIN_WAIT
 
 

@@ -68,8 +68,7 @@ class Clicks:
             if pulse is None or now < pulse.end:
                 targets.append(Target(contact.key, pulse=pulse))
                 ends.append(math.inf if pulse is None else pulse.end)
-        until = min(ends, default=math.inf)
-        return HapticIntent(tuple(targets), until=None if until == math.inf else until)
+        return HapticIntent(tuple(targets), until=min(ends, default=math.inf))
 
 
 def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counter[str]:

@@ -296,8 +296,8 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
 
 
 @pytest.mark.parametrize(
-    ("until", "due"), [(None, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+    ("until", "due"), [(math.inf, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )
-def test_due_of_an_expired_intent_is_later(until: float | None, due: float) -> None:
+def test_due_of_an_expired_intent_is_later(until: float, due: float) -> None:
     """So that it does not keep the loop busy."""
     assert HapticIntent((), until=until).due(5.0) == due

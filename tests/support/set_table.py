@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from controller.play import joint_answer, planner
-from model.answer.answer import Answer, Layer
+from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
 from model.answer.fingers import Finger, Placement, Stimulus, together
 from model.answer.plan import answer, prepare_answers, query
 from model.answer.search import Contents, Stream, Tones
-from model.answer.strength import NO_LIMITS, Limits, scaled
+from model.answer.strength import scaled
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig

@@ -6,8 +6,9 @@ from itertools import chain
 import numpy as np
 import pytest
 
+from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement
-from model.answer.strength import Limits, with_gains
+from model.answer.strength import with_gains
 from model.finger.perception import detection_threshold
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table

@@ -19,8 +19,8 @@ from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
+from model.table.build import cached_table
 from model.table.table import PAPER_GRID, LocalizationTable
-from model.table.table_cache import cached_table
 
 Fingers: TypeAlias = Positions | Sequence[Finger]
 """Positions [m] of fingers, or fingers with their loads and bounds."""

@@ -7,8 +7,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
 from model.drive_modes.forms import Forms
-from model.ensemble.draws import Drawing
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate, outer
 from model.table.raster import FingertipShapes

@@ -14,8 +14,7 @@ from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.search import PROMISED_PERCENTILE, Contents, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import NEARLY
-from model.ensemble.draws import PROMISED_DRAWS
-from model.ensemble.measures import percentile
+from model.ensemble.draws import PROMISED_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import LocalizationTable
 

@@ -27,8 +27,7 @@ from model.drive_modes.coherent import (
 )
 from model.drive_modes.forms import Drive, Forms
 from model.drive_modes.switched import find_switched, max_sensation_switched
-from model.ensemble.draws import JUDGING_DRAWS
-from model.ensemble.measures import percentile
+from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 

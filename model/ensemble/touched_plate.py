@@ -27,8 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.ensemble.draws import Drawing, Draws, draw
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import Drawing, Draws, draw, over_fingertips
 from model.ensemble.plate_on_eras import MODELLED, THICKER, THINNER, PlateOnEras
 
 RIDGE = 1e-6

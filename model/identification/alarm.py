@@ -17,8 +17,7 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.grid import Grid
-from model.identification.settled import PatternModel
-from model.identification.settled_update import State, StateUpdate
+from model.identification.settled import PatternModel, State, StateUpdate
 
 WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2

@@ -18,8 +18,7 @@ from model.choice import ranked_by
 from model.identification.alarm import PLACES
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
-from model.identification.settled import PatternModel, finger_covariance
-from model.identification.settled_update import State, StateUpdate, update
+from model.identification.settled import PatternModel, State, StateUpdate, finger_covariance, update
 
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3

@@ -22,8 +22,7 @@ from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import PlateChange, explain
 from model.identification.identify import solved_for
 from model.identification.parameters import KINDS, MODE_SHIFTS, space_of
-from model.identification.settled import PatternModel, SettledPattern
-from model.identification.settled_update import NoiseLevel, State, update
+from model.identification.settled import NoiseLevel, PatternModel, SettledPattern, State, update
 from model.identification.values import Values, rig_with
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty

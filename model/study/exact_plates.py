@@ -14,7 +14,7 @@ import numpy as np
 
 from model.answer.fingers import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import over_fingertips
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     FingertipLoad,

@@ -11,9 +11,8 @@ from model.answer.fingers_on_plate import (
     FingerForms,
     FingersOnPlate,
 )
-from model.answer.over_duration import forms_of, on_drawn_plates
+from model.answer.over_duration import RingingUnderFingers, forms_of, on_drawn_plates
 from model.answer.promised import promised
-from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_few, best_first, best_of

@@ -17,9 +17,8 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.reduction.finite_element_modes import FiniteElementModes
-from model.reduction.receptance import FreeModes, FreeReceptance, between, combined
-from model.reduction.spectral_modes import SpectralModes
+from model.reduction.free_modes import FiniteElementModes, FreeModes, SpectralModes
+from model.reduction.receptance import FreeReceptance, between, combined
 from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (

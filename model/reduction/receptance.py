@@ -17,31 +17,13 @@ for 2 % of thickness, and 0.3 % for 5 %.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.reduction.finite_element_modes import FiniteElementModes
-from model.reduction.spectral_modes import SpectralModes
+from model.reduction.free_modes import FreeModes
 from model.reduction.truncation import RESIDUAL_ORDER, truncation_slopes, truncation_weights
 from model.structure.modal_elasticity import modal_receptance
-
-FreeModes: TypeAlias = SpectralModes | FiniteElementModes
-"""Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
-
-A truncated mode of eigenvalue lambda counts with u = 1 / (lambda + shift), in units of
-largest_truncated, u_c, that of the lowest [s²/rad²]. eigenvalues omega² (r,) [rad²/s²], and losses
-(r,), their imaginary part beside the plate's own loss factor; dispersion: how they change with
-frequency, None where they do not. Between points (n, 2) and others (m, 2), or footprints (n, 3):
-
-- shapes_at(points): of the modes, (n, r);
-- truncated_terms(points, others): sums of phi phi' (u / u_c)^j over the truncated modes, j = 1, 2,
-  ..., (TERMS, n, m);
-- basis(points, others): deflection at others of modes and of the RESIDUAL_ORDER residual vectors of
-  forces at the points, term by term, (m, r + RESIDUAL_ORDER n); unknowns(points): its columns in
-  the unknowns of the plate, by symmetry class.
-"""
 
 TERMS = 2 * RESIDUAL_ORDER
 """Truncated sums of a receptance between points."""

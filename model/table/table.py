@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
 from model.drive_modes.switched import highest_levels
-from model.ensemble.attached_plate import AttachedPlate, attach
+from model.ensemble.attached_plate import AttachedPlate, PlateOnEras, attach
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
-from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.grid import Grid

@@ -24,7 +24,6 @@ from model.answer.fingers import (
     Placement,
     Stimulus,
     check_fingers,
-    checked_mode,
     together,
 )
 from model.answer.modulation import is_served, with_modulation
@@ -39,7 +38,7 @@ from model.answer.strength import (
 )
 from model.arrays import Point
 from model.choice import NEARLY, best_by, best_of
-from model.drive_modes import UNRESTRICTED
+from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
 from model.table.table import LocalizationTable

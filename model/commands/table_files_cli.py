@@ -241,15 +241,14 @@ def build(
 ) -> None:
     """Solve the plate and write its table."""
     from model.compiled.kernels import why_slow
-    from model.drive_modes import DRIVE_MODES
+    from model.drive_modes import checked_mode
     from model.finger.grid import Grid
     from model.rig.file import load_rig
     from model.table.build import TableProblem, solve_table
     from model.table.file import ZIP, save_table
     from model.table.table import default_drive_frequencies
 
-    if drive_mode not in DRIVE_MODES:
-        raise InputError(f"--mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
+    checked_mode(drive_mode, "--mode")
     check_place(output, example="table.npz")
     check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")

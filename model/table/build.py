@@ -18,7 +18,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.cache_folder import cache_folder
-from model.drive_modes import DRIVE_MODES
+from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.array_file import Arrays
 from model.finger.grid import Grid
@@ -129,9 +129,7 @@ def solve_table(
 
     progress: called with the number of finished parts and the total. Raises InputError.
     """
-    if drive_mode not in DRIVE_MODES:
-        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
-    parts = dict(enumerate((_discretisation, _modes)))
+    mode, parts = checked_mode(drive_mode), dict(enumerate((_discretisation, _modes)))
     solved: dict[str, Any] = {name: getattr(problem.rig, name) for name in PHYSICS}
     # A copy without cached properties, which cannot all be sent to a process.
     found = on_processes(workers, _solve, replace(problem), parts)
@@ -142,7 +140,7 @@ def solve_table(
         mesh=problem.rig.mesh,
         raster=problem.raster,
         grid=problem.grid,
-        drive_mode=drive_mode,
+        drive_mode=mode,
         code_version=code_version(),
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,

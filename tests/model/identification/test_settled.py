@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.identification.hidden import draw
 from model.arrays import FloatArray
-from model.identification.alarm import WINDOW, Alarm, Observation
+from model.identification.changes import WINDOW, Alarm, Observation
 from model.identification.forward import Sensor
 from model.identification.in_service import LivePlate, PlateEstimate
 from model.identification.settled import (

@@ -6,10 +6,10 @@ ratio, which finds what fingers and noise hide in the sum (M. Basseville, I. V. 
 of Abrupt Changes, 1993, section 2.4.3). One pattern alone raises none, since a finger may be unlike
 any other, but no state is updated by it either.
 
-Its explanation: one spring, one gain, the thickness or a mass: each is a wide prior of the parameters that would
-have changed. The most likely one is that whose batch estimate over the last patterns costs least, a
-further cost for each parameter that changed; where even that leaves residuals that chance does not,
-the plate has changed in a way not known.
+Its explanation: one spring, one gain, the thickness or a mass: each is a wide prior of the
+parameters that would have changed. The most likely one is that whose batch estimate over the last
+patterns costs least, a further cost for each parameter that changed; where even that leaves
+residuals that chance does not, the plate has changed in a way not known.
 """
 
 from collections import deque

@@ -3,9 +3,9 @@
 The parameters of an identification drift; an update moves them together with the fingers of its
 pattern, which are dropped afterwards. Where innovations are unlikely the state goes back to where
 they began, since an update smears a jump over all parameters, and is held until the patterns since
-then are explained together by one change (`model.identification.changes`). Such a change is followed; after one that nothing explains, as
-by a crack or a hand that rests on it, the plate counts as changed, until patterns are those of the
-plate as it was.
+then are explained together by one change (`model.identification.changes`). Such a change is
+followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
+counts as changed, until patterns are those of the plate as it was.
 """
 
 from collections.abc import Sequence

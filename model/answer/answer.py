@@ -161,8 +161,8 @@ class Answer:
         """What each finger gets, in the order in which they were given."""
         found, tones = dict[int, Sensation](), self.tones
         known = [  # None for what there is not
-            [None if each != each else each for each in (*contrasts, foreign)]
-            for contrasts, foreign in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
+            [None if each != each else each for each in (*contrasts, of_others)]
+            for contrasts, of_others in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
         ]
         for number, stream in enumerate(self.contents.streams):
             lowered = self.lowered_db(number)

@@ -34,8 +34,7 @@ from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.build import build_table
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 from model.vibration.excitation import Excitation, Tone
 
 TIKHONOV = 1e-3

@@ -22,8 +22,7 @@ from model.ensemble.touched_plate import gram
 from model.finger.perception import detection_threshold
 from model.structure.attachments import Fingertip, fingertip_loads
 from model.table.raster import FingertipShapes
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 from model.transients.knots import RISE
 from model.transients.loaded_ramps import (
     ramped_accelerations,

@@ -4,7 +4,7 @@ Plates of several thicknesses have their ERAs and masses eliminated, once for ea
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
 s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (as in `model.reduction.receptance`): of one h times as thick
+and frequencies higher by it (as in `model.reduction.free_plate`): of one h times as thick
 
     g = 1 / (h (h² s lambda - w²)),    dg / d ln loss = -i h³ Im(s lambda) g².
 

@@ -12,7 +12,7 @@ from model.answer.strength import with_gains
 from model.finger.perception import detection_threshold
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table
-from model.table.raster_kernel import read_fingertips
+from model.table.table import read_fingertips
 from only import phased as answer
 from only import wants
 from paper_table import contact_sets, smooth_rig

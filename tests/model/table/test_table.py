@@ -24,8 +24,7 @@ from model.study.exact_plates import Plates, felt_on
 from model.table.build import TableProblem, build_table
 from model.table.following import table_following
 from model.table.raster import Raster
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable, default_drive_frequencies
+from model.table.table import LocalizationTable, default_drive_frequencies, read_fingertips
 from model.vibration.excitation import Tone, tone_amplitudes
 from only import only
 from paper_plate import make_paper_rig

@@ -316,7 +316,7 @@ _FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
 
 
 def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
-    """Shapes at fingertips centred at places [m] of a table's plate, by a kernel if there is one."""
+    """Shapes at fingertips centred at places [m], by a kernel in C where there is one."""
     by = kernels()
     if by is None:
         return table.raster.fingertips(np.array(places), table.shapes)

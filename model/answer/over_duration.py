@@ -30,6 +30,7 @@ from model.transients.loaded_ramps import (
     response_count,
     time_count,
 )
+from model.transients.ringing import RINGING_TIMES, RampedRinging, ringing_time
 
 ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
@@ -44,9 +45,6 @@ _IN_PHASE = 0.1
 So about nine of ten plates keep what is promised of a click (docs/measured/promise.md); with none,
 four of five of those of four ERAs do.
 """
-
-
-_MIN_RINGING_TIME = 0.02  # s; over which what quiet fingers feel after the end is followed
 
 
 def pulse_ramp(duration: float) -> float:
@@ -81,7 +79,7 @@ class FollowedPart:
     def of(cls, duration: float) -> "FollowedPart":
         """Short ones to beyond their end, where a quiet finger may feel most."""
         length = min(duration, SHAPED_FROM)  # the rest is steady
-        after = max(duration / 2, _MIN_RINGING_TIME) if duration <= SHAPED_FROM else None
+        after = ringing_time(duration) if duration <= SHAPED_FROM else None
         return cls(length, after, length / duration)
 
 
@@ -123,6 +121,22 @@ def on_drawn_plates(power: FloatArray, heard: FloatArray, gain: FloatArray | flo
     others = gain * np.sqrt(np.maximum(power - power[..., :1], 0.0))
     own = np.sqrt(heard)[..., None]
     return np.asarray(own * own + 2 * _IN_PHASE * own * others + others * others)
+
+
+def forms_over(
+    steady: Forms,
+    formed: FingerForms,
+    targets: Sequence[int],
+    others: Sequence[int],
+    ringing: RampedRinging,
+) -> Forms:
+    """Forms over an effect from steady ones; ringing is that of the plate without fingers."""
+    fields, few = formed.contacts.fields, formed.fingers.tips.few
+    (f, k, p, n), at = fields.shape, few.reshape(-1, few.shape[2])
+    real, imaginary = ringing.parts[:, formed.rows].reshape(2, -1, at.shape[1]) @ at.T
+    parts = (real + 1j * imaginary).reshape(f, n, -1, k, p).transpose(0, 3, 2, 4, 1)
+    over = parts + ringing.envelope[:, None, None] * fields[:, :, None]
+    return forms_of(steady, formed, targets, others, over, RINGING_TIMES)
 
 
 def forms_of(

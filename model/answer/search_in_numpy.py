@@ -11,7 +11,7 @@ from model.answer.fingers_on_plate import (
     FingerForms,
     FingersOnPlate,
 )
-from model.answer.over_duration import RingingUnderFingers, forms_of, on_drawn_plates
+from model.answer.over_duration import RingingUnderFingers, forms_of, forms_over, on_drawn_plates
 from model.answer.promised import promised
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
@@ -30,7 +30,7 @@ from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
-MAX_DURING_EFFECT, MAX_ALONE = 5, 4
+MAX_DURING_EFFECT, MAX_ALONE = 3, 4
 """Candidates of a short effect, and as many at their frequencies; without a quiet finger."""
 
 _TINY = 1e-20
@@ -67,7 +67,7 @@ def choose_by_numpy(
         if len(kept) < len(rows) and (not found.drives or is_limited):
             found, is_limited = _candidates(fingers, contents, rows, ringing)
     else:
-        found = _switched_candidates(fingers, contents)
+        found = _switched_candidates(fingers, contents, ringing[0])
     least, own, loudest = _judged(fingers, contents, found, ringing)
     best, is_apart = np.zeros(1, dtype=int), True
     if len(contents.streams) > 1:
@@ -155,13 +155,13 @@ def _short_candidates(
     others: Sequence[int],
     over: RingingUnderFingers,
 ) -> list[tuple[float, Drive]]:
-    """The best tones of a vibration that lasts, and at their frequencies those over a duration.
+    """The best tones over a duration, and at their frequencies those with the fingers' weight.
 
     Ringing under the fingers takes too long to solve at every frequency. steady: forms to search
     for a vibration that lasts.
     """
     count = MAX_DURING_EFFECT if others else MAX_ALONE
-    found, _ = search_to_level(steady)
+    found, _ = search_to_level(_forms_over(steady, formed, targets, others, over))
     best = _drives_of(found, formed.rows, best_first(found.score)[:count])
     if not others:
         return best
@@ -173,6 +173,20 @@ def _short_candidates(
     return best + _drives_of(search_all(during), rows, np.arange(len(rows)))
 
 
+def _forms_over(
+    steady: Forms,
+    formed: FingerForms,
+    targets: Sequence[int],
+    others: Sequence[int],
+    over: RingingUnderFingers | None,
+) -> Forms:
+    """Forms over a duration where there is one, and a finger that is to be quiet."""
+    if over is None or not others:
+        return steady
+    ringing = formed.fingers.table.ringing(over.duration)
+    return steady if ringing is None else forms_over(steady, formed, targets, others, ringing)
+
+
 def _drives_of(found: CoherentResult, rows: IntArray, some: IntArray) -> list[tuple[float, Drive]]:
     """Tones at rows (f,) that reach the level, of some by index, with their scores."""
     return [
@@ -182,16 +196,19 @@ def _drives_of(found: CoherentResult, rows: IntArray, some: IntArray) -> list[tu
     ]
 
 
-def _switched_candidates(fingers: FingersOnPlate, contents: Contents) -> Candidates:
+def _switched_candidates(
+    fingers: FingersOnPlate, contents: Contents, over: RingingUnderFingers | None
+) -> Candidates:
     """The best patterns of the mode `switched` for an only content.
 
     Near the highest level where none reaches it.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
-    by_point = contents.durations[0] is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
+    by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
     formed = fingers.forms(rows, with_fine=by_point)
     rest = None if contents.background is None else contents.background[rows]
     forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
+    forms = _forms_over(forms, formed, stream.targets, quiet, over)
     if by_point:
         forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
     found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))

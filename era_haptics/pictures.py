@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
-from era_haptics.drive import Played, excitation_of
+from era_haptics.drive import Played, layers_of
 from era_haptics.solved_plate import SolvedPlate
 from model.answer.answer import Answer
 from model.arguments import expect, is_whole, shown
@@ -30,7 +30,8 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
     The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
     """
     expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
-    active = excitation_of(drive, plate.rig).keys()
+    layers = layers_of(drive, plate.rig)
+    active = {name for layer in layers for each in layer.excitations for name in each}
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
 
@@ -98,11 +99,10 @@ def draw_playback(playback: Playback) -> Figure:
     axes.grid(True, which="both", alpha=0.2)
     axes.legend(loc="lower right")
     if playback.contrast_db is not None:
-        axes.set_title(
-            f"contrast {playback.contrast_db:.1f} dB steady, "
-            f"{playback.transient_contrast_db:.1f} dB over the first 100 ms",
-            fontsize=11,
-        )
+        transient, title = playback.transient_contrast_db, f"contrast {playback.contrast_db:.1f} dB"
+        if transient is not None:
+            title += f" steady, {transient:.1f} dB over the first 100 ms"
+        axes.set_title(title, fontsize=11)
     return figure
 
 

@@ -1,16 +1,19 @@
-"""Play an excitation on the plate in the time domain, without wires and amplifiers.
+"""Play layers on the plate in the time domain, without wires and amplifiers.
 
-From rest the bases move exactly as commanded, along shaped onsets or a ramp.
+From rest the bases move exactly as commanded, along shaped onsets or a ramp. The plate is linear:
+each frequency of each layer is played alone, which keeps a finger's own apart from those of others.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from model.answer.fingers import Placement, Stimulus, check_fingers, together
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.answer import Layer
+from model.answer.fingers import Finger, check_fingers
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
@@ -19,39 +22,79 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
     contrast_db,
-    mean_level_db_sl,
-    sensation_level,
+    decibels,
+    detection_threshold,
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import fingertip_loads
-from model.transients.base_motion import Envelopes, ramped_onset, shaped
+from model.structure.attachments import Era, fingertip_loads
+from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import Excitation, base_amplitudes
-from sim.plant.fingers import Felt, Record, felt_peaks, measure_vibration
+from model.vibration.excitation import base_amplitudes, by_frequency
+from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
-"""Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
+"""Length [s] of the last part, in which steady amplitudes are fitted."""
+
+LEVEL_WINDOW, LEVEL_STEP = 0.05, 0.01
+"""Hann window under which a level over time is a root mean square, and the steps of both [s]."""
 
 MAX_DURATION = 10.0
-"""Longest playback [s]; ten fingers take 150 MB."""
+"""Longest playback [s]; ten fingers take 150 MB for each frequency of a layer."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeltFinger:
+    """What one finger felt, steady as of a `Sensation`, and over time.
+
+    level_db_sl: of its own layers, mean over the fingertip, -inf without one; foreign_level_db_sl:
+    of all others at its loudest point, None without one; contrast_db: of its own above these, or
+    where there are no others above its own at the loudest quiet finger; of a quiet finger the
+    weakest level at another one's own finger above all of them here. times (w,) [s], and at these
+    levels_db_sl and foreign_levels_db_sl (w,): root mean square over some 25 ms, a Hann window.
+    """
+
+    level_db_sl: float
+    foreign_level_db_sl: float | None
+    contrast_db: float | None
+    times: FloatArray
+    levels_db_sl: FloatArray
+    foreign_levels_db_sl: FloatArray
+
+    def to_frame(self) -> Any:
+        """Time, its own level and that of the others as a pandas DataFrame; needs pandas."""
+        return as_frame(
+            {
+                "time_s": self.times,
+                "level_db_sl": self.levels_db_sl,
+                "foreign_level_db_sl": self.foreign_levels_db_sl,
+            }
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Vibration:
+    """One frequency [Hz] of a layer, by number, and the records of all fingers under it alone."""
+
+    layer: int
+    frequency: float
+    records: tuple[Record, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """Records of fingertips while an excitation played, from rest at time 0.
+    """Records of fingertips while layers played, from rest at time 0.
 
-    frequencies (f,) [Hz]: driven; targets, quiet: records of the fingers; settled [s]: end of the
-    onset; threshold: name of the set that levels are above. Measures are named as those of a
-    `Sensation`; steady ones are fitted to the last STEADY seconds, after the plate has settled
-    (50 ms to 1 s).
+    vibrations: each frequency of each layer alone; own: of each finger the numbers of the layers
+    that are for it, none of a quiet one; settled [s]: end of the onsets; threshold: name of the set
+    that levels are above. Measures are named as those of a `Sensation`; steady ones are fitted to
+    the last STEADY seconds, after the plate has settled (50 ms to 1 s).
     """
 
-    frequencies: tuple[float, ...]
-    targets: tuple[Record, ...]
-    quiet: tuple[Record, ...]
+    vibrations: tuple[Vibration, ...]
+    own: tuple[tuple[int, ...], ...]
     settled: float
     threshold: str = DEFAULT_THRESHOLD
 
@@ -68,114 +111,193 @@ class Playback:
             for name, records in fingers.items()
             for number, record in enumerate(records, start=1)
         }
-        return as_frame({"time_s": self.targets[0].times, **means})
+        return as_frame({"time_s": self.vibrations[0].records[0].times, **means})
+
+    @property
+    def frequencies(self) -> tuple[float, ...]:
+        """Frequencies that are driven [Hz], ascending."""
+        return tuple(sorted({each.frequency for each in self.vibrations}))
+
+    @cached_property
+    def records(self) -> tuple[Record, ...]:
+        """Of each finger, of all layers together, in the order in which they were given."""
+        return tuple(
+            replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
+            for alone in zip(*[each.records for each in self.vibrations], strict=True)
+        )
+
+    @property
+    def targets(self) -> tuple[Record, ...]:
+        """Records of the fingers that have a layer."""
+        return tuple(each for each, own in zip(self.records, self.own, strict=True) if own)
+
+    @property
+    def quiet(self) -> tuple[Record, ...]:
+        """Records of the fingers that have none."""
+        return tuple(each for each, own in zip(self.records, self.own, strict=True) if not own)
+
+    @cached_property
+    def fingers(self) -> tuple[FeltFinger, ...]:
+        """What each finger felt, in the order in which they were given."""
+        found, steady = [], self._steady
+        for number, (level, foreign) in enumerate(steady):
+            others = foreign if foreign > -np.inf else self.quiet_level_db_sl
+            above = level if self.own[number] else self.level_db_sl
+            found.append(
+                FeltFinger(
+                    level,
+                    foreign if foreign > -np.inf else None,
+                    None if others is None else above - others,
+                    *self._over_time(number),
+                )
+            )
+        return tuple(found)
 
     @property
     def level_db_sl(self) -> float:
-        """Steady level at the target [dB SL], mean over its fingertip; minimum over targets."""
-        return min(
-            mean_level_db_sl(*_tones(felt), felt.weights, self.threshold)
-            for felt in self._felt[: len(self.targets)]
-        )
+        """Steady level of a target's own [dB SL], mean over its fingertip; minimum over targets."""
+        return min(level for (level, _), own in zip(self._steady, self.own, strict=True) if own)
 
     @property
     def quiet_level_db_sl(self) -> float | None:
         """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
-        quiet = self._felt[len(self.targets) :]
-        loudest = [sensation_level(*_tones(felt), self.threshold).max() for felt in quiet]
-        return float(max(loudest)) if loudest else None
+        quiet = [level for (_, level), own in zip(self._steady, self.own, strict=True) if not own]
+        return max(quiet, default=None)
 
     @property
     def contrast_db(self) -> float | None:
-        """Steady level of the target above that of the loudest quiet point [dB]; None if alone."""
-        quiet = self.quiet_level_db_sl
-        return None if quiet is None else self.level_db_sl - quiet
+        """The least steady contrast of all fingers [dB]; None if alone."""
+        found = [each.contrast_db for each in self.fingers if each.contrast_db is not None]
+        return min(found, default=None)
 
     @property
     def transient_contrast_db(self) -> float | None:
-        """Contrast [dB] of the peaks over the first 100 ms; None where a finger is alone."""
-        inside = self.targets[0].times <= ONSET_WINDOW
+        """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without these."""
+        targets, quiet = self.targets, self.quiet
+        if not quiet:
+            return None
+        inside = targets[0].times <= ONSET_WINDOW
         first = [
             felt_peaks(record.times[inside], record.accelerations[inside])
-            for record in (*self.targets, *self.quiet)
+            for record in (*targets, *quiet)
         ]
-        return self._contrast(first)
-
-    def _contrast(self, peaks: list[FloatArray]) -> float | None:
-        count = len(self.targets)
-        if len(peaks) == count:
-            return None
-        weights = [record.weights for record in self.targets]
-        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:]), weights))
+        count, weights = len(targets), [record.weights for record in targets]
+        return float(contrast_db(first[:count], np.concatenate(first[count:]), weights))
 
     @cached_property
-    def _felt(self) -> tuple[Felt, ...]:
-        """Steady vibration of each finger, targets first."""
-        return tuple(
-            measure_vibration(self._last(record), self.frequencies)
-            for record in (*self.targets, *self.quiet)
-        )
+    def _steady(self) -> tuple[tuple[float, float], ...]:
+        """Steady level of each finger's own layers, and of all others at its loudest point."""
+        times = self.vibrations[0].records[0].times
+        inside = times >= max(self.settled, times[-1] - STEADY)
+        found = []
+        for number in range(len(self.own)):
+            powers = []
+            for each in self.vibrations:
+                samples = each.records[number].accelerations[inside] / self._threshold_of(each)
+                fitted = fit_tones(times[inside] - times[0], samples, [each.frequency])
+                powers.append((each.layer, np.abs(fitted[0]) ** 2))
+            own, others = self._levels(number, powers)
+            found.append((float(own), float(others)))
+        return tuple(found)
 
-    def _last(self, record: Record) -> Record:
-        since = max(self.settled, record.times[-1] - STEADY)
-        inside = record.times >= since
-        times, accelerations = record.times[inside], record.accelerations[inside]
-        return Record(record.points, record.weights, times, accelerations)
+    def _over_time(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times (w,) [s], and at these levels of a finger's own layers and of all others (w,)."""
+        times, signals = self.vibrations[0].records[0].times, dict[int, FloatArray]()
+        for each in self.vibrations:
+            samples = each.records[number].accelerations / self._threshold_of(each)
+            signals[each.layer] = signals.get(each.layer, 0) + samples
+        count, step = (round(each * SAMPLE_RATE) for each in (LEVEL_WINDOW, LEVEL_STEP))
+        count = min(count, len(times))
+        weights = np.hanning(count + 2)[1:-1]
+        powers = [
+            (layer, sliding_window_view(each**2, count, axis=0)[::step] @ (2 * weights))
+            for layer, each in signals.items()
+        ]
+        means = [(layer, power / weights.sum()) for layer, power in powers]
+        own, others = self._levels(number, means)
+        return times[count // 2 :][: len(own) * step : step], own, others
+
+    def _levels(
+        self, number: int, powers: Sequence[tuple[int, FloatArray]]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Levels of a finger's own layers and of all others, from powers (..., p) of each layer."""
+        record, both = self.records[number], [0 * powers[0][1], 0 * powers[0][1]]
+        for layer, power in powers:
+            both[layer in self.own[number]] += power
+        others, own = np.sqrt(both)
+        return decibels(own @ record.weights), decibels(others.max(axis=-1))
+
+    def _threshold_of(self, vibration: Vibration) -> float:
+        return float(detection_threshold(np.array(vibration.frequency), self.threshold))
 
 
 def play(
     rig: Rig,
     reduced: ReducedPlate,
-    excitation: Excitation,
-    fingers: Placement,
+    layers: Sequence[Layer],
+    fingers: Sequence[Finger],
+    own: Sequence[tuple[int, ...]] | None = None,
     *,
     duration: float,
-    ramp: float = ONSET_RAMP,
-    onset: Envelopes | None = None,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> Playback:
-    """Play an excitation for a duration [s] on a plate at rest, under these fingers.
+    """Play layers for a duration [s] on a plate at rest, under these fingers.
 
-    The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
-    imperfections make of the rig's, for forces at its ERAs and loads; ramp [s], or onset in its
-    place. Latency, skew and noise are left out. Raises InputError for fingers off the plate, an
-    excitation that the rig cannot play, and a duration out of range.
+    The fingers load the plate as the rig's fingertip, by their loads; own: of each the numbers of
+    the layers for it, by default all where it has a stimulus. reduced: the plate that the imperfections make of the rig's, for forces at
+    its ERAs and loads. Each layer starts along its onset, or its ramp. Latency, skew and noise are
+    left out. Raises InputError for fingers off the plate, layers that the rig cannot play, and a
+    duration out of range.
     """
-    check_fingers(together(fingers, Stimulus()), rig.plate)
-    frequencies, _ = base_amplitudes(excitation, rig.eras)
-    settled = max(envelope.duration for envelope in onset.values()) if onset else ramp
+    check_fingers(fingers, rig.plate)
+    if own is None:
+        every = tuple(range(len(layers)))
+        own = [every if each.stimulus else () for each in fingers]
+    voices = [(number, each) for number, one in enumerate(layers) for each in one.voices]
+    ends = [0.0]
+    for _, each in voices:
+        base_amplitudes(each.excitation, rig.eras)  # refuses ERAs that the rig does not have
+        onsets = each.onset.values() if each.onset else ()
+        ends.append(max([envelope.duration for envelope in onsets], default=each.ramp))
+    settled = max(ends)
     if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
             f"{duration:g} s; one second suffices for most plates"
         )
-    plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
-    contacts = fingers.contacts
-    resting = fingertip_loads(rig.fingertip, contacts, fingers.loads)
-    plant.set_contacts(
-        {
-            str(n): replace(each, fingertip=imperfections.load_of(str(n), each.fingertip))
-            for n, each in enumerate(resting)
-        }
-    )
-    bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
-    for number, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
-        plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))
+    contacts = [each.at for each in fingers]
+    resting = fingertip_loads(rig.fingertip, contacts, [each.load for each in fingers])
+    loads = {
+        str(n): replace(each, fingertip=imperfections.load_of(str(n), each.fingertip))
+        for n, each in enumerate(resting)
+    }
     discs = [fingertip_points(*at, rig.plate) for at in contacts]
-    times, felt = plant.advance(
-        duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(np.concatenate(discs))
-    )
-    ends = np.cumsum([len(disc) for disc in discs])[:-1]
-    records = tuple(
-        Record(disc, fingertip_weights(*at, rig.plate), times, part)
-        for at, disc, part in zip(contacts, discs, np.split(felt, ends, axis=1), strict=True)
-    )
-    count = len(fingers.targets)
-    return Playback(
-        tuple(frequencies.tolist()), records[:count], records[count:], settled, rig.threshold
-    )
+    weights = [fingertip_weights(*at, rig.plate) for at in contacts]
+    splits, loaded = np.cumsum([len(disc) for disc in discs])[:-1], None
+    vibrations = []
+    for number, frequency, bases in _parts(voices, rig.eras):
+        plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
+        plant.set_contacts(loads, loaded=loaded)
+        loaded = plant.loaded
+        for at, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
+            plant.set_input(at, realised(terms, imperfections.errors_of(era.name, rig)))
+        shapes = plant.reduced.at(np.concatenate(discs))
+        times, felt = plant.advance(duration, sample_rate=SAMPLE_RATE, shapes=shapes)
+        parts = np.split(felt, splits, axis=1)
+        records = [Record(*each) for each in zip(discs, weights, [times] * len(discs), parts)]
+        vibrations.append(Vibration(number, frequency, tuple(records)))
+    return Playback(tuple(vibrations), tuple(own), settled, rig.threshold)
 
 
-def _tones(felt: Felt) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (f,) [Hz] and steady amplitudes (f, p) [m/s²]."""
-    return np.array(felt.frequencies), felt.amplitude
+def _parts(
+    voices: Sequence[tuple[int, Layer]], eras: Sequence[Era]
+) -> Iterator[tuple[int, float, Bases]]:
+    """Layer, frequency [Hz] and motion of the bases of each frequency of each voice."""
+    for number, layer in voices:
+        for frequency, tones in by_frequency(layer.excitation):
+            if layer.onset:
+                envelopes = layer.onset.items()
+                own = {name: each for name, each in envelopes if each.frequency == frequency}
+                yield number, frequency, shaped(own, eras)
+            else:
+                yield number, frequency, ramped_onset(tones, eras, ramp=layer.ramp)

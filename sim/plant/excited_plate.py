@@ -63,6 +63,10 @@ class FeltFinger:
     levels_db_sl: FloatArray
     foreign_levels_db_sl: FloatArray
 
+    def __repr__(self) -> str:
+        contrast = "alone" if self.contrast_db is None else f"contrast {self.contrast_db:.1f} dB"
+        return f"<FeltFinger at {self.level_db_sl:.1f} dB SL, {contrast}>"
+
     def to_frame(self) -> Any:
         """Time, its own level and that of the others as a pandas DataFrame; needs pandas."""
         return as_frame(

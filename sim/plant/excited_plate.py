@@ -38,7 +38,7 @@ from sim.plant.plant import SAMPLE_RATE, Plant
 STEADY = 0.25
 """Length [s] of the last part, in which steady amplitudes are fitted."""
 
-LEVEL_WINDOW, LEVEL_STEP = 0.05, 0.01
+LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
 """Hann window under which a level over time is a root mean square, and the steps of both [s]."""
 
 MAX_DURATION = 10.0
@@ -53,7 +53,7 @@ class FeltFinger:
     of all others at its loudest point, None without one; contrast_db: of its own above these, or
     where there are no others above its own at the loudest quiet finger; of a quiet finger the
     weakest level at another one's own finger above all of them here. times (w,) [s], and at these
-    levels_db_sl and foreign_levels_db_sl (w,): root mean square over some 25 ms, a Hann window.
+    levels_db_sl and foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
     """
 
     level_db_sl: float

@@ -11,6 +11,7 @@ from model.answer.answer import Answer
 from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.figures.contents_picture import ContentFinger, contents_figure
 from model.figures.drawing import map_figure
 from model.figures.table_pictures import (
     contrast_map_figure,
@@ -62,6 +63,30 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
         axes.set_title(title, fontsize=11, pad=20)
     draw_level_scale(figure, [axes], shrink=0.8)
     return figure
+
+
+def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
+    """Draw all layers of an answer over the plate, each in its colour, and each alone.
+
+    A colour is grey where layers mix, and black where nothing is felt. Beside every finger its
+    frequency, verdict, promised level and contrast. The picture of `era demo`. Raises InputError
+    for an answer without layers.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
+    if not answer.layers:
+        raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
+    fingers = [
+        ContentFinger(
+            each.finger.at,
+            each.layer,
+            each.verdict,
+            each.promised_level_db_sl,
+            each.promised_contrast_db,
+        )
+        for each in answer.fingers
+    ]
+    return contents_figure(table, answer.layers, fingers)
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:

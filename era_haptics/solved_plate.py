@@ -62,15 +62,18 @@ class SolvedPlate:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28), of all layers of an answer. Raises InputError for a drive that the rig cannot play.
+        All layers of an answer play. ERAs at one frequency add as complex amplitudes, magnitudes of
+        several frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot
+        play.
         """
         points = (
             None
             if raster is None
             else as_pair(raster, what="raster", such_as="points along x and y such as (61, 46)")
         )
-        factors = {era.name: self._drawn.errors_of(era.name, self.rig).factor for era in self.rig.eras}
+        factors = {
+            era.name: self._drawn.errors_of(era.name, self.rig).factor for era in self.rig.eras
+        }
         excitations = [
             {
                 name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)

@@ -23,7 +23,7 @@ from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import by_frequency
+from model.vibration.excitation import Excitation
 
 Position = tuple[float, float]
 
@@ -99,7 +99,7 @@ class TouchSimulator:
         bases = [
             (frequency, ramped_pulse(part, self.table.eras, ramp=layer.ramp, duration=end))
             for end in (since + duration,)
-            for frequency, part in by_frequency(layer.excitation)
+            for frequency, part in _by_frequency(layer.excitation)
         ]
         transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
         end = since + duration
@@ -155,3 +155,15 @@ class TouchSimulator:
         count = min(round(length * SAMPLE_RATE), len(total) - 1)
         mean = np.maximum((total[count:] - total[:-count]) / count, 0.0)
         return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
+
+
+def _by_frequency(excitation: Excitation) -> list[tuple[float, Excitation]]:
+    """Return the tones of each frequency [Hz], ascending."""
+    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    return [
+        (
+            frequency,
+            {name: tone for name, tone in excitation.items() if tone.frequency == frequency},
+        )
+        for frequency in frequencies
+    ]

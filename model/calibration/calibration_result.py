@@ -1,9 +1,13 @@
 """Results of a calibration."""
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.sensed_plate import Parameter
+from model.files.csv_file import as_frame
 from model.rig.rig import Rig
 
 MAX_FIT_ERROR = 0.25
@@ -94,6 +98,22 @@ class Calibration:
     measured: ComplexArray
     before: ComplexArray
     after: ComplexArray
+
+    def to_frame(self) -> Any:
+        """Each parameter before and after, with its standard error, as a pandas DataFrame.
+
+        Values in units of SI, which stand beside them; NaN without an error. Needs pandas.
+        """
+        fitted = self.parameters
+        return as_frame(
+            {
+                "parameter": [each.parameter.name for each in fitted],
+                "unit": [each.parameter.unit for each in fitted],
+                "before": [each.before for each in fitted],
+                "after": [each.value for each in fitted],
+                "standard_error": np.array([each.standard_error for each in fitted], dtype=float),
+            }
+        )
 
     @property
     def is_good(self) -> bool:

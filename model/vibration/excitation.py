@@ -46,18 +46,6 @@ NULL_SHARE = 0.1
 """A null is below this share of the map's maximum."""
 
 
-def by_frequency(excitation: Excitation) -> list[tuple[float, Excitation]]:
-    """Return the tones of each frequency [Hz], ascending."""
-    frequencies = sorted({tone.frequency for tone in excitation.values()})
-    return [
-        (
-            frequency,
-            {name: tone for name, tone in excitation.items() if tone.frequency == frequency},
-        )
-        for frequency in frequencies
-    ]
-
-
 def base_amplitudes(
     excitation: Excitation, eras: Sequence[Era], *others: Excitation
 ) -> tuple[FloatArray, ComplexArray]:

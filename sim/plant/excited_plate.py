@@ -1,12 +1,13 @@
 """Play layers on the plate in the time domain, without wires and amplifiers.
 
 From rest the bases move exactly as commanded, along shaped onsets or a ramp. The plate is linear:
-each frequency of each layer is played alone, which keeps a finger's own apart from those of others.
+each layer is played alone, which keeps a finger's own apart from those of others.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,26 +24,27 @@ from model.finger.perception import (
     DEFAULT_THRESHOLD,
     contrast_db,
     decibels,
-    detection_threshold,
+    over_threshold,
+    sensation_level,
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, fingertip_loads
 from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import base_amplitudes, by_frequency
+from model.vibration.excitation import base_amplitudes
 from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
-"""Length [s] of the last part, in which steady amplitudes are fitted."""
+"""Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
 
 LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
 """Hann window under which a level over time is a root mean square, and the steps of both [s]."""
 
 MAX_DURATION = 10.0
-"""Longest playback [s]; ten fingers take 150 MB for each frequency of a layer."""
+"""Longest playback [s]; ten fingers take 150 MB for each layer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +82,9 @@ class FeltFinger:
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """One frequency [Hz] of a layer, by number, and the records of all fingers under it alone."""
+    """What one layer does alone: its frequencies (f,) [Hz], and the records of all fingers."""
 
-    layer: int
-    frequency: float
+    frequencies: tuple[float, ...]
     records: tuple[Record, ...]
 
 
@@ -91,7 +92,7 @@ class Vibration:
 class Playback:
     """Records of fingertips while layers played, from rest at time 0.
 
-    vibrations: each frequency of each layer alone; own: of each finger the numbers of the layers
+    vibrations: each layer alone, by number; own: of each finger the numbers of the layers
     that are for it, none of a quiet one; settled [s]: end of the onsets; threshold: name of the set
     that levels are above. Measures are named as those of a `Sensation`; steady ones are fitted to
     the last STEADY seconds, after the plate has settled (50 ms to 1 s).
@@ -115,12 +116,12 @@ class Playback:
             for name, records in fingers.items()
             for number, record in enumerate(records, start=1)
         }
-        return as_frame({"time_s": self.vibrations[0].records[0].times, **means})
+        return as_frame({"time_s": self.records[0].times, **means})
 
     @property
     def frequencies(self) -> tuple[float, ...]:
         """Frequencies that are driven [Hz], ascending."""
-        return tuple(sorted({each.frequency for each in self.vibrations}))
+        return tuple(sorted({each for one in self.vibrations for each in one.frequencies}))
 
     @cached_property
     def records(self) -> tuple[Record, ...]:
@@ -191,48 +192,40 @@ class Playback:
     @cached_property
     def _steady(self) -> tuple[tuple[float, float], ...]:
         """Steady level of each finger's own layers, and of all others at its loudest point."""
-        times = self.vibrations[0].records[0].times
-        inside = times >= max(self.settled, times[-1] - STEADY)
         found = []
         for number in range(len(self.own)):
-            powers = []
-            for each in self.vibrations:
-                samples = each.records[number].accelerations[inside] / self._threshold_of(each)
-                fitted = fit_tones(times[inside] - times[0], samples, [each.frequency])
-                powers.append((each.layer, np.abs(fitted[0]) ** 2))
+            powers = [self._power_of(each, number) for each in self.vibrations]
             own, others = self._levels(number, powers)
             found.append((float(own), float(others)))
         return tuple(found)
 
+    def _power_of(self, vibration: Vibration, number: int) -> FloatArray:
+        """Steady power to threshold at the points of a finger (p,)."""
+        record, driven = vibration.records[number], vibration.frequencies
+        inside = record.times >= max(self.settled, record.times[-1] - STEADY)
+        fitted = np.abs(fit_tones(record.times[inside], record.accelerations[inside], driven))
+        return np.asarray(10 ** (sensation_level(np.array(driven), fitted, self.threshold) / 10))
+
     def _over_time(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times (w,) [s], and at these levels of a finger's own layers and of all others (w,)."""
-        times, signals = self.vibrations[0].records[0].times, dict[int, FloatArray]()
-        for each in self.vibrations:
-            samples = each.records[number].accelerations / self._threshold_of(each)
-            signals[each.layer] = signals.get(each.layer, 0) + samples
-        count, step = (round(each * SAMPLE_RATE) for each in (LEVEL_WINDOW, LEVEL_STEP))
+        times, powers = self.records[number].times, []
+        rate = (len(times) - 1) / (times[-1] - times[0])
+        count, step = (round(each * rate) for each in (LEVEL_WINDOW, LEVEL_STEP))
         count = min(count, len(times))
         weights = np.hanning(count + 2)[1:-1]
-        powers = [
-            (layer, sliding_window_view(each**2, count, axis=0)[::step] @ (2 * weights))
-            for layer, each in signals.items()
-        ]
-        means = [(layer, power / weights.sum()) for layer, power in powers]
-        own, others = self._levels(number, means)
-        return times[count // 2 :][: len(own) * step : step], own, others
+        weights *= 2 / weights.sum()  # a level is that of a tone's amplitude
+        for each in self.vibrations:
+            felt = over_threshold(each.records[number].accelerations, rate, self.threshold)
+            powers.append(sliding_window_view(felt**2, count, axis=0)[::step] @ weights)
+        return times[count // 2 :: step][: len(powers[0])], *self._levels(number, powers)
 
-    def _levels(
-        self, number: int, powers: Sequence[tuple[int, FloatArray]]
-    ) -> tuple[FloatArray, FloatArray]:
+    def _levels(self, number: int, powers: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Levels of a finger's own layers and of all others, from powers (..., p) of each layer."""
-        record, both = self.records[number], [0 * powers[0][1], 0 * powers[0][1]]
-        for layer, power in powers:
+        both = [0 * powers[0], 0 * powers[0]]
+        for layer, power in enumerate(powers):
             both[layer in self.own[number]] += power
         others, own = np.sqrt(both)
-        return decibels(own @ record.weights), decibels(others.max(axis=-1))
-
-    def _threshold_of(self, vibration: Vibration) -> float:
-        return float(detection_threshold(np.array(vibration.frequency), self.threshold))
+        return decibels(own @ self.records[number].weights), decibels(others.max(axis=-1))
 
 
 def play(
@@ -248,21 +241,24 @@ def play(
     """Play layers for a duration [s] on a plate at rest, under these fingers.
 
     The fingers load the plate as the rig's fingertip, by their loads; own: of each the numbers of
-    the layers for it, by default all where it has a stimulus. reduced: the plate that the imperfections make of the rig's, for forces at
-    its ERAs and loads. Each layer starts along its onset, or its ramp. Latency, skew and noise are
-    left out. Raises InputError for fingers off the plate, layers that the rig cannot play, and a
-    duration out of range.
+    the layers for it, by default all where it has a stimulus. reduced: the plate that the
+    imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
+    onset, or its ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
+    plate, layers that the rig cannot play, and a duration out of range.
     """
     check_fingers(fingers, rig.plate)
     if own is None:
         every = tuple(range(len(layers)))
         own = [every if each.stimulus else () for each in fingers]
-    voices = [(number, each) for number, one in enumerate(layers) for each in one.voices]
-    ends = [0.0]
-    for _, each in voices:
-        base_amplitudes(each.excitation, rig.eras)  # refuses ERAs that the rig does not have
-        onsets = each.onset.values() if each.onset else ()
-        ends.append(max([envelope.duration for envelope in onsets], default=each.ramp))
+    voices = [voice for layer in layers for voice in layer.voices]
+    ends = [
+        max(
+            [envelope.duration for envelope in voice.onset.values()]
+            if voice.onset
+            else [voice.ramp]
+        )
+        for voice in voices
+    ]
     settled = max(ends)
     if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
@@ -279,29 +275,27 @@ def play(
     weights = [fingertip_weights(*at, rig.plate) for at in contacts]
     splits, loaded = np.cumsum([len(disc) for disc in discs])[:-1], None
     vibrations = []
-    for number, frequency, bases in _parts(voices, rig.eras):
+    for layer in layers:
+        frequencies, _ = base_amplitudes(layer.excitation, rig.eras, *layer.side_bands)
         plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
         plant.set_contacts(loads, loaded=loaded)
         loaded = plant.loaded
-        for at, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
-            plant.set_input(at, realised(terms, imperfections.errors_of(era.name, rig)))
+        for number, (era, terms) in enumerate(zip(rig.eras, _bases(layer, rig.eras), strict=True)):
+            plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))
         shapes = plant.reduced.at(np.concatenate(discs))
         times, felt = plant.advance(duration, sample_rate=SAMPLE_RATE, shapes=shapes)
-        parts = np.split(felt, splits, axis=1)
-        records = [Record(*each) for each in zip(discs, weights, [times] * len(discs), parts)]
-        vibrations.append(Vibration(number, frequency, tuple(records)))
+        parts = zip(discs, weights, np.split(felt, splits, axis=1), strict=True)
+        records = tuple([Record(disc, weight, times, part) for disc, weight, part in parts])
+        vibrations.append(Vibration(tuple(frequencies.tolist()), records))
     return Playback(tuple(vibrations), tuple(own), settled, rig.threshold)
 
 
-def _parts(
-    voices: Sequence[tuple[int, Layer]], eras: Sequence[Era]
-) -> Iterator[tuple[int, float, Bases]]:
-    """Layer, frequency [Hz] and motion of the bases of each frequency of each voice."""
-    for number, layer in voices:
-        for frequency, tones in by_frequency(layer.excitation):
-            if layer.onset:
-                envelopes = layer.onset.items()
-                own = {name: each for name, each in envelopes if each.frequency == frequency}
-                yield number, frequency, shaped(own, eras)
-            else:
-                yield number, frequency, ramped_onset(tones, eras, ramp=layer.ramp)
+def _bases(layer: Layer, eras: Sequence[Era]) -> Bases:
+    """Motion of the bases when a layer starts, its side bands included."""
+    voices = [
+        shaped(each.onset, eras)
+        if each.onset
+        else ramped_onset(each.excitation, eras, ramp=each.ramp)
+        for each in layer.voices
+    ]
+    return tuple(tuple(chain.from_iterable(each)) for each in zip(*voices, strict=True))

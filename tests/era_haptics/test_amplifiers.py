@@ -60,7 +60,10 @@ def test_open_amplifier_needs_a_name_when_there_are_several() -> None:
 
 
 def test_layers_of_accepts_frequency_drive_and_tone() -> None:
-    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept."""
+    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept.
+
+    Several tones of an ERA are excitations beside the first.
+    """
     tone = era.Tone(250.0, 3e-5, 0.1)
     drives = {"SW": 110, "SE": era.Drive(110, level=0.25, phase_deg=-90), "NE": tone}
     assert layers_of(drives, RIG)[0].excitation == {
@@ -68,6 +71,11 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
         "SE": era.Tone(110, 0.25e-4, -math.pi / 2),
         "NE": tone,
     }
+    (layer,) = layers_of({"SW": [110, era.Drive(90, level=0.5)], "SE": (110,)}, RIG)
+    assert layer.excitations == (
+        {"SW": era.Tone(110, 1e-4), "SE": era.Tone(110, 1e-4)},
+        {"SW": era.Tone(90, 0.5e-4)},
+    )
 
 
 def test_layers_of_converts_numbers_of_numpy() -> None:
@@ -86,6 +94,8 @@ def test_layers_of_converts_numbers_of_numpy() -> None:
         ({"SW": 0}, "frequency.* got 0 Hz"),
         ({"SW": math.inf}, "frequency.* got inf Hz"),
         ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
+        ({"SW": [110, -1]}, "frequency.* got -1 Hz"),
+        ({"SW": []}, "SW must have a tone"),
     ],
 )
 def test_layers_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:

@@ -16,9 +16,9 @@ PLATE = era.SolvedPlate(RIG)
 ONE, OTHER, QUIET = (0.08, 0.06), (0.22, 0.16), (0.15, 0.11)
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["beside a quiet finger", "modulated"])
+@pytest.fixture(scope="module", params=[False, True], ids=["quiet", "modulated"])
 def answer(request: pytest.FixtureRequest) -> era.Answer:
-    """Of two fingers, beside a quiet one that comes first, or the strength of one comes and goes."""
+    """Of two fingers, beside a quiet one that comes first, or one of them modulated."""
     frequencies = np.array([60.0, 120.0, 230.0, 250.0, 270.0])
     table = build_table(RIG, frequencies=frequencies, grid=era.Grid(4, 3), drive_mode="phased")
     first = era.Finger(ONE, era.Stimulus(modulation_hz=20)), era.Finger(OTHER, era.Stimulus())

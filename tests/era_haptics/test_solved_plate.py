@@ -125,6 +125,9 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert found.rig.plate.loss_factor == pytest.approx(0.013, rel=0.01)
     assert found.rig.era("SW").stiffness == pytest.approx(19040, rel=0.02)
     assert found.rig.uncertainty.thickness < 0.005
+    frame = found.to_frame().set_index("parameter")
+    assert frame.loc["SW stiffness", "after"] == found.rig.era("SW").stiffness
+    assert frame.loc["SW stiffness", ["before", "unit"]].tolist() == [17000.0, "N/m"]
 
 
 def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch) -> None:

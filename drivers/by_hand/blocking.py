@@ -48,7 +48,6 @@ class BlockingAmplifier:
         self._reached = reached(url, limits=limits, is_output=is_output)
         self._opened = AsyncExitStack()
         self._token = 1
-        self._numbers: set[int] = set()  # of the layers that may play
         self._name = f"amplifier {url}"
 
     def __enter__(self) -> "BlockingAmplifier":
@@ -144,11 +143,10 @@ class BlockingAmplifier:
         _require_layers(layers)
         self._token = token_after(self._token)
         numbers = {each.number for each in layers}
-        (like, *_), left = (*layers, Layer(0)), sorted(self._numbers - numbers)
-        ended = [replace(like, number=number, tones=()) for number in left]
-        staged = await self._amplifier.stage(self._token, [*layers, *ended], now=True)
-        self._numbers = numbers
-        return staged
+        every = range(self._amplifier.capabilities["layers"])
+        (like, *_) = (*layers, Layer(0))
+        ended = [replace(like, number=n, tones=()) for n in every if n not in numbers]
+        return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
 
     async def _stopped(self) -> Stopped:
         return await self._amplifier.stop()

@@ -144,30 +144,29 @@ class Playback:
     @cached_property
     def fingers(self) -> tuple[FeltFinger, ...]:
         """What each finger felt, in the order in which they were given."""
-        found, steady = [], self._steady
-        for number, (level, foreign) in enumerate(steady):
-            others = foreign if foreign > -np.inf else self.quiet_level_db_sl
-            above = level if self.own[number] else self.level_db_sl
-            found.append(
-                FeltFinger(
-                    level,
-                    foreign if foreign > -np.inf else None,
-                    None if others is None else above - others,
-                    *self._over_time(number),
-                )
-            )
+        levels, found = [self._levels(number) for number in range(len(self.own))], []
+        weakest = min([own[0] for own, _ in levels if own[0] > -np.inf], default=-np.inf)
+        every = [*zip(self.own, levels, strict=True)]
+        loudest = max([others[0] for layers, (_, others) in every if not layers], default=None)
+        for layers, (own, others) in every:
+            foreign = others[0] if others[0] > -np.inf else None
+            beside = loudest if foreign is None else foreign
+            contrast = None if beside is None else (own[0] if layers else weakest) - beside
+            times = self.records[0].times[self._window[0] // 2 :: self._window[1]][: len(own) - 1]
+            found.append(FeltFinger(own[0], foreign, contrast, times, own[1:], others[1:]))
         return tuple(found)
 
     @property
     def level_db_sl(self) -> float:
         """Steady level of a target's own [dB SL], mean over its fingertip; minimum over targets."""
-        return min(level for (level, _), own in zip(self._steady, self.own, strict=True) if own)
+        levels = zip(self.fingers, self.own, strict=True)
+        return min([each.level_db_sl for each, layers in levels if layers])
 
     @property
     def quiet_level_db_sl(self) -> float | None:
         """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
-        quiet = [level for (_, level), own in zip(self._steady, self.own, strict=True) if not own]
-        return max(quiet, default=None)
+        quiet = [each for each, layers in zip(self.fingers, self.own, strict=True) if not layers]
+        return max([each.foreign_level_db_sl or -np.inf for each in quiet], default=None)
 
     @property
     def contrast_db(self) -> float | None:
@@ -189,43 +188,33 @@ class Playback:
         count, weights = len(targets), [record.weights for record in targets]
         return float(contrast_db(first[:count], np.concatenate(first[count:]), weights))
 
-    @cached_property
-    def _steady(self) -> tuple[tuple[float, float], ...]:
-        """Steady level of each finger's own layers, and of all others at its loudest point."""
-        found = []
-        for number in range(len(self.own)):
-            powers = [self._power_of(each, number) for each in self.vibrations]
-            own, others = self._levels(number, powers)
-            found.append((float(own), float(others)))
-        return tuple(found)
-
-    def _power_of(self, vibration: Vibration, number: int) -> FloatArray:
-        """Steady power to threshold at the points of a finger (p,)."""
-        record, driven = vibration.records[number], vibration.frequencies
-        inside = record.times >= max(self.settled, record.times[-1] - STEADY)
-        fitted = np.abs(fit_tones(record.times[inside], record.accelerations[inside], driven))
-        return np.asarray(10 ** (sensation_level(np.array(driven), fitted, self.threshold) / 10))
-
-    def _over_time(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times (w,) [s], and at these levels of a finger's own layers and of all others (w,)."""
-        times, powers = self.records[number].times, []
+    @property
+    def _window(self) -> tuple[int, int]:
+        """Samples of a window over which a level over time is taken, and between two of these."""
+        times = self.records[0].times
         rate = (len(times) - 1) / (times[-1] - times[0])
-        count, step = (round(each * rate) for each in (LEVEL_WINDOW, LEVEL_STEP))
-        count = min(count, len(times))
-        weights = np.hanning(count + 2)[1:-1]
-        weights *= 2 / weights.sum()  # a level is that of a tone's amplitude
-        for each in self.vibrations:
-            felt = over_threshold(each.records[number].accelerations, rate, self.threshold)
-            powers.append(sliding_window_view(felt**2, count, axis=0)[::step] @ weights)
-        return times[count // 2 :: step][: len(powers[0])], *self._levels(number, powers)
+        return min(round(LEVEL_WINDOW * rate), len(times)), round(LEVEL_STEP * rate)
 
-    def _levels(self, number: int, powers: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Levels of a finger's own layers and of all others, from powers (..., p) of each layer."""
-        both = [0 * powers[0], 0 * powers[0]]
-        for layer, power in enumerate(powers):
-            both[layer in self.own[number]] += power
-        others, own = np.sqrt(both)
+    def _levels(self, number: int) -> tuple[FloatArray, FloatArray]:
+        """Levels (1 + w,) of a finger's own layers and of all others: steady, then over time."""
+        powers = np.array(
+            [self._powers(each.records[number], each.frequencies) for each in self.vibrations]
+        )
+        is_own = np.isin(np.arange(len(powers)), self.own[number])
+        own, others = (np.sqrt(powers[some].sum(axis=0)) for some in (is_own, ~is_own))
         return decibels(own @ self.records[number].weights), decibels(others.max(axis=-1))
+
+    def _powers(self, record: Record, frequencies: Sequence[float]) -> FloatArray:
+        """Power to threshold at the points of a finger (1 + w, p): steady, then over time."""
+        times, (count, step) = record.times, self._window
+        inside = times >= max(self.settled, times[-1] - STEADY)
+        fitted = np.abs(fit_tones(times[inside], record.accelerations[inside], frequencies))
+        level = sensation_level(np.array(frequencies), fitted, self.threshold)
+        felt = over_threshold(record.accelerations, 1 / (times[1] - times[0]), self.threshold)
+        weights = np.hanning(count + 2)[1:-1]
+        power = sliding_window_view(felt**2, count, axis=0)[::step] @ weights
+        # That of a tone is the square of its amplitude, twice its mean square.
+        return np.vstack([10 ** (level / 10), 2 * power / weights.sum()])
 
 
 def play(
@@ -251,14 +240,8 @@ def play(
         every = tuple(range(len(layers)))
         own = [every if each.stimulus else () for each in fingers]
     voices = [voice for layer in layers for voice in layer.voices]
-    ends = [
-        max(
-            [envelope.duration for envelope in voice.onset.values()]
-            if voice.onset
-            else [voice.ramp]
-        )
-        for voice in voices
-    ]
+    ends = [voice.ramp for voice in voices if not voice.onset]
+    ends += [each.duration for voice in voices for each in (voice.onset or {}).values()]
     settled = max(ends)
     if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(

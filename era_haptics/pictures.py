@@ -13,12 +13,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.figures.contents_picture import ContentFinger, contents_figure
 from model.figures.drawing import map_figure
-from model.figures.table_pictures import (
-    contrast_map_figure,
-    draw_fingertip,
-    draw_level_scale,
-    draw_levels,
-)
+from model.figures.table_pictures import contrast_map_figure, layer_figure
 from model.study.contrast_map import ContrastMap
 from model.table.table import LocalizationTable
 from sim.plant.excited_plate import Playback
@@ -48,21 +43,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
             f"layer must be the number of one of the answer's {len(answer.layers)}, from 0, got "
             f"{shown(layer)}"
         )
-    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
-    axes = figure.subplots()
-    axes.set_axis_off()
-    played = answer.layers[layer]
-    draw_levels(axes, table, played.excitation)
-    for number, each in enumerate(answer.fingers):
-        is_felt = number in played.fingers
-        level = each.level_db_sl if is_felt else None
-        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
-    promised = answer.fingers[played.fingers[0]].promised_contrast_db
-    if promised is not None:
-        title = f"contrast at least {promised:.0f} dB on nine of ten plates"
-        axes.set_title(title, fontsize=11, pad=20)
-    draw_level_scale(figure, [axes], shrink=0.8)
-    return figure
+    return layer_figure(table, answer, layer)
 
 
 def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:

@@ -1,12 +1,13 @@
 """The plate of a rig, solved once: modes, maps, and playback in time."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
 from era_haptics.drive import Played, layers_of
 from model.answer.answer import Answer, Layer
-from model.answer.fingers import Finger, Placement, Stimulus, together
+from model.answer.fingers import Placement, Stimulus, together
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -104,15 +105,13 @@ class SolvedPlate:
         """
         expect_number(duration, what="duration", unit="seconds")
         layers = self._layers(drive)
-        placed, weighed = as_points(quiet, what="quiet"), as_loads(loads)
-        fingers: Sequence[Finger]
-        own: list[tuple[int, ...]] | None = None
+        others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
         if target is not None:
             at = as_points(target, what="target")
-            fingers = together(Placement(at, placed, weighed), Stimulus())
-        elif isinstance(drive, Answer) and not placed and not weighed:
-            fingers = drive.asked
-            own = [() if each.layer is None else (each.layer,) for each in drive.fingers]
+            fingers = together(Placement(at, others, weighed), Stimulus())
+            layers = tuple([replace(each, fingers=tuple(range(len(at)))) for each in layers])
+        elif isinstance(drive, Answer) and not others and not weighed:
+            fingers = [*drive.asked]
         else:
             raise InputError(
                 "target must be positions of fingers such as (0.08, 0.06), got None; only the "
@@ -123,7 +122,6 @@ class SolvedPlate:
             self._reduced,
             layers,
             fingers,
-            own,
             duration=duration,
             imperfections=self._drawn,
         )

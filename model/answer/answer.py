@@ -100,11 +100,9 @@ class Layer:
     @property
     def voices(self) -> tuple["Layer", ...]:
         """It without side bands, and each of them as a layer, along its ramp."""
-        if not self.side_bands:
-            return (self,)
-        carrier = replace(self, side_bands=())
-        sides = [replace(carrier, excitation=e, onset=None, ending=None) for e in self.side_bands]
-        return (carrier, *sides)
+        carrier, sides = replace(self, side_bands=()), self.side_bands
+        beside = replace(carrier, onset=None, ending=None)
+        return (carrier, *[replace(beside, excitation=each) for each in sides])
 
     def scaled(self, gain_db: float) -> "Layer":
         """The layer louder by so much [dB]: contrasts stay."""

@@ -5,7 +5,7 @@ each layer is played alone, which keeps a finger's own apart from those of other
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -51,23 +51,19 @@ MAX_DURATION = 10.0
 class FeltFinger:
     """What one finger felt, steady as of a `Sensation`, and over time.
 
-    level_db_sl: of its own layers, mean over the fingertip, -inf without one; foreign_level_db_sl:
-    of all others at its loudest point, None without one; contrast_db: of its own above these, or
+    level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
+    its loudest point; both -inf without one; contrast_db: of its own above these, or
     where there are no others above its own at the loudest quiet finger; of a quiet finger the
     weakest level at another one's own finger above all of them here. times (w,) [s], and at these
     levels_db_sl and foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
     """
 
     level_db_sl: float
-    foreign_level_db_sl: float | None
+    foreign_level_db_sl: float
     contrast_db: float | None
-    times: FloatArray
-    levels_db_sl: FloatArray
-    foreign_levels_db_sl: FloatArray
-
-    def __repr__(self) -> str:
-        contrast = "alone" if self.contrast_db is None else f"contrast {self.contrast_db:.1f} dB"
-        return f"<FeltFinger at {self.level_db_sl:.1f} dB SL, {contrast}>"
+    times: FloatArray = field(repr=False)
+    levels_db_sl: FloatArray = field(repr=False)
+    foreign_levels_db_sl: FloatArray = field(repr=False)
 
     def to_frame(self) -> Any:
         """Time, its own level and that of the others as a pandas DataFrame; needs pandas."""
@@ -82,9 +78,13 @@ class FeltFinger:
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """What one layer does alone: its frequencies (f,) [Hz], and the records of all fingers."""
+    """What one layer does alone at all fingers.
+
+    frequencies (f,) [Hz]; fingers: numbers of those that it is for; records: of all fingers.
+    """
 
     frequencies: tuple[float, ...]
+    fingers: tuple[int, ...]
     records: tuple[Record, ...]
 
 
@@ -92,14 +92,13 @@ class Vibration:
 class Playback:
     """Records of fingertips while layers played, from rest at time 0.
 
-    vibrations: each layer alone, by number; own: of each finger the numbers of the layers
-    that are for it, none of a quiet one; settled [s]: end of the onsets; threshold: name of the set
-    that levels are above. Measures are named as those of a `Sensation`; steady ones are fitted to
-    the last STEADY seconds, after the plate has settled (50 ms to 1 s).
+    vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
+    onsets; threshold: name of the set that levels are above. Measures are named as those of a
+    `Sensation`; steady ones are fitted to the last STEADY seconds, after the plate has settled
+    (50 ms to 1 s).
     """
 
     vibrations: tuple[Vibration, ...]
-    own: tuple[tuple[int, ...], ...]
     settled: float
     threshold: str = DEFAULT_THRESHOLD
 
@@ -134,39 +133,51 @@ class Playback:
     @property
     def targets(self) -> tuple[Record, ...]:
         """Records of the fingers that have a layer."""
-        return tuple(each for each, own in zip(self.records, self.own, strict=True) if own)
+        return tuple([self.records[number] for number in self._own])
 
     @property
     def quiet(self) -> tuple[Record, ...]:
         """Records of the fingers that have none."""
-        return tuple(each for each, own in zip(self.records, self.own, strict=True) if not own)
+        return tuple([each for number, each in enumerate(self.records) if number not in self._own])
+
+    @property
+    def _own(self) -> list[int]:
+        """Numbers of the fingers that have a layer, ascending."""
+        return sorted({number for each in self.vibrations for number in each.fingers})
 
     @cached_property
     def fingers(self) -> tuple[FeltFinger, ...]:
         """What each finger felt, in the order in which they were given."""
-        levels, found = [self._levels(number) for number in range(len(self.own))], []
-        weakest = min([own[0] for own, _ in levels if own[0] > -np.inf], default=-np.inf)
-        every = [*zip(self.own, levels, strict=True)]
-        loudest = max([others[0] for layers, (_, others) in every if not layers], default=None)
-        for layers, (own, others) in every:
-            foreign = others[0] if others[0] > -np.inf else None
-            beside = loudest if foreign is None else foreign
-            contrast = None if beside is None else (own[0] if layers else weakest) - beside
-            times = self.records[0].times[self._window[0] // 2 :: self._window[1]][: len(own) - 1]
-            found.append(FeltFinger(own[0], foreign, contrast, times, own[1:], others[1:]))
+        levels, found = [self._levels(number) for number in range(len(self.records))], []
+        weakest = min([levels[number][0][0] for number in self._own])
+        quiet = [others[0] for number, (_, others) in enumerate(levels) if number not in self._own]
+        (count, step), all_times = self._window, self.records[0].times
+        for number, (own, others) in enumerate(levels):
+            is_alone = others[0] == -np.inf and not quiet
+            beside = max(quiet) if quiet and others[0] == -np.inf else others[0]
+            above = own[0] if number in self._own else weakest
+            found.append(
+                FeltFinger(
+                    own[0],
+                    others[0],
+                    None if is_alone else above - beside,
+                    all_times[count // 2 :: step][: len(own) - 1],
+                    own[1:],
+                    others[1:],
+                )
+            )
         return tuple(found)
 
     @property
     def level_db_sl(self) -> float:
         """Steady level of a target's own [dB SL], mean over its fingertip; minimum over targets."""
-        levels = zip(self.fingers, self.own, strict=True)
-        return min([each.level_db_sl for each, layers in levels if layers])
+        return min([self.fingers[number].level_db_sl for number in self._own])
 
     @property
     def quiet_level_db_sl(self) -> float | None:
         """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
-        quiet = [each for each, layers in zip(self.fingers, self.own, strict=True) if not layers]
-        return max([each.foreign_level_db_sl or -np.inf for each in quiet], default=None)
+        felt = [each for number, each in enumerate(self.fingers) if number not in self._own]
+        return max([each.foreign_level_db_sl for each in felt], default=None)
 
     @property
     def contrast_db(self) -> float | None:
@@ -200,7 +211,7 @@ class Playback:
         powers = np.array(
             [self._powers(each.records[number], each.frequencies) for each in self.vibrations]
         )
-        is_own = np.isin(np.arange(len(powers)), self.own[number])
+        is_own = np.array([number in each.fingers for each in self.vibrations])
         own, others = (np.sqrt(powers[some].sum(axis=0)) for some in (is_own, ~is_own))
         return decibels(own @ self.records[number].weights), decibels(others.max(axis=-1))
 
@@ -222,27 +233,21 @@ def play(
     reduced: ReducedPlate,
     layers: Sequence[Layer],
     fingers: Sequence[Finger],
-    own: Sequence[tuple[int, ...]] | None = None,
     *,
     duration: float,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> Playback:
-    """Play layers for a duration [s] on a plate at rest, under these fingers.
+    """Play layers for a duration [s] on a plate at rest, under fingers, by number in the layers.
 
-    The fingers load the plate as the rig's fingertip, by their loads; own: of each the numbers of
-    the layers for it, by default all where it has a stimulus. reduced: the plate that the
+    The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
     imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
     onset, or its ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
     plate, layers that the rig cannot play, and a duration out of range.
     """
     check_fingers(fingers, rig.plate)
-    if own is None:
-        every = tuple(range(len(layers)))
-        own = [every if each.stimulus else () for each in fingers]
-    voices = [voice for layer in layers for voice in layer.voices]
-    ends = [voice.ramp for voice in voices if not voice.onset]
-    ends += [each.duration for voice in voices for each in (voice.onset or {}).values()]
-    settled = max(ends)
+    driven = [_bases(layer, rig.eras) for layer in layers]
+    terms = [term for bases in driven for motion in bases for term in motion]
+    settled = max([term.start for term in terms], default=0.0)  # of the last, which goes on
     if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
@@ -258,19 +263,19 @@ def play(
     weights = [fingertip_weights(*at, rig.plate) for at in contacts]
     splits, loaded = np.cumsum([len(disc) for disc in discs])[:-1], None
     vibrations = []
-    for layer in layers:
+    for layer, bases in zip(layers, driven, strict=True):
         frequencies, _ = base_amplitudes(layer.excitation, rig.eras, *layer.side_bands)
         plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
         plant.set_contacts(loads, loaded=loaded)
         loaded = plant.loaded
-        for number, (era, terms) in enumerate(zip(rig.eras, _bases(layer, rig.eras), strict=True)):
-            plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))
+        for number, (era, motion) in enumerate(zip(rig.eras, bases, strict=True)):
+            plant.set_input(number, realised(motion, imperfections.errors_of(era.name, rig)))
         shapes = plant.reduced.at(np.concatenate(discs))
         times, felt = plant.advance(duration, sample_rate=SAMPLE_RATE, shapes=shapes)
         parts = zip(discs, weights, np.split(felt, splits, axis=1), strict=True)
         records = tuple([Record(disc, weight, times, part) for disc, weight, part in parts])
-        vibrations.append(Vibration(tuple(frequencies.tolist()), records))
-    return Playback(tuple(vibrations), tuple(own), settled, rig.threshold)
+        vibrations.append(Vibration(tuple(frequencies.tolist()), layer.fingers, records))
+    return Playback(tuple(vibrations), settled, rig.threshold)
 
 
 def _bases(layer: Layer, eras: Sequence[Era]) -> Bases:

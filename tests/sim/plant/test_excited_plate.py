@@ -158,13 +158,13 @@ def test_playback_measures_of_several_targets() -> None:
     quiet = record(0.1, 0.2)
     quiet.accelerations[:1000] *= 10.0  # louder while it starts
     at_targets = record(3.0, 5.0), record(2.0, 2.0)
-    vibration = Vibration((100.0,), (*at_targets, quiet))
-    played = Playback((vibration,), ((0,), (0,), ()), settled=0.1)
+    vibration = Vibration((100.0,), (0, 1), (*at_targets, quiet))
+    played = Playback((vibration,), settled=0.1)
     assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
     assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=0.01)
     assert played.quiet_level_db_sl is not None
     assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
-    alone = Playback((Vibration((100.0,), at_targets[:1]),), ((0,),), settled=0.1)
+    alone = Playback((Vibration((100.0,), (0,), at_targets[:1]),), settled=0.1)
     assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
 
 
@@ -216,6 +216,6 @@ def test_playback_reads_steady_measures_at_the_end() -> None:
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
     record = Record(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
-    playback = Playback((Vibration((100.0,), (record,)),), ((0,),), settled=0.04)
+    playback = Playback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
     expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
     assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

@@ -73,8 +73,6 @@ def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
         if name not in rig.wiring:
             raise InputError(f"unknown ERA {name!r}; known are {', '.join(rig.wiring)}")
         several = given if isinstance(given, list | tuple) else (given,)
-        if not several:
-            raise InputError(f"{name} must have a tone to be driven, got {shown(given)}")
         tones[name] = [_tone_of(one, name, rig) for one in several]
     count = max([1, *map(len, tones.values())])
     excitation, *others = (

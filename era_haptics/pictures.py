@@ -1,5 +1,7 @@
 """Pictures as matplotlib figures, without pyplot."""
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
@@ -11,7 +13,7 @@ from model.answer.answer import Answer
 from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.figures.contents_picture import ContentFinger, contents_figure
+from model.figures.contents_picture import contents_figure
 from model.figures.drawing import map_figure
 from model.figures.table_pictures import contrast_map_figure, layer_figure
 from model.study.contrast_map import ContrastMap
@@ -57,17 +59,11 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
-    fingers = [
-        ContentFinger(
-            each.finger.at,
-            each.layer,
-            each.verdict,
-            each.promised_level_db_sl,
-            each.promised_contrast_db,
-        )
+    promised = [
+        replace(each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db)
         for each in answer.fingers
     ]
-    return contents_figure(table, answer.layers, fingers)
+    return contents_figure(table, answer.layers, promised)
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:

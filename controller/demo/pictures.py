@@ -9,9 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from controller.demo.touch_row import TouchRow
+from model.answer.answer import Sensation
+from model.answer.fingers import Finger
 from model.choice import ranked_by
 from model.figures import save_figure
-from model.figures.contents_picture import ContentFinger, contents_figure
+from model.figures.contents_picture import contents_figure
 from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
 from model.table.table import LocalizationTable
 
@@ -28,12 +30,12 @@ def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path)
         row = max(several, key=lambda row: len(row.contents))
         frequencies = [layer.frequency for layer in row.contents]
         fingers = [
-            ContentFinger(
-                each.at_m,
-                frequencies.index(each.frequency_hz) if each.frequency_hz in frequencies else None,
+            Sensation(
+                Finger(each.at_m),
                 each.verdict,
-                each.measured_level_db_sl,
-                each.measured_contrast_db,
+                frequencies.index(each.frequency_hz) if each.frequency_hz in frequencies else None,
+                -math.inf if each.measured_level_db_sl is None else each.measured_level_db_sl,
+                contrast_db=each.measured_contrast_db,
             )
             for each in row.fingers
         ]

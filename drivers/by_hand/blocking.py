@@ -142,10 +142,8 @@ class BlockingAmplifier:
     async def _applied(self, layers: Sequence[Layer]) -> Staged:
         _require_layers(layers)
         self._token = token_after(self._token)
-        numbers = {each.number for each in layers}
-        every = range(self._amplifier.capabilities["layers"])
-        (like, *_) = (*layers, Layer(0))
-        ended = [replace(like, number=n, tones=()) for n in every if n not in numbers]
+        every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
+        ended = [Layer(number) for number in every if number not in given]
         return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
 
     async def _stopped(self) -> Stopped:

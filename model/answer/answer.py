@@ -100,9 +100,11 @@ class Layer:
     @property
     def voices(self) -> tuple["Layer", ...]:
         """It without side bands, and each of them as a layer, along its ramp."""
-        carrier, sides = replace(self, side_bands=()), self.side_bands
-        beside = replace(carrier, onset=None, ending=None)
-        return (carrier, *[replace(beside, excitation=each) for each in sides])
+        beside = [
+            Layer(each, self.fingers, ramp=self.ramp, drive_mode=self.drive_mode)
+            for each in self.side_bands
+        ]
+        return (replace(self, side_bands=()), *beside)
 
     def scaled(self, gain_db: float) -> "Layer":
         """The layer louder by so much [dB]: contrasts stay."""

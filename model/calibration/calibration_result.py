@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.sensed_plate import Parameter
 from model.files.csv_file import as_frame
@@ -102,16 +100,15 @@ class Calibration:
     def to_frame(self) -> Any:
         """Each parameter before and after, with its standard error, as a pandas DataFrame.
 
-        Values in units of SI, which stand beside them; NaN without an error. Needs pandas.
+        Values in units of SI, which stand beside them; needs pandas.
         """
-        fitted = self.parameters
         return as_frame(
             {
-                "parameter": [each.parameter.name for each in fitted],
-                "unit": [each.parameter.unit for each in fitted],
-                "before": [each.before for each in fitted],
-                "after": [each.value for each in fitted],
-                "standard_error": np.array([each.standard_error for each in fitted], dtype=float),
+                "parameter": [each.parameter.name for each in self.parameters],
+                "unit": [each.parameter.unit for each in self.parameters],
+                "before": [each.before for each in self.parameters],
+                "after": [each.value for each in self.parameters],
+                "standard_error": [each.standard_error for each in self.parameters],
             }
         )
 

@@ -1,7 +1,7 @@
 """Where each of several contents is felt, as a table predicts it: each has a colour of its own."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,8 +9,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from model.answer.answer import OWN_CONTRAST_DB, Layer
-from model.arrays import FloatArray, Point, lattice
+from model.answer.answer import OWN_CONTRAST_DB, Layer, Sensation
+from model.arrays import FloatArray, lattice
 from model.figures.drawing import label_plate, raster
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
@@ -26,30 +26,13 @@ _GREY = 0.62
 _RADIUS = 100 * FINGERTIP_RADIUS  # cm
 
 
-@dataclass(frozen=True)
-class ContentFinger:
-    """A finger among contents: its place [m], and what is written beside it.
-
-    content: number of the one that it feels, None for none; level_db_sl, contrast_db: of that one,
-    None where they are not known.
-    """
-
-    at: Point
-    content: int | None
-    verdict: str
-    level_db_sl: float | None = None
-    contrast_db: float | None = None
-
-    @property
-    def color(self) -> str:
-        """Of its content, white without one."""
-        return "white" if self.content is None else COLORS[self.content % len(COLORS)]
-
-
 def contents_figure(
-    table: LocalizationTable, contents: Sequence[Layer], fingers: Sequence[ContentFinger]
+    table: LocalizationTable, contents: Sequence[Layer], fingers: Sequence[Sensation]
 ) -> Figure:
-    """Draw a panel with all contents, and one for each, as the table predicts them."""
+    """Draw a panel with all contents, and one for each, as the table predicts them.
+
+    Beside every finger its verdict, and level and contrast as they are given.
+    """
     count = len(contents)
     levels = np.array([_levels(table, each) for each in contents])
     width = 8.4 * (1 + 1 / count)
@@ -90,7 +73,7 @@ def _draw(
     table: LocalizationTable,
     levels: FloatArray,
     colors: Sequence[str],
-    fingers: Sequence[ContentFinger],
+    fingers: Sequence[Sensation],
 ) -> None:
     """Draw fingers, and the loudest content in its colour, paler the less it is above others."""
     plate = table.plate
@@ -112,19 +95,23 @@ def _draw(
     axes.plot(*zip(*places, strict=True), "o", ms=8, color="0.9", mec="black", clip_on=False)
     label_plate(axes)
     for finger in fingers:
-        place = 100 * finger.at[0], 100 * finger.at[1]
-        for width, hue in ((5.5, "white"), (2.6, finger.color)):
+        place = 100 * finger.finger.at[0], 100 * finger.finger.at[1]
+        for width, hue in ((5.5, "white"), (2.6, _color_of(finger))):
             axes.add_patch(Circle(place, _RADIUS, fill=False, ec=hue, lw=width, clip_on=False))
 
 
-def _label_finger(axes: Axes, finger: ContentFinger, contents: Sequence[Layer]) -> None:
+def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
     """Write verdict, level and contrast beside a finger, on the side towards the middle."""
     lines = [finger.verdict]
-    if finger.content is not None:
-        lines = [f"{_frequency(contents[finger.content])}, {finger.verdict}"]
+    if finger.layer is not None:
+        lines = [f"{_frequency(contents[finger.layer])}, {finger.verdict}"]
         figures = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
-        lines += [f"{each:.0f} dB {what}" for what, each in figures.items() if each is not None]
-    x, y = (100 * value for value in finger.at)
+        lines += [
+            f"{each:.0f} dB {what}"
+            for what, each in figures.items()
+            if each is not None and math.isfinite(each)
+        ]
+    x, y = (100 * value for value in finger.finger.at)
     is_high = y > sum(axes.get_ylim()) / 2
     axes.annotate(
         "\n".join(lines),
@@ -134,6 +121,11 @@ def _label_finger(axes: Axes, finger: ContentFinger, contents: Sequence[Layer]) 
         ha="center",
         va="top" if is_high else "bottom",
         fontsize=11,
-        color=finger.color,
+        color=_color_of(finger),
         bbox={"fc": "black", "ec": "none", "alpha": 0.75, "boxstyle": "round"},
     )
+
+
+def _color_of(finger: Sensation) -> str:
+    """Of its content, white without one."""
+    return "white" if finger.layer is None else COLORS[finger.layer % len(COLORS)]

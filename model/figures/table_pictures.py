@@ -142,10 +142,8 @@ def answer_figure(table: LocalizationTable) -> Figure:
     with suppress(InputError):  # small plate
         answer = query(table, Placement((target,), tuple(quiet)))
     if answer is None or not answer.is_reached:  # weak rig
-        figure = Figure(figsize=(6.6, 5), layout="compressed")
-        axes = figure.subplots()
-        axes.set_title("The table has no answer to the three fingers of this picture")
-        axes.axis("off")
+        figure = Figure(figsize=(6.6, 5))
+        figure.suptitle("The table has no answer to the three fingers of this picture")
         return figure
     figure, felt = layer_figure(table, answer, 0), answer.fingers[0]
     figure.axes[0].set_title(

@@ -267,8 +267,9 @@ class SupportedModes:
 
     def to_frame(self) -> Any:
         """Frequency and damping ratio as a pandas DataFrame, a row a mode; needs pandas."""
-        columns = {"frequency_hz": self.natural_frequencies, "damping_ratio": self.damping_ratios}
-        return as_frame(columns)
+        return as_frame(
+            {"frequency_hz": self.natural_frequencies, "damping_ratio": self.damping_ratios}
+        )
 
     def at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].

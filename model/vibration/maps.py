@@ -77,8 +77,7 @@ def plate_map(
         found = [solved.acceleration(rig.eras, driven, part, loads=rig.masses) for part in parts]
         return np.concatenate(found, axis=2)
 
-    first, *others = excitations
-    frequencies, field = tone_fields(first, rig.eras, respond, *others)
+    frequencies, field = tone_fields(excitations[0], rig.eras, respond, *excitations[1:])
     peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
     nulls = find_nulls(x, y, peak)
     return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))

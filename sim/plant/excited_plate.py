@@ -148,25 +148,24 @@ class Playback:
     @cached_property
     def fingers(self) -> tuple[FeltFinger, ...]:
         """What each finger felt, in the order in which they were given."""
-        levels, found = [self._levels(number) for number in range(len(self.records))], []
-        weakest = min([levels[number][0][0] for number in self._own])
-        quiet = [others[0] for number, (_, others) in enumerate(levels) if number not in self._own]
-        (count, step), all_times = self._window, self.records[0].times
-        for number, (own, others) in enumerate(levels):
-            is_alone = others[0] == -np.inf and not quiet
-            beside = max(quiet) if quiet and others[0] == -np.inf else others[0]
-            above = own[0] if number in self._own else weakest
-            found.append(
-                FeltFinger(
-                    own[0],
-                    others[0],
-                    None if is_alone else above - beside,
-                    all_times[count // 2 :: step][: len(own) - 1],
-                    own[1:],
-                    others[1:],
-                )
+        numbers, (count, step), own = range(len(self.records)), self._window, self._own
+        levels = np.array([self._levels(number) for number in numbers])
+        mine, others = levels[:, :, 0].T
+        has_own = np.isin(numbers, own)
+        loudest = others[~has_own].max(initial=-np.inf)
+        above = np.where(has_own, mine, mine[own].min())
+        contrasts = above - np.where(others > -np.inf, others, loudest)
+        times = self.records[0].times[count // 2 :: step][: levels.shape[2] - 1]
+        return tuple(
+            FeltFinger(
+                float(each[0, 0]),
+                float(each[1, 0]),
+                float(contrast) if contrast < np.inf else None,
+                times,
+                *each[:, 1:],
             )
-        return tuple(found)
+            for each, contrast in zip(levels, contrasts, strict=True)
+        )
 
     @property
     def level_db_sl(self) -> float:

@@ -117,10 +117,11 @@ def _by_amplifier(
         )
         for name, tone in promise.layer.excitation.items()
     )
-    layers = [contents.Layer(0, tones, _RAMP)]
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
-            playing = thread.submit(amplifier.play, layers, duration=seconds + _SETTLING)
+            playing = thread.submit(
+                amplifier.play, [contents.Layer(0, tones, _RAMP)], duration=seconds + _SETTLING
+            )
             heard = card.run(np.zeros((round(seconds * card.rate), 0)))
             playing.result()
         except BaseException:  # leaving waits for the thread, which feeds the watchdog

@@ -25,9 +25,9 @@ LIMITS = GuardLimits(40.0, 500.0, 0.5)
 DRAWN = f"sim://{example_rig_path()}"
 
 
-def layer(channel: int, frequency: float, level: float, number: int = 0) -> Layer:
+def layer(channel: int, frequency: float, level: float) -> Layer:
     """One tone at once, in a layer."""
-    return Layer(number, (Tone(channel, frequency, level),), ramp=0.0)
+    return Layer(0, (Tone(channel, frequency, level),), ramp=0.0)
 
 
 def loop_threads() -> list[str]:
@@ -37,15 +37,15 @@ def loop_threads() -> list[str]:
 
 
 def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
-    """Arm, play, stop, clear; a layer that is not given again ends, and nothing is left running."""
+    """Arm, play, stop, clear; layers that are not given end, and nothing is left running."""
     with BlockingAmplifier(DRAWN, limits=LIMITS) as amplifier:
         assert amplifier.identity["serial_number"] == "SIM-main"
         assert amplifier.capabilities["channels"] == 4
         assert amplifier.arm(2.0)["state"] == "OPERATION_ENABLED"
         played = amplifier.play([layer(0, 110.004, 0.2)], duration=0.03)
         assert played.layers[0].commands[0].frequency == 2200  # in 1/20 Hz
-        amplifier.apply([layer(0, 110.0, 0.2, number=1)])
         later = amplifier.apply([layer(1, 110.0, 0.3)])
+        assert [bool(each.commands) for each in later.layers] == [True] + [False] * 7
         status = amplifier.status()
         assert (status["token"], status["levels"]) == (later.token, [0.0, 0.3, 0.0, 0.0])
         amplifier.stop()

@@ -49,11 +49,10 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
 
 
 def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
-    """Draw all layers of an answer over the plate, each in its colour, and each alone.
+    """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
 
-    A colour is grey where layers mix, and black where nothing is felt. Beside every finger its
-    frequency, verdict, promised level and contrast. The picture of `era demo`. Raises InputError
-    for an answer without layers.
+    Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
+    picture of `era demo`. Raises InputError for an answer without layers.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")

@@ -96,12 +96,11 @@ class SolvedPlate:
     ) -> Playback:
         """Compute what fingers feel during a duration [s], from rest.
 
-        target: positions [m] of the fingers that all of it is for, by default the fingers of an
-        answer, each with its own layer and its load. A layer starts with its onset or its ramp,
-        other drives with a ramp of 40 ms. Fingers load the plate as the rig's fingertip; loads: of
-        each relative to it, targets first, 1 without. The plate in time is solved exactly, without
-        steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a
-        duration too short for a steady state.
+        target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
+        each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
+        without. A layer starts with its onset or its ramp, drives with a ramp of 40 ms. The plate
+        in time is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for
+        fingers off the plate, and a duration too short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
         layers = self._layers(drive)

@@ -58,11 +58,16 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
-    promised = [
-        replace(each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db)
-        for each in answer.fingers
-    ]
-    return contents_figure(table, answer.layers, promised)
+    return contents_figure(
+        table,
+        answer.layers,
+        [
+            replace(
+                each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db
+            )
+            for each in answer.fingers
+        ],
+    )
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:

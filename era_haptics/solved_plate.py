@@ -1,13 +1,13 @@
 """The plate of a rig, solved once: modes, maps, and playback in time."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
-from era_haptics.drive import Played, excitation_of, layer_of
+from era_haptics.drive import Played, layers_of
 from model.answer.answer import Answer, Layer
-from model.answer.fingers import Placement
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.fingers import Placement, Stimulus, together
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -19,7 +19,7 @@ from model.reduction.reduced_plate import (
 )
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.vibration.excitation import Excitation, Tone
+from model.vibration.excitation import Tone
 from model.vibration.maps import PlateMap, plate_map
 from sim.plant.excited_plate import Playback, play
 from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -63,65 +63,79 @@ class SolvedPlate:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
+        All layers of an answer play. ERAs at one frequency add as complex amplitudes, magnitudes of
+        several frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot
+        play.
         """
         points = (
             None
             if raster is None
             else as_pair(raster, what="raster", such_as="points along x and y such as (61, 46)")
         )
-        excitation = {}
-        for name, tone in self._excitation(drive).items():
-            factor = self._drawn.errors_of(name, self.rig).factor
-            excitation[name] = Tone.from_phasor(tone.frequency, factor * tone.phasor)
-        return plate_map(self._real, excitation, raster=points, free=self._free)
+        factors = {
+            era.name: self._drawn.errors_of(era.name, self.rig).factor for era in self.rig.eras
+        }
+        excitations = [
+            {
+                name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
+                for name, tone in each.items()
+            }
+            for layer in self._layers(drive)
+            for each in layer.excitations
+        ]
+        return plate_map(self._real, *excitations, raster=points, free=self._free)
 
     def play(
         self,
         drive: Played,
-        target: Positions,
+        target: Positions | None = None,
         *,
         quiet: Positions = (),
         loads: Sequence[float] = (),
         duration: float = 1.0,
     ) -> Playback:
-        """Compute what fingers at positions [m] feel during a duration [s], from rest.
+        """Compute what fingers feel during a duration [s], from rest.
 
-        A layer starts with its onset or its ramp, other drives with a ramp of 40 ms. Fingers
-        load the plate as the rig's fingertip; loads: of each relative to it, targets first, 1
-        without. The plate in time is solved exactly, without steps
-        (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a duration too
-        short for a steady state.
+        target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
+        each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
+        without. A layer starts with its onset or its ramp, drives with a ramp of 40 ms. The plate
+        in time is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for
+        fingers off the plate, and a duration too short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
-        fingers = Placement(
-            as_points(target, what="target"),
-            as_points(quiet, what="quiet"),
-            loads=as_loads(loads),
-        )
-        layer = layer_of(drive) if isinstance(drive, Answer | Layer) else None
+        layers = self._layers(drive)
+        others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
+        if target is not None:
+            at = as_points(target, what="target")
+            fingers = together(Placement(at, others, weighed), Stimulus())
+            layers = tuple([replace(each, fingers=tuple(range(len(at)))) for each in layers])
+        elif isinstance(drive, Answer) and not others and not weighed:
+            fingers = [*drive.asked]
+        else:
+            raise InputError(
+                "target must be positions of fingers such as (0.08, 0.06), got None; only the "
+                "fingers of an answer, with their loads, are known without"
+            )
         return play(
             self.rig,
             self._reduced,
-            self._excitation(drive),
+            layers,
             fingers,
             duration=duration,
-            ramp=layer.ramp if layer else ONSET_RAMP,
-            onset=layer.onset if layer else None,
             imperfections=self._drawn,
         )
 
-    def _excitation(self, drive: Played) -> Excitation:
-        """The excitation; raises InputError beyond the frequencies that the plate is solved for."""
-        excitation, highest = excitation_of(drive, self.rig), self.rig.limits.frequency_max
-        for name, tone in excitation.items():
+    def _layers(self, drive: Played) -> tuple[Layer, ...]:
+        """The layers; raises InputError beyond the frequencies that the plate is solved for."""
+        layers, highest = layers_of(drive, self.rig), self.rig.limits.frequency_max
+        tones = [item for one in layers for each in one.excitations for item in each.items()]
+        for name, tone in tones:
             if tone.frequency > highest:
                 raise InputError(
                     f"frequency of {name} must be at most {highest:g} Hz, got {tone.frequency:g}; "
                     "raise limits.frequency of the rig"
                 )
-        return excitation
+        return layers
 
     @cached_property
     def _free(self) -> FreePlate:

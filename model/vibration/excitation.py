@@ -46,21 +46,24 @@ NULL_SHARE = 0.1
 """A null is below this share of the map's maximum."""
 
 
-def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
+def base_amplitudes(
+    excitation: Excitation, eras: Sequence[Era], *others: Excitation
+) -> tuple[FloatArray, ComplexArray]:
     """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
 
-    Raises InputError where no ERA is driven, or an unknown one.
+    others: that play at the same time. Raises InputError where no ERA is driven, or an unknown one.
     """
-    if not excitation:
+    tones = [each for one in (excitation, *others) for each in one.items()]
+    if not tones:
         raise InputError("excitation: must drive at least one ERA")
     names = [era.name for era in eras]
-    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    frequencies = sorted({tone.frequency for _, tone in tones})
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
-    for name, tone in excitation.items():
+    for name, tone in tones:
         if name not in names:
             raise InputError(f"the rig has no ERA {name!r}; it has {', '.join(names)}")
         phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
-        amplitudes[frequencies.index(tone.frequency), names.index(name)] = phasor
+        amplitudes[frequencies.index(tone.frequency), names.index(name)] += phasor
     return np.array(frequencies), amplitudes
 
 
@@ -81,9 +84,13 @@ def tone_fields(
     excitation: Excitation,
     eras: Sequence[Era],
     response: Callable[[FloatArray], ComplexArray],
+    *others: Excitation,
 ) -> tuple[FloatArray, ComplexArray]:
-    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases."""
-    frequencies, amplitudes = base_amplitudes(excitation, eras)
+    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases.
+
+    others: excitations that play at the same time.
+    """
+    frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
     weights = amplitudes / np.array([era.stroke for era in eras])
     return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
 

@@ -106,7 +106,7 @@ MEASURED = Path(__file__).parents[2] / "examples" / "measured.csv"
 
 
 def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
-    """Of two frequencies; a drive of another phase turns its own field by that phase."""
+    """Of two frequencies; a drive of another phase turns its own field, several of one add up."""
     plate = era.SolvedPlate(era.load_rig(era.example_rig_path()))
     drive = {"SW": era.Drive(110, level=0.5), "NE": era.Drive(150, level=0.2)}
     found = plate.map(drive, raster=(7, 5))
@@ -115,6 +115,9 @@ def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
     np.testing.assert_allclose(np.abs(found.field).sum(axis=0), found.peak)
     turned = plate.map({"SW": era.Drive(110, level=0.5, phase_deg=90)}, raster=(7, 5))
     np.testing.assert_allclose(turned.field[0], 1j * found.field[0], rtol=1e-9)
+    parts = [era.Drive(110, level=0.2), era.Drive(110, level=0.3)]
+    added = plate.map({"SW": parts}, raster=(7, 5))
+    np.testing.assert_allclose(added.field[0], found.field[0], rtol=1e-9)
 
 
 @pytest.mark.long
@@ -125,6 +128,9 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert found.rig.plate.loss_factor == pytest.approx(0.013, rel=0.01)
     assert found.rig.era("SW").stiffness == pytest.approx(19040, rel=0.02)
     assert found.rig.uncertainty.thickness < 0.005
+    frame = found.to_frame().set_index("parameter")
+    assert frame.loc["SW stiffness", "after"] == found.rig.era("SW").stiffness
+    assert frame.loc["SW stiffness", ["before", "unit"]].tolist() == [17000.0, "N/m"]
 
 
 def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from desk_card import DeskCard
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
-from drivers.playing.contents import Tone
+from drivers.playing.contents import Layer
 from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
@@ -286,16 +286,14 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
     class Observed(BlockingAmplifier):
         """Notes how what it plays ends."""
 
-        def apply(
-            self, tones: Sequence[Tone], *, ramp: float = 0.02, valid_for: float = 0.0
-        ) -> Staged:
-            staged = super().apply(tones, ramp=ramp, valid_for=valid_for)
+        def apply(self, layers: Sequence[Layer]) -> Staged:
+            staged = super().apply(layers)
             playing.set()
             return staged
 
-        def play(self, tones: Sequence[Tone], *, duration: float, ramp: float = 0.02) -> Staged:
+        def play(self, layers: Sequence[Layer], *, duration: float) -> Staged:
             try:
-                staged = super().play(tones, duration=duration, ramp=ramp)
+                staged = super().play(layers, duration=duration)
             except CommandRefused:
                 ended.append("disarmed")
                 raise

@@ -7,17 +7,25 @@ errors, ERAs in other places.
 
 import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from zlib import crc32
 
 import numpy as np
 
+from model.arrays import Point
 from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import Era, Fingertip, PointLoad
+from model.structure.attachments import (
+    Era,
+    Fingertip,
+    FingertipLoad,
+    PointLoad,
+    fingertip_loads,
+)
+from model.study.exact_plates import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration.convergence import finer_mesh
 
@@ -134,6 +142,15 @@ class Imperfections:
         rng = np.random.default_rng([self.seed, crc32(finger.encode())])
         return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
 
+    def resting(
+        self, rig: Rig, contacts: Sequence[Point], loads: Sequence[float] = ()
+    ) -> list[FingertipLoad]:
+        """Fingers at contacts [m], with loads relative to the rig's fingertip, empty for 1."""
+        return [
+            replace(each, fingertip=self.load_of(str(number), each.fingertip))
+            for number, each in enumerate(fingertip_loads(rig.fingertip, contacts, loads))
+        ]
+
 
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
@@ -160,6 +177,34 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         mesh=_other_mesh(rig),
     )
     return Imperfections(channels, plate=plate, fingertip=std.fingertip, seed=seed)
+
+
+def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
+    """Draw a plate as those on which promises are checked (`model.study.exact_plates`).
+
+    As `draw_imperfections`, and with what the gains of all channels have in common.
+    """
+    drawn = draw_plates(
+        np.random.default_rng(seed),
+        rig.uncertainty,
+        count=1,
+        era_count=len(rig.eras),
+        contact_count=0,
+    )
+    gains, names = drawn.gain[0].tolist(), [era.name for era in rig.eras]
+    stiffness = np.maximum(drawn.stiffness[0], _MIN_FACTOR).tolist()
+    plate = PlateErrors(
+        thickness=max(float(drawn.thickness[0]), _MIN_FACTOR),
+        loss_factor=float(drawn.loss[0]),
+        era_damping=float(drawn.damping[0]),
+        stiffness=dict(zip(names, stiffness, strict=True)),
+        mesh=_other_mesh(rig),
+    )
+    channels = {
+        rig.wiring[name]: ChannelErrors(*cmath.polar(gain))
+        for name, gain in zip(names, gains, strict=True)
+    }
+    return Imperfections(channels, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed)
 
 
 def _other_mesh(rig: Rig) -> PlateMesh:

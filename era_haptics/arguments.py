@@ -27,10 +27,7 @@ def expect_rig(value: object) -> None:
 def as_frequencies(given: object) -> FloatArray:
     """Frequencies (f,) [Hz] in the order given, one at least."""
     rule = "frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10)"
-    found = _row(given, rule)
-    if not len(found):
-        raise InputError(f"{rule}, got none")
-    return found
+    return _row(given, rule, least=1)
 
 
 def as_loads(given: object) -> tuple[float, ...]:
@@ -98,10 +95,10 @@ def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-def _row(given: object, rule: str) -> FloatArray:
+def _row(given: object, rule: str, *, least: int = 0) -> FloatArray:
     """A sequence of numbers as an array (n,); raises InputError, which says the rule."""
     found = _numbers(given)
-    if found.ndim != 1:
+    if found.ndim != 1 or len(found) < least:
         raise InputError(f"{rule}, got {shown(given)}")
     return found
 

@@ -97,6 +97,15 @@ class Layer:
         """The excitation and its side bands."""
         return (self.excitation, *self.side_bands)
 
+    @property
+    def voices(self) -> tuple["Layer", ...]:
+        """It without side bands, and each of them as a layer, along its ramp."""
+        beside = [
+            Layer(each, self.fingers, ramp=self.ramp, drive_mode=self.drive_mode)
+            for each in self.side_bands
+        ]
+        return (replace(self, side_bands=()), *beside)
+
     def scaled(self, gain_db: float) -> "Layer":
         """The layer louder by so much [dB]: contrasts stay."""
         factor = 10 ** (gain_db / 20)

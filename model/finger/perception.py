@@ -160,6 +160,20 @@ def mean_level_db_sl(
     return float(decibels(above @ weights))
 
 
+def over_threshold(
+    samples: FloatArray, sample_rate: float, threshold: str = DEFAULT_THRESHOLD
+) -> FloatArray:
+    """What is felt of samples (n, p) [m/s²] at a rate [Hz], each frequency over its threshold.
+
+    Beyond the data of a set its last threshold is taken.
+    """
+    count, (known, acceleration) = len(samples), _tabulated(threshold)
+    frequencies = np.maximum(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0])
+    lowest = np.exp(np.interp(np.log(frequencies), np.log(known), np.log(acceleration)))
+    spectrum = np.fft.rfft(felt_part(samples, sample_rate), 2 * count, axis=0)
+    return np.fft.irfft(spectrum / lowest[:, None], axis=0)[:count]
+
+
 _CUTOFF = 1250.0  # Hz; where half of a tone passes
 _HALF_LENGTH = 0.002  # s; of the filter: 0.5 % up to 850 Hz, 40 dB from 1.65 kHz on
 

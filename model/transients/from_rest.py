@@ -42,13 +42,12 @@ def from_rest(
         z = plate.following_all(s[some], spectrum[some])
         forced[some] = s[some, None] ** 2 * (z @ by_forced)
         start += 2 * z.sum(axis=0) - (z[0] if first == 0 else 0)
-    found = np.fft.irfft(forced, period, axis=0)[:count]
     free = -plate.to_free @ (plate.vectors @ start).real / period
-    times = np.arange(count) / sample_rate
-    for first in range(0, count, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        found[some] += ((free * np.exp(np.outer(times[some], plate.decay))) @ by_free).real
-    return found
+    ringing = [
+        ((free * np.exp(np.outer(times, plate.decay))) @ by_free).real
+        for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _AT_ONCE)
+    ]
+    return np.asarray(np.fft.irfft(forced, period, axis=0)[:count] + np.concatenate(ringing))
 
 
 def _continued(signals: FloatArray) -> FloatArray:

@@ -13,7 +13,8 @@ from zlib import crc32
 
 import numpy as np
 
-from model.arrays import Point
+from model.answer.fingers import Finger
+from model.arrays import ComplexArray
 from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
@@ -142,14 +143,17 @@ class Imperfections:
         rng = np.random.default_rng([self.seed, crc32(finger.encode())])
         return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
 
-    def resting(
-        self, rig: Rig, contacts: Sequence[Point], loads: Sequence[float] = ()
-    ) -> list[FingertipLoad]:
-        """Fingers at contacts [m], with loads relative to the rig's fingertip, empty for 1."""
+    def resting(self, rig: Rig, fingers: Sequence[Finger]) -> list[FingertipLoad]:
+        """Fingers as loads of the plate; none where the rig's are weightless."""
+        places, loads = [each.at for each in fingers], [each.load for each in fingers]
         return [
             replace(each, fingertip=self.load_of(str(number), each.fingertip))
-            for number, each in enumerate(fingertip_loads(rig.fingertip, contacts, loads))
+            for number, each in enumerate(fingertip_loads(rig.fingertip, places, loads))
         ]
+
+    def factors(self, rig: Rig) -> ComplexArray:
+        """Gain and phase of each ERA's channel, (eras,)."""
+        return np.array([self.errors_of(era.name, rig).factor for era in rig.eras])
 
 
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
@@ -191,18 +195,19 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
         era_count=len(rig.eras),
         contact_count=0,
     )
-    gains, names = drawn.gain[0].tolist(), [era.name for era in rig.eras]
-    stiffness = np.maximum(drawn.stiffness[0], _MIN_FACTOR).tolist()
     plate = PlateErrors(
         thickness=max(float(drawn.thickness[0]), _MIN_FACTOR),
         loss_factor=float(drawn.loss[0]),
         era_damping=float(drawn.damping[0]),
-        stiffness=dict(zip(names, stiffness, strict=True)),
+        stiffness={
+            era.name: max(factor, _MIN_FACTOR)
+            for era, factor in zip(rig.eras, drawn.stiffness[0].tolist(), strict=True)
+        },
         mesh=_other_mesh(rig),
     )
     channels = {
-        rig.wiring[name]: ChannelErrors(*cmath.polar(gain))
-        for name, gain in zip(names, gains, strict=True)
+        rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain))
+        for era, gain in zip(rig.eras, drawn.gain[0].tolist(), strict=True)
     }
     return Imperfections(channels, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed)
 

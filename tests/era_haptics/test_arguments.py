@@ -52,6 +52,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "found": era.ContrastMap(*np.zeros((2, 1)), (TARGET,), {"phased": np.zeros((1, 1))}, {}),
     },
     era.draw_answer: {"table": None, "answer": ANSWER, "layer": 0},
+    era.draw_contents: {"table": None, "answer": ANSWER},
     era.draw_playback: {"playback": None},
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
     era.commands_for: {"rig": RIG, "drive": DRIVE},

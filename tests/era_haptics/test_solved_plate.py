@@ -141,8 +141,9 @@ def test_signals_of_a_ramped_tone_are_felt_as_the_drive(
 ) -> None:
     """Under two fingers: acceleration to 1e-4 of its peak, where the ramp bends, later to 1e-6.
 
-    And to 2 % in the last samples: a signal that is cut has no band. An error of phase, which a drawn
-    channel has of all frequencies alike, is not causal: then to 2 % anywhere. The same measures.
+    And to 2 % in the last samples: a signal that is cut has no band. An error of phase, which a
+    drawn channel has at all frequencies alike, is not causal: then to 2 % anywhere. The measures
+    are the same.
     """
     drawn = era.SolvedPlate(plate.rig, seed=seed)
     signals = np.zeros((4, COUNT))
@@ -247,6 +248,9 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert found.rig.plate.loss_factor == pytest.approx(0.013, rel=0.01)
     assert found.rig.era("SW").stiffness == pytest.approx(19040, rel=0.02)
     assert found.rig.uncertainty.thickness < 0.005
+    frame = found.to_frame().set_index("parameter")
+    assert frame.loc["SW stiffness", "after"] == found.rig.era("SW").stiffness
+    assert frame.loc["SW stiffness", ["before", "unit"]].tolist() == [17000.0, "N/m"]
 
 
 def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -160,8 +160,8 @@ def test_signals_of_a_ramped_tone_are_felt_as_the_drive(
         peak = np.abs(theirs.accelerations).max()
         assert differ.max() < 2e-2 * peak
         if seed is None:
-            assert differ[:-200].max() < 1e-4 * peak
-            assert differ[1000:-200].max() < 1e-6 * peak
+            assert differ[:-500].max() < 1e-4 * peak
+            assert differ[1000:-500].max() < 1e-6 * peak
     assert played.level_db_sl == pytest.approx(other.level_db_sl, abs=0.05)
     assert played.contrast_db == pytest.approx(other.contrast_db, abs=0.01)
     assert played.transient_contrast_db == pytest.approx(other.transient_contrast_db, abs=1e-3)
@@ -215,7 +215,7 @@ def test_signals_that_no_era_plays_are_refused(
         ({"points": TARGET, "fingers": [(0.1, 9.0)]}, "finger"),
         ({"points": TARGET, "fingers": [era.Finger(TARGET, load=99.0)]}, "load"),
         ({"points": TARGET, "frequencies": [600]}, r"500 Hz.*limits\.frequency"),
-        ({"points": TARGET, "frequencies": []}, "got none"),
+        ({"points": TARGET, "frequencies": []}, "frequencies must be"),
         ({"points": TARGET, "frequencies": [np.nan]}, "frequency"),
     ],
 )

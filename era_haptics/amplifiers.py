@@ -2,7 +2,7 @@
 
 from controller.play.routing import route
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.playing.contents import Layer
+from drivers.playing.contents import Layer as AmplifierLayer
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Played, layers_of
 from model.arguments import shown
@@ -30,12 +30,11 @@ def open_amplifier(
     return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
 
 
-def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[Layer, ...]]:
+def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...]]:
     """Convert to layers by name of the amplifier, for its `play` and `apply`.
 
-    A layer for each of an answer, and for each of its side bands; each on all amplifiers, with its
-    ramp, onset and ending. Channels by the rig's wiring, levels 0..1 of full stroke, phases in
-    degrees. Raises InputError for an unknown ERA.
+    One for each layer of an answer, and for each of its side bands, with its ramp, onset and
+    ending; channels by the rig's wiring. Raises InputError for an unknown ERA.
     """
     expect_rig(rig)
     voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]

@@ -49,21 +49,25 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
 
 
 def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
-    """Draw all layers of an answer over the plate, each in its colour, and each alone.
+    """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
 
-    A colour is grey where layers mix, and black where nothing is felt. Beside every finger its
-    frequency, verdict, promised level and contrast. The picture of `era demo`. Raises InputError
-    for an answer without layers.
+    Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
+    picture of `era demo`. Raises InputError for an answer without layers.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
-    promised = [
-        replace(each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db)
-        for each in answer.fingers
-    ]
-    return contents_figure(table, answer.layers, promised)
+    return contents_figure(
+        table,
+        answer.layers,
+        [
+            replace(
+                each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db
+            )
+            for each in answer.fingers
+        ],
+    )
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:

@@ -43,9 +43,8 @@ from sim.plant.imperfections import Imperfections, draw_of_ensemble
 class SolvedPlate:
     """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
 
-    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as those on
-    which `era table verify` checks promises, on another mesh; None for the rig's own. Solved once,
-    at the first use, in some hundredths of a second.
+    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era table
+    verify` draws them, on another mesh; None for the rig's own. Solved once, at the first use.
     """
 
     def __init__(self, rig: Rig, *, seed: int | None = None) -> None:
@@ -86,11 +85,10 @@ class SolvedPlate:
         """Compute the acceleration [m/s²] at points by each ERA alone at full stroke.
 
         points (p, 2) [m]; frequencies (f,) [Hz]: those of a table by default; fingers: that rest on
-        the plate, as positions [m] or with their loads; seed: of a drawn plate, whose responses
-        those of `SolvedPlate(rig, seed=seed)` are. Returns complex amplitudes (f, ERAs, p), ERAs as
-        in `rig.eras`; phases are those of exp(+i omega t), as a tone's. With weights w (f, ERAs) in
-        full strokes the field is their product, as in `map`. Raises InputError for points and
-        fingers off the plate, and frequencies for which it is not solved.
+        the plate, as positions [m] or with their loads; seed: of another plate, as
+        `SolvedPlate(rig, seed=seed)`. Complex amplitudes (f, ERAs, p) of exp(+i omega t), ERAs as
+        in `rig.eras`: times weights in full strokes they are the field of `map`. Raises InputError
+        for points and fingers off the plate, and frequencies for which it is not solved.
         """
         if seed is not None:
             drawn = SolvedPlate(self.rig, seed=seed)
@@ -146,14 +144,13 @@ class SolvedPlate:
     ) -> Playback:
         """Compute what fingers feel during a duration [s], from rest.
 
-        target: positions [m] of the fingers that all of it is for, by default the fingers of an
-        answer, each with its own layer and its load. A layer starts with its onset or its ramp,
-        other drives with a ramp of 40 ms. Fingers load the plate as the rig's fingertip; loads: of
-        each relative to it, targets first, 1 without. The plate in time is solved exactly, without
-        steps (`docs/concepts/plant.md`). With a sample_rate [Hz] drive is an array (ERAs, samples)
-        of band-limited signals in full strokes, -1 to 1, which say the duration, and records have
-        their samples. Raises InputError for fingers off the plate, a duration too short for a
-        steady state, and signals that no ERA can play.
+        target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
+        each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
+        without. A layer starts with its onset or its ramp, drives with a ramp of 40 ms. With a
+        sample_rate [Hz] drive is an array (ERAs, samples) of band-limited signals in full strokes,
+        which say the duration and where records are sampled. The plate in time is solved exactly,
+        without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
+        duration too short for a steady state, and signals that no ERA can play.
         """
         expect_number(duration, what="duration", unit="seconds")
         others, weighed = as_points(quiet, what="quiet"), as_loads(loads)

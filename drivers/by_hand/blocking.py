@@ -2,7 +2,8 @@
 
     with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
         amplifier.arm()
-        amplifier.play([Layer(0, (Tone(channel=0, frequency=110, level=0.2),))], duration=0.5)
+        tone = Tone(channel=0, frequency=110, level=0.2)
+        amplifier.play([AmplifierLayer(0, (tone,))], duration=0.5)
 
 Only `play` and `measure`, while they wait, and `heartbeat` feed the watchdog: a script that hangs
 falls silent.
@@ -29,7 +30,7 @@ from drivers.host.dialogue import Staged
 from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
-from drivers.playing.contents import Layer
+from drivers.playing.contents import Layer as AmplifierLayer
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED
 from drivers.protocol.timing import HEARTBEAT
@@ -125,11 +126,11 @@ class BlockingAmplifier:
         """
         return self._wait(self._measured(frequencies, window))
 
-    def apply(self, layers: Sequence[Layer]) -> Staged:
+    def apply(self, layers: Sequence[AmplifierLayer]) -> Staged:
         """Play these layers from now on, all else silent; returns them as on the wire."""
         return self._wait(self._applied(layers))
 
-    def play(self, layers: Sequence[Layer], *, duration: float) -> Staged:
+    def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> Staged:
         """Play these layers for a time [s], feed the watchdog and wait for the end.
 
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
@@ -139,11 +140,11 @@ class BlockingAmplifier:
         self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
         return played
 
-    async def _applied(self, layers: Sequence[Layer]) -> Staged:
+    async def _applied(self, layers: Sequence[AmplifierLayer]) -> Staged:
         _require_layers(layers)
         self._token = token_after(self._token)
         every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
-        ended = [Layer(number) for number in every if number not in given]
+        ended = [AmplifierLayer(number) for number in every if number not in given]
         return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
 
     async def _stopped(self) -> Stopped:
@@ -169,5 +170,5 @@ class BlockingAmplifier:
 
 def _require_layers(layers: object) -> None:
     """Raise CommandError for anything but a sequence of layers."""
-    if not (isinstance(layers, Sequence) and all(isinstance(one, Layer) for one in layers)):
-        raise CommandError(f"layers must be a list of Layer, got {type(layers).__name__}")
+    if not (isinstance(layers, Sequence) and all(isinstance(n, AmplifierLayer) for n in layers)):
+        raise CommandError(f"layers must be a list of AmplifierLayer, got {type(layers).__name__}")

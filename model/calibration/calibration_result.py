@@ -98,9 +98,9 @@ class Calibration:
     after: ComplexArray
 
     def to_frame(self) -> Any:
-        """Each parameter before and after, with its standard error, as a pandas DataFrame.
+        """Parameters before and after, their units and errors, as a pandas DataFrame.
 
-        Values in units of SI, which stand beside them; needs pandas.
+        A row a parameter; needs pandas.
         """
         return as_frame(
             {

@@ -41,9 +41,10 @@ def contents_figure(
     panels = figure.subplot_mosaic(
         [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
     )
-    title = "Coloured where a finger feels its own content, grey where contents mix"
     _draw(panels["all"], table, levels, COLORS, fingers)
-    panels["all"].set_title(title, fontsize=13)
+    panels["all"].set_title(
+        "Coloured where a finger feels its own content, grey where contents mix", fontsize=13
+    )
     for finger in fingers:
         _label_finger(panels["all"], finger, contents)
     for number, layer in enumerate(contents):
@@ -78,13 +79,12 @@ def _draw(
     """Draw fingers, and the loudest content in its colour, paler the less it is above others."""
     plate = table.plate
     powers = 10 ** (levels / 10)
-    loudest = powers.argmax(axis=0)
     own = powers.max(axis=0)
     with np.errstate(divide="ignore"):
         contrast = 10 * np.log10(own / (powers.sum(axis=0) - own))
     purity = np.clip(contrast / OWN_CONTRAST_DB, 0, 1)[:, :, None]
     light = np.clip(10 * np.log10(own) / BRIGHTEST_DB_SL, 0, 1)[:, :, None]
-    color = np.array([to_rgb(each) for each in colors])[loudest % len(colors)]
+    color = np.array([to_rgb(each) for each in colors])[powers.argmax(axis=0) % len(colors)]
     axes.imshow(
         light * (purity * color + (1 - purity) * _GREY),
         origin="lower",

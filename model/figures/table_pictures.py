@@ -168,8 +168,9 @@ def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figur
         draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
     promised = answer.fingers[layer.fingers[0]].promised_contrast_db
     if promised is not None:
-        title = f"contrast at least {promised:.0f} dB on nine of ten plates"
-        axes.set_title(title, fontsize=11, pad=20)
+        axes.set_title(
+            f"contrast at least {promised:.0f} dB on nine of ten plates", fontsize=11, pad=20
+        )
     draw_level_scale(figure, [axes], shrink=0.8)
     return figure
 

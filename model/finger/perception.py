@@ -167,11 +167,12 @@ def over_threshold(
 
     Beyond the data of a set its last threshold is taken.
     """
-    count, (known, acceleration) = len(samples), _tabulated(threshold)
-    frequencies = np.maximum(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0])
-    lowest = np.exp(np.interp(np.log(frequencies), np.log(known), np.log(acceleration)))
+    count, known = len(samples), _tabulated(threshold)[0]
+    frequencies = np.clip(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0], known[-1])
     spectrum = np.fft.rfft(felt_part(samples, sample_rate), 2 * count, axis=0)
-    return np.fft.irfft(spectrum / lowest[:, None], axis=0)[:count]
+    return np.fft.irfft(spectrum / detection_threshold(frequencies, threshold)[:, None], axis=0)[
+        :count
+    ]
 
 
 _CUTOFF = 1250.0  # Hz; where half of a tone passes

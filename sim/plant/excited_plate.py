@@ -54,13 +54,11 @@ MAX_DURATION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class FeltFinger:
-    """What one finger felt, steady as of a `Sensation`, and over time.
+    """What one finger felt, steady as in a `Sensation`, and over time.
 
     level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
-    its loudest point; both -inf without one; contrast_db: of its own above these, or
-    where there are no others above its own at the loudest quiet finger; of a quiet finger the
-    weakest level at another one's own finger above all of them here. times (w,) [s], and at these
-    levels_db_sl and foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
+    its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
+    foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
     """
 
     level_db_sl: float
@@ -99,9 +97,8 @@ class Playback:
     """Records of fingertips while layers played, from rest at time 0.
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
-    onsets; threshold: name of the set that levels are above. Measures are named as those of a
-    `Sensation`; steady ones are fitted to the last STEADY seconds, after the plate has settled
-    (50 ms to 1 s), of signals the power then under a Hann window.
+    onsets; threshold: of levels. Steady measures are fitted to the last STEADY seconds, after the
+    plate has settled (50 ms to 1 s); of signals they are of the power then.
     """
 
     vibrations: tuple[Vibration, ...]

@@ -91,44 +91,52 @@ def ours(table, fingers):
     return np.abs(table.frequencies - layer.frequency).argmin(), np.array(weights)
 
 
+def plates_of(rig):
+    """What methods may know of the rig's plate: the nominal one, or some that are drawn."""
+    drawn = [era.SolvedPlate(rig, seed=seed) for seed in KNOWN]
+    return {"nominal plate": [era.SolvedPlate(rig)], f"{len(drawn)} drawn plates": drawn}
+
+
+def by_method(plates, fingers, thresholds):
+    """Frequency by its index and weights of each method, by its name and what it knows."""
+    fields = {of: fields_of(some, fingers) for of, some in plates.items()}
+    return {
+        f"{name}, {of}": chosen(method, fields[of], thresholds)
+        for name, method in METHODS.items()
+        for of in plates
+    }
+
+
 def compare(pairs):
     """Contrast [dB] that nine of ten judging plates give, by method, median over the pairs."""
     rig = era.load_rig(era.example_rig_path())
-    table, nominal = era.table(rig, drive_mode="phased"), [era.SolvedPlate(rig)]
-    known, judges = ([era.SolvedPlate(rig, seed=seed) for seed in some] for some in (KNOWN, JUDGES))
-    found = {}
+    table, plates, found = era.table(rig, drive_mode="phased"), plates_of(rig), {}
+    judges = [era.SolvedPlate(rig, seed=seed) for seed in JUDGES]
     for fingers in pairs:
         judged = fields_of(judges, fingers)
         rows = {"era-haptics": ours(table, fingers)}
-        for name, method in METHODS.items():
-            for plates, of in ((nominal, "nominal plate"), (known, "20 drawn plates")):
-                fields = fields_of(plates, fingers)
-                rows[f"{name}, {of}"] = chosen(method, fields, table.thresholds)
-        for row, (frequency, weights) in rows.items():
+        rows |= by_method(plates, fingers, table.thresholds)
+        for name, (frequency, weights) in rows.items():
             contrast = felt(weights, judged[:, frequency])[1]
-            found.setdefault(row, []).append(np.percentile(contrast, 10))
-    return {row: np.median(contrasts) for row, contrasts in found.items()}
+            found.setdefault(name, []).append(np.percentile(contrast, 10))
+    return {name: np.median(contrasts) for name, contrasts in found.items()}
 
 
 def write_entries(folder):
     """Write an entry for each method and what it knows, for `python -m benchmarks.contrast`."""
-    document = json.loads((folder / "localization-1.json").read_text("utf-8"))
-    patterns = {}
+    document, patterns = json.loads((folder / "localization-1.json").read_text("utf-8")), {}
     for plate, content in document["plates"].items():
         rig = era.load_rig(folder / f"{plate}.yaml")
-        table, nominal = era.table(rig, drive_mode="phased"), [era.SolvedPlate(rig)]
-        known = [era.SolvedPlate(rig, seed=seed) for seed in KNOWN]
+        table, plates = era.table(rig, drive_mode="phased"), plates_of(rig)
         for place, fingers in content["sets"].items():
-            for name, method in METHODS.items():
-                for plates, of in ((nominal, "nominal"), (known, "drawn")):
-                    row, weights = chosen(method, fields_of(plates, fingers), table.thresholds)
-                    patterns.setdefault(f"{name}, {of}", {})[place] = {
-                        e.name: [table.frequencies[row], min(abs(w), 1), np.degrees(np.angle(w))]
-                        for e, w in zip(rig.eras, weights, strict=True)
-                    }
+            for name, (row, weights) in by_method(plates, fingers, table.thresholds).items():
+                patterns.setdefault(name, {})[place] = {
+                    e.name: [table.frequencies[row], min(abs(w), 1), np.degrees(np.angle(w))]
+                    for e, w in zip(rig.eras, weights, strict=True)
+                }
     for name, each in patterns.items():
         entry = {"benchmark": "era-localization", "version": 1, "name": name, "patterns": each}
-        file = folder / f"{name.replace(', ', '-').replace(' ', '-')}.json"
+        file = folder / f"{name.replace(',', '').replace(' ', '-')}.json"
         file.write_text(json.dumps(entry), "utf-8")
         print(f"wrote {file}")
 
@@ -144,5 +152,5 @@ if __name__ == "__main__":
     if sys.argv[1:]:
         write_entries(Path(sys.argv[1]))
     else:
-        for row, contrast in compare(ten_pairs()).items():
-            print(f"{row:35} {contrast:5.1f} dB")
+        for name, contrast in compare(ten_pairs()).items():
+            print(f"{name:35} {contrast:5.1f} dB")

@@ -354,7 +354,7 @@ class PlateEvent(CauseAndRemedy):
     """What is known of the plate has changed, or whether it is followed."""
 
     state: LearningState
-    robust: bool = Field(
+    cautious: bool = Field(
         description="whether answers are those of a plate that is not known: it has changed in an "
         "unknown way, or there was no estimator for a minute"
     )

@@ -110,8 +110,8 @@ def _learning(learning: LearningSummary) -> list[str]:
         f"{counted(learning.corrections, 'correction')} of answers{within}"
     )
     return [
-        f"  plate {state.upper() if learning.robust else state}: {learning.cause}",
-        *_given(("    answers promise what a plate that is not known gives", learning.robust)),
+        f"  plate {state.upper() if learning.cautious else state}: {learning.cause}",
+        *_given(("    answers promise what a plate that is not known gives", learning.cautious)),
         *_given(("    remedy: {}", learning.remedy)),
         *_given(("    {}", measured if learning.readings else None)),
     ]

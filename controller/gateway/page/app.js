@@ -252,8 +252,8 @@ const HANDLERS = {
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
-  plate({ state, cause, remedy, robust, alarms }) {
-    const isBad = robust || state === "failed" || state === "restarting";
+  plate({ state, cause, remedy, cautious, alarms }) {
+    const isBad = cautious || state === "failed" || state === "restarting";
     const isAlarm = alarms > knownAlarms;
     knownAlarms = alarms;
     at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;

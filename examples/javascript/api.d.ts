@@ -317,7 +317,7 @@ export interface PlateEvent {
   remedy: string | null;
   state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
-  robust: boolean;
+  cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
 }
@@ -452,7 +452,7 @@ export interface LearningSummary {
   remedy: string | null;
   state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
-  robust: boolean;
+  cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
   /** settled patterns that were measured */

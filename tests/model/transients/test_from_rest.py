@@ -1,7 +1,6 @@
 """Bases that move along samples, against SciPy's integration of the equations of motion."""
 
 import numpy as np
-import pytest
 from scipy.signal import StateSpace, lsim
 
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
@@ -49,19 +48,3 @@ def test_bursts_are_followed_as_scipy_integrates() -> None:
     bases = np.array([0.8 * chirp(fine), -0.5 * chirp(fine - 0.003)]).T * rig.eras[0].stroke
     _, expected, _ = lsim(system, np.hstack([bases, np.gradient(bases, fine, axis=0)]), fine)
     np.testing.assert_allclose(found, expected[::FINER], atol=1e-4 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("count", [1, 2, 7])
-def test_signals_of_zeros_leave_the_plate_at_rest(count: int) -> None:
-    """However few they are."""
-    rig = make_paper_rig(4, 3)
-    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=200.0)
-    found = from_rest(
-        plate_in_time(reduced, rig.eras),
-        np.zeros((4, count)),
-        reduced.at(np.array([[0.1, 0.1]])),
-        sample_rate=RATE,
-        factors=np.ones(4, dtype=complex),
-    )
-    assert not found.any()
-    assert found.shape == (count, 1)

@@ -229,7 +229,7 @@ MEASURED = Path(__file__).parents[2] / "examples" / "measured.csv"
 
 
 def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
-    """Of two frequencies; a drive of another phase turns its own field by that phase."""
+    """Of two frequencies; a drive of another phase turns its own field, several of one add up."""
     plate = era.SolvedPlate(era.load_rig(era.example_rig_path()))
     drive = {"SW": era.Drive(110, level=0.5), "NE": era.Drive(150, level=0.2)}
     found = plate.map(drive, raster=(7, 5))
@@ -238,6 +238,9 @@ def test_map_has_complex_fields_whose_magnitudes_are_the_peak() -> None:
     np.testing.assert_allclose(np.abs(found.field).sum(axis=0), found.peak)
     turned = plate.map({"SW": era.Drive(110, level=0.5, phase_deg=90)}, raster=(7, 5))
     np.testing.assert_allclose(turned.field[0], 1j * found.field[0], rtol=1e-9)
+    parts = [era.Drive(110, level=0.2), era.Drive(110, level=0.3)]
+    added = plate.map({"SW": parts}, raster=(7, 5))
+    np.testing.assert_allclose(added.field[0], found.field[0], rtol=1e-9)
 
 
 @pytest.mark.long

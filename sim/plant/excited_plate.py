@@ -98,7 +98,7 @@ class Playback:
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
     onsets; threshold: of levels. Steady measures are fitted to the last STEADY seconds, after the
-    plate has settled (50 ms to 1 s); of signals they are of the power then.
+    plate has settled (50 ms to 1 s); those of signals are of the power in these.
     """
 
     vibrations: tuple[Vibration, ...]
@@ -330,17 +330,10 @@ def _records(
     rig: Rig, fingers: Sequence[Finger], times: FloatArray, felt: FloatArray
 ) -> tuple[Record, ...]:
     """Accelerations (n, p) at the points of all fingertips as a record of each finger."""
-    split = np.split(felt, len(fingers), axis=1)
+    plate, split = rig.plate, np.split(felt, len(fingers), axis=1)
     return tuple(
-        [
-            Record(
-                fingertip_points(*each.at, rig.plate),
-                fingertip_weights(*each.at, rig.plate),
-                times,
-                part,
-            )
-            for each, part in zip(fingers, split, strict=True)
-        ]
+        Record(fingertip_points(*each.at, plate), fingertip_weights(*each.at, plate), times, part)
+        for each, part in zip(fingers, split, strict=True)
     )
 
 

@@ -243,7 +243,7 @@ class FreePlate:
         if len(frequencies) and frequencies.max() > self.frequency_max * (1 + 1e-9):
             raise InputError(
                 f"frequency must be at most {self.frequency_max:g} Hz, to which the plate was "
-                f"solved, got {frequencies.max():g} Hz; solve it with a higher frequency_max"
+                f"solved, got {frequencies.max():g} Hz; raise limits.frequency of the rig"
             )
         return 2 * np.pi * frequencies
 

@@ -67,28 +67,16 @@ def base_amplitudes(
     return np.array(frequencies), amplitudes
 
 
-def tone_amplitudes(
-    excitation: Excitation,
-    eras: Sequence[Era],
-    response: Callable[[FloatArray], ComplexArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Peak acceleration [m/s²] per distinct frequency: frequencies (f,) [Hz], amplitudes (f, p).
-
-    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
-    """
-    frequencies, field = tone_fields(excitation, eras, response)
-    return frequencies, np.abs(field)
-
-
 def tone_fields(
     excitation: Excitation,
     eras: Sequence[Era],
     response: Callable[[FloatArray], ComplexArray],
     *others: Excitation,
 ) -> tuple[FloatArray, ComplexArray]:
-    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases.
+    """Complex acceleration [m/s²] at each distinct frequency: frequencies (f,) [Hz], field (f, p).
 
-    others: excitations that play at the same time.
+    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p); others:
+    excitations that play at the same time.
     """
     frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
     weights = amplitudes / np.array([era.stroke for era in eras])

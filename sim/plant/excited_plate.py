@@ -29,12 +29,14 @@ from model.finger.perception import (
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import Era, fingertip_loads
+from model.structure.attachments import Era
 from model.transients.base_motion import Bases, ramped_onset, shaped
+from model.transients.from_rest import from_rest
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import base_amplitudes
 from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
+from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
@@ -42,6 +44,9 @@ STEADY = 0.25
 
 LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
 """Hann window under which a level over time is a root mean square, and the steps of both [s]."""
+
+MIN_SIGNAL = 0.01
+"""Shortest signals [s]; shorter ones are followed by zeros."""
 
 MAX_DURATION = 10.0
 """Longest playback [s]; ten fingers take 150 MB for each layer."""
@@ -76,9 +81,10 @@ class FeltFinger:
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """What one layer does alone at all fingers.
+    """What one layer, or signals of all ERAs, do alone at all fingers.
 
-    frequencies (f,) [Hz]; fingers: numbers of those that it is for; records: of all fingers.
+    frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
+    all fingers.
     """
 
     frequencies: tuple[float, ...]
@@ -92,7 +98,7 @@ class Playback:
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
     onsets; threshold: of levels. Steady measures are fitted to the last STEADY seconds, after the
-    plate has settled (50 ms to 1 s).
+    plate has settled (50 ms to 1 s); those of signals are of the power in these.
     """
 
     vibrations: tuple[Vibration, ...]
@@ -100,9 +106,9 @@ class Playback:
     threshold: str = DEFAULT_THRESHOLD
 
     def __repr__(self) -> str:
-        driven = ", ".join(f"{frequency:g}" for frequency in self.frequencies)
+        driven = ", ".join(f"{frequency:g} Hz" for frequency in self.frequencies) or "signals"
         felt = f"{counted(len(self.targets), 'target')} and {len(self.quiet)} quiet"
-        return f"<Playback of {driven} Hz for {self.targets[0].times[-1]:g} s at {felt}>"
+        return f"<Playback of {driven} for {self.targets[0].times[-1]:g} s at {felt}>"
 
     def to_frame(self) -> Any:
         """Time and mean acceleration of each fingertip as a pandas DataFrame; needs pandas."""
@@ -215,13 +221,18 @@ class Playback:
         """Power to threshold at the points of a finger (1 + w, p): steady, then over time."""
         times, (count, step) = record.times, self._window
         inside = times >= max(self.settled, times[-1] - STEADY)
-        fitted = np.abs(fit_tones(times[inside], record.accelerations[inside], frequencies))
-        level = sensation_level(np.array(frequencies), fitted, self.threshold)
         felt = over_threshold(record.accelerations, 1 / (times[1] - times[0]), self.threshold)
         weights = np.hanning(count + 2)[1:-1]
         power = sliding_window_view(felt**2, count, axis=0)[::step] @ weights
+        if frequencies:
+            fitted = np.abs(fit_tones(times[inside], record.accelerations[inside], frequencies))
+            level = sensation_level(np.array(frequencies), fitted, self.threshold)
+            steady = 10 ** (level / 10)
+        else:
+            last = np.hanning(inside.sum() + 2)[1:-1]
+            steady = 2 * last @ felt[inside] ** 2 / last.sum()
         # That of a tone is the square of its amplitude, twice its mean square.
-        return np.vstack([10 ** (level / 10), 2 * power / weights.sum()])
+        return np.vstack([steady, 2 * power / weights.sum()])
 
 
 def play(
@@ -249,29 +260,81 @@ def play(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
             f"{duration:g} s; one second suffices for most plates"
         )
-    contacts = [each.at for each in fingers]
-    resting = fingertip_loads(rig.fingertip, contacts, [each.load for each in fingers])
-    loads = {
-        str(n): replace(each, fingertip=imperfections.load_of(str(n), each.fingertip))
-        for n, each in enumerate(resting)
-    }
-    discs = [fingertip_points(*at, rig.plate) for at in contacts]
-    weights = [fingertip_weights(*at, rig.plate) for at in contacts]
-    splits, loaded = np.cumsum([len(disc) for disc in discs])[:-1], None
-    vibrations = []
+    points, loaded, vibrations = _points(rig, fingers), None, []
     for layer, bases in zip(layers, driven, strict=True):
         frequencies, _ = base_amplitudes(layer.excitation, rig.eras, *layer.side_bands)
-        plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
-        plant.set_contacts(loads, loaded=loaded)
+        plant = _plant_under(rig, reduced, fingers, imperfections, loaded)
         loaded = plant.loaded
         for number, (era, motion) in enumerate(zip(rig.eras, bases, strict=True)):
             plant.set_input(number, realised(motion, imperfections.errors_of(era.name, rig)))
-        shapes = plant.reduced.at(np.concatenate(discs))
-        times, felt = plant.advance(duration, sample_rate=SAMPLE_RATE, shapes=shapes)
-        parts = zip(discs, weights, np.split(felt, splits, axis=1), strict=True)
-        records = tuple([Record(disc, weight, times, part) for disc, weight, part in parts])
+        times, felt = plant.advance(
+            duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(points)
+        )
+        records = _records(rig, fingers, times, felt)
         vibrations.append(Vibration(tuple(frequencies.tolist()), layer.fingers, records))
     return Playback(tuple(vibrations), settled, rig.threshold)
+
+
+def play_signals(
+    rig: Rig,
+    reduced: ReducedPlate,
+    signals: FloatArray,
+    fingers: Sequence[Finger],
+    *,
+    sample_rate: float,
+    imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
+) -> Playback:
+    """Play signals (eras, n) in full strokes on a plate at rest, for all fingers with a stimulus.
+
+    Records have the signals' samples [Hz]; the rest as of `play`.
+    """
+    check_fingers(fingers, rig.plate)
+    duration = signals.shape[1] / sample_rate
+    if not MIN_SIGNAL <= duration <= MAX_DURATION:
+        raise InputError(
+            f"signals must last from {MIN_SIGNAL:g} to {MAX_DURATION:g} s, got {duration:g} s"
+        )
+    plant = _plant_under(rig, reduced, fingers, imperfections)
+    felt = from_rest(
+        plant.loaded.plate,
+        signals,
+        plant.reduced.at(_points(rig, fingers)),
+        sample_rate=sample_rate,
+        factors=imperfections.factors(rig),
+    )
+    records = _records(rig, fingers, np.arange(len(felt)) / sample_rate, felt)
+    own = tuple([number for number, each in enumerate(fingers) if each.stimulus])
+    return Playback((Vibration((), own, records),), 0.0, rig.threshold)
+
+
+def _plant_under(
+    rig: Rig,
+    reduced: ReducedPlate,
+    fingers: Sequence[Finger],
+    imperfections: Imperfections,
+    loaded: LoadedPlate | None = None,
+) -> Plant:
+    """The plate at rest under fingers; loaded: where that is solved already."""
+    plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
+    resting = imperfections.resting(rig, fingers)
+    plant.set_contacts({str(n): each for n, each in enumerate(resting)}, loaded=loaded)
+    return plant
+
+
+def _points(rig: Rig, fingers: Sequence[Finger]) -> FloatArray:
+    """Points (p, 2) of all fingertips, one after the other."""
+    return np.concatenate([fingertip_points(*each.at, rig.plate) for each in fingers])
+
+
+def _records(
+    rig: Rig, fingers: Sequence[Finger], times: FloatArray, felt: FloatArray
+) -> tuple[Record, ...]:
+    """Accelerations (n, p) at the points of all fingertips as a record of each finger."""
+    plate, split = rig.plate, np.split(felt, len(fingers), axis=1)
+    return tuple(
+        Record(fingertip_points(*each.at, plate), fingertip_weights(*each.at, plate), times, part)
+        for each, part in zip(fingers, split, strict=True)
+    )
 
 
 def _bases(layer: Layer, eras: Sequence[Era]) -> Bases:

@@ -42,8 +42,10 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
-        "drive": DRIVE, "target": TARGET, "quiet": (), "loads": (1.5,), "duration": 0.3,
+        "drive": np.zeros((4, 300)), "target": TARGET, "quiet": (), "loads": (1.5,),
+        "duration": 0.3, "sample_rate": 3000,
     },
+    PLATE.responses: {"points": [TARGET], "frequencies": [60.0], "fingers": (), "seed": 1},
     era.draw_map: {"plate": PLATE, "drive": DRIVE},
     era.draw_contrast_map: {
         "table": None,

@@ -31,7 +31,7 @@ from model.study.table_check import CheckSettings
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable
-from model.vibration.excitation import tone_amplitudes
+from model.vibration.excitation import tone_fields
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors
@@ -80,7 +80,7 @@ def felt_contrast(rig: Rig, promise: Promise) -> float:
     """Felt contrast [dB] at the sensors of a promise, by the direct solver."""
     points = np.array([PLACES[name] for name in promise.sensors])
     respond = direct_responder(rig.plate, rig.mesh)
-    frequencies, found = tone_amplitudes(
+    frequencies, found = tone_fields(
         promise.layer.excitation, rig.eras, lambda f: respond(rig.eras, f, points)
     )
     felt = np.linalg.norm(found / detection_threshold(frequencies)[:, None], axis=0)

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from controller.play.intent import Pulse, Target
+from controller.play.intent import Gains, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import HELD_BACK, OWN, Layer
+from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, verdict_of
 from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
@@ -45,6 +45,35 @@ class Prediction:
     content: str | None = None
     nominal_db_sl: float | None = None
 
+    def weakened(self, gain_db: float, others_db: float) -> "Prediction":
+        """Return it with a gain [dB]; others_db: at most on others' contents.
+
+        Of its contrasts what is left at least.
+        """
+        lost = min(gain_db - others_db, 0.0)
+        promised = _plus(self.promised_contrast_db, lost)
+        verdict, held_back = self.verdict, self.held_back
+        level = _plus(self.level_db_sl, gain_db)
+        if level is not None and self.level_db_sl is not None and level < 0 <= self.level_db_sl:
+            verdict = HELD_BACK
+            held_back = f"a strength of {gain_db:g} dB leaves it below the threshold; raise it"
+        elif verdict in (OWN, MIXED):
+            verdict = verdict_of(promised)
+        return replace(
+            self,
+            level_db_sl=level,
+            contrast_db=_plus(self.contrast_db, lost),
+            verdict=verdict,
+            held_back=held_back,
+            promised_contrast_db=promised,
+            foreign_level_db_sl=_plus(self.foreign_level_db_sl, others_db),
+            nominal_db_sl=_plus(self.nominal_db_sl, gain_db),
+        )
+
+
+def _plus(level: float | None, gain_db: float) -> float | None:
+    return None if level is None else level + gain_db
+
 
 @dataclass(frozen=True)
 class Content:
@@ -52,7 +81,7 @@ class Content:
 
     targets: the finger whose content it is, then those that share it; placement: where they are,
     and all others; predictions: one per target; voice: 0, or the number of a side band of the
-    finger's content, which has no predictions.
+    finger's content, which has no predictions; gain_db: that the layer has, its fingers' strength.
     """
 
     targets: Targets
@@ -60,6 +89,7 @@ class Content:
     layer: Layer
     predictions: tuple[Prediction, ...] = ()
     voice: int = 0
+    gain_db: float = 0.0
 
     @property
     def key(self) -> tuple[ContactKey, int]:
@@ -70,6 +100,20 @@ class Content:
     def frequency(self) -> float | None:
         """Its frequency [Hz]; None of several."""
         return self.layer.frequency
+
+    @property
+    def chosen_for(self) -> tuple[object, ...]:
+        """What it was chosen for, whatever its strength."""
+        return self.targets, self.placement, self.voice
+
+    def weakened(self, gain_db: float, others_db: float) -> "Content":
+        """Return it with a gain [dB]; others_db: the highest gain of the others."""
+        return replace(
+            self,
+            layer=self.layer.scaled(gain_db),
+            predictions=tuple([each.weakened(gain_db, others_db) for each in self.predictions]),
+            gain_db=gain_db,
+        )
 
 
 @dataclass(frozen=True)
@@ -115,6 +159,22 @@ class Selection:
         """Whether every target feels its own, so that who leaves changes nothing for others."""
         is_each_alone = all(len(content.targets) == 1 for content in self.contents)
         return bool(self.contents) and is_each_alone and not self.not_served
+
+    def weakened(self, gains_db: Gains) -> "Selection":
+        """Return it with the strengths of fingers; what several share has the lowest."""
+        if not (self.contents and any(gains_db.values())):
+            return self
+        gains, contents = dict[Targets, float](), list[Content]()
+        for each in self.contents:
+            keys = [(contact.key, target.is_short) for contact, target in each.targets]
+            gains[each.targets] = min(0.0, *[gains_db.get(key, 0.0) for key in keys])
+        for each in self.contents:
+            gain = gains[each.targets]
+            others = [other for targets, other in gains.items() if targets != each.targets]
+            contents.append(each.weakened(gain, max(others, default=gain)))
+        strongest = max(gains.values())
+        levels = {key: level + strongest for key, level in self.quiet_levels.items()}
+        return replace(self, contents=tuple(contents), quiet_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
         """Return it without some contents, whose targets feel nothing for a reason."""

@@ -155,6 +155,11 @@ class BaseEnvelope:
         """The largest amplitude [m]."""
         return max(map(abs, (self.start, *self.knots)))
 
+    def scaled(self, factor: float) -> "BaseEnvelope":
+        """Return it with all amplitudes times a factor."""
+        start, *knots = [factor * each for each in (self.start, *self.knots)]
+        return BaseEnvelope(self.frequency, start, tuple(knots), self.step)
+
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""
         values = np.array([self.start, *self.knots])

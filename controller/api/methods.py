@@ -28,6 +28,7 @@ from controller.api.schema import (
     Name,
     PatternFields,
     RigSummary,
+    StrengthList,
     TableSummary,
     Topic,
     TouchInputStatus,
@@ -35,6 +36,9 @@ from controller.api.schema import (
 )
 
 DEFAULT_LEASE = 10.0  # s
+MIN_GAIN_DB = -40.0
+"""Lowest strength of a source or client; the highest is 0."""
+
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -59,7 +63,7 @@ class HelloResult(Message):
     )
 
 
-class StatusResult(PatternFields, CauseAndRemedy):
+class StatusResult(StrengthList, PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
@@ -181,6 +185,17 @@ class PlayParams(Message):
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
     level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
+
+
+class StrengthParams(Message):
+    """A touch source or client and its gain; without a gain nothing is set."""
+
+    name: Name | None = Field(
+        None, description="of an input, a source or a client; null for all that are known"
+    )
+    gain_db: Annotated[float, Field(ge=MIN_GAIN_DB, le=0)] | None = Field(
+        None, description="of all that it brings, 0 for what layout and limits allow"
+    )
 
 
 class UnsubscribeParams(Message):

@@ -65,6 +65,7 @@ Topic: TypeAlias = Literal[
     "layout",
     "plate",
     "inputs",
+    "strength",
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
@@ -162,6 +163,22 @@ class TouchInputStatus(Message):
     problem: str | None = Field(
         None, description="why it is mute or missing, and what to do; null if it is neither"
     )
+
+
+class SourceStrength(Message):
+    """The gain of a touch source or client."""
+
+    name: str
+    gain_db: float = Field(description="0 where none is set")
+
+
+class StrengthList(Message):
+    """Strengths: of the inputs of the configuration, of sources and clients, and what else is set.
+
+    Sources are those that had fingers, clients those that played an effect and are connected.
+    """
+
+    strengths: list[SourceStrength] = Field(default=[], description="in order of their names")
 
 
 class ContactStatus(Message):

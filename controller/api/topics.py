@@ -26,6 +26,7 @@ from controller.api.schema import (
     Message,
     PatternFields,
     PlateEvent,
+    StrengthList,
     Topic,
     TouchInputStatus,
 )
@@ -140,6 +141,7 @@ TOPICS: dict[Topic, TopicData] = {
     "inputs": TopicData(
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
     ),
+    "strength": TopicData(StrengthList, "strengths were set, or sources are new", "newest"),
 }
 """Every topic, by name."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
+from controller.daemon.strengths_file import read_strengths
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.process.socket_lock import check_socket_path
@@ -54,7 +55,8 @@ class DaemonConfig:
 
     rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
     it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
-    layout: None for the same effect everywhere.
+    layout: None for the same effect everywhere; strengths: file in which they are kept, None for as
+    long as the daemon runs.
     """
 
     source: Path
@@ -65,6 +67,7 @@ class DaemonConfig:
     table: Path | None
     learn: Path | None
     layout: SurfaceLayout | None
+    strengths: Path | None
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
@@ -97,7 +100,9 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     log_file = file_of(document, "log", "file")
     dump_folder = file_of(document, "dumps", "folder")
     learn = file_of(document, "learn")
+    strengths = file_of(document, "strengths")
     _check_folders(validation, log_file, dump_folder)
+    _check_strengths(validation, strengths)
     _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:
@@ -115,6 +120,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         table=table,
         learn=learn,
         layout=layout,
+        strengths=strengths,
         touch=touch,
         socket=socket,
         log_file=log_file,
@@ -292,6 +298,16 @@ def _check_folders(
         existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
         if not existing.is_dir():
             validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
+
+
+def _check_strengths(validation: Validation[DaemonSection], file: Path | None) -> None:
+    """Refuse to keep strengths in a file that is something else; its folder must exist."""
+    try:
+        read_strengths(file)
+    except InputError as error:
+        validation.add(("strengths",), str(error))
+    if file is not None and not file.parent.is_dir():
+        validation.add(("strengths",), f"folder not found: {file.parent}; create it")
 
 
 def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:

@@ -28,7 +28,7 @@ from controller.api.schema import (
     Name,
     PatternFields,
     RigSummary,
-    StrengthList,
+    Strengths,
     TableSummary,
     Topic,
     TouchInputStatus,
@@ -36,9 +36,6 @@ from controller.api.schema import (
 )
 
 DEFAULT_LEASE = 10.0  # s
-MIN_GAIN_DB = -40.0
-"""Lowest strength of a source or client; the highest is 0."""
-
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -63,7 +60,7 @@ class HelloResult(Message):
     )
 
 
-class StatusResult(StrengthList, PatternFields, CauseAndRemedy):
+class StatusResult(Strengths, PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
@@ -193,7 +190,7 @@ class StrengthParams(Message):
     name: Name | None = Field(
         None, description="of an input, a source or a client; null for all that are known"
     )
-    gain_db: Annotated[float, Field(ge=MIN_GAIN_DB, le=0)] | None = Field(
+    gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )
 

@@ -16,8 +16,8 @@ from controller.api.methods import (
     RequestedBy,
     StatusResult,
     StopResult,
-    StrengthList,
     StrengthParams,
+    Strengths,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
@@ -36,7 +36,7 @@ METHODS: dict[str, Method] = {
     "touch": Method(TouchParams, Empty, is_limited=False),
     "effects": Method(Empty, EffectsResult),
     "play": Method(PlayParams, Empty, is_repeated=False),
-    "strength": Method(StrengthParams, StrengthList),
+    "strength": Method(StrengthParams, Strengths),
     "subscribe": Method(SubscribeParams, Empty, over_http=False),
     "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
 }

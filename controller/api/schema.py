@@ -165,20 +165,14 @@ class TouchInputStatus(Message):
     )
 
 
-class SourceStrength(Message):
-    """The gain of a touch source or client."""
+class Strengths(Message):
+    """The strengths of touch sources and clients that are known."""
 
-    name: str
-    gain_db: float = Field(description="0 where none is set")
-
-
-class StrengthList(Message):
-    """Strengths: of the inputs of the configuration, of sources and clients, and what else is set.
-
-    Sources are those that had fingers, clients those that played an effect and are connected.
-    """
-
-    strengths: list[SourceStrength] = Field(default=[], description="in order of their names")
+    strengths: dict[str, float] = Field(
+        default={},
+        description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
+        "sources that had fingers, clients that are connected, and what else is set",
+    )
 
 
 class ContactStatus(Message):

@@ -26,7 +26,7 @@ from controller.api.schema import (
     Message,
     PatternFields,
     PlateEvent,
-    StrengthList,
+    Strengths,
     Topic,
     TouchInputStatus,
 )
@@ -141,7 +141,9 @@ TOPICS: dict[Topic, TopicData] = {
     "inputs": TopicData(
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
     ),
-    "strength": TopicData(StrengthList, "strengths were set, or sources are new", "newest"),
+    "strength": TopicData(
+        Strengths, "strengths of touch sources and clients, at rate_hz", "periodically"
+    ),
 }
 """Every topic, by name."""
 

@@ -148,7 +148,7 @@ def strength(
     """It is kept by this name; what layout and limits allow is 0."""
     with _client(socket) as era:
         found = era.strength(name=name, gain_db=gain_db)
-    lines = [f"{each.name}: {each.gain_db:g} dB" for each in found.strengths]
+    lines = [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()]
     print_report(lines, found.model_dump(), as_json=as_json)
 
 

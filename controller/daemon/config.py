@@ -7,9 +7,9 @@ from pathlib import Path
 
 from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
-from controller.daemon.strengths_file import read_strengths
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
+from controller.effects.strengths import read_strengths
 from controller.process.socket_lock import check_socket_path
 from controller.sources.touch import (
     TouchCalibration,
@@ -102,7 +102,10 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     learn = file_of(document, "learn")
     strengths = file_of(document, "strengths")
     _check_folders(validation, log_file, dump_folder)
-    _check_strengths(validation, strengths)
+    try:
+        read_strengths(strengths)
+    except InputError as error:
+        validation.add(("strengths",), str(error))
     _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:
@@ -298,16 +301,6 @@ def _check_folders(
         existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
         if not existing.is_dir():
             validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
-
-
-def _check_strengths(validation: Validation[DaemonSection], file: Path | None) -> None:
-    """Refuse to keep strengths in a file that is something else; its folder must exist."""
-    try:
-        read_strengths(file)
-    except InputError as error:
-        validation.add(("strengths",), str(error))
-    if file is not None and not file.parent.is_dir():
-        validation.add(("strengths",), f"folder not found: {file.parent}; create it")
 
 
 def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:

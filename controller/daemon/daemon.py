@@ -15,7 +15,6 @@ from controller.daemon.inputs import TouchInputs
 from controller.daemon.messages import amplifier_statuses
 from controller.daemon.methods import ApiService
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.strengths_file import read_strengths
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths
 from controller.learning.learning import Learning
@@ -81,8 +80,7 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        strengths = Strengths(read_strengths(config.strengths))
-        self._layout = EffectPlayer(config.effective_layout, strengths)
+        self._layout = EffectPlayer(config.effective_layout, Strengths(config.strengths))
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
         self._publisher = EventPublisher(

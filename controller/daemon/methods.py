@@ -7,7 +7,6 @@ import math
 import secrets
 import time
 from collections.abc import Awaitable, Mapping
-from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -35,17 +34,14 @@ from controller.api.registered import METHODS
 from controller.api.schema import (
     AmplifierSilence,
     Empty,
-    SourceStrength,
-    StrengthList,
+    Strengths,
     headline,
 )
 from controller.api.server import Handler
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.messages import effects_result, hello_result, playing_of
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.strengths_file import save_strengths
 from controller.effects.player import EffectPlayer
-from controller.effects.strengths import MAX_STRENGTHS
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER
@@ -65,7 +61,6 @@ from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 from registry import clock
-from registry.suggestions import did_you_mean
 from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
@@ -99,8 +94,8 @@ class ApiService:
         self._learning = learning
         self._next_number = itertools.count(1)
         self._started = clock.now()
-        self._strengths = layout.strengths
-        self._has_played: dict[Connection, bool] = {}  # of the clients that are connected
+        self._clients = set[Connection]()  # that are connected and have said or done something
+        layout.strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving = asyncio.Lock()
 
     def handlers(self) -> Mapping[str, Handler]:
@@ -112,9 +107,7 @@ class ApiService:
         self._publisher.hub.forget(client)
         if client.number is not None:
             self._controller.lift(f"{_origin(client)}:")
-            self._strengths.clients.pop(_origin(client), None)
-        self._has_played.pop(client, None)
-        self._note_players()
+        self._clients.discard(client)
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -125,7 +118,7 @@ class ApiService:
     def hello(self, client: Connection, params: HelloParams) -> HelloResult:
         """Introduce the client; returns what the daemon drives."""
         client.name = params.client
-        self._has_played.setdefault(client, False)
+        self._clients.add(client)
         return hello_result(
             self._config,
             self._table,
@@ -163,7 +156,7 @@ class ApiService:
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
-            strengths=self._publisher.strength_list().strengths,
+            strengths=self._publisher.strengths().strengths,
             slow_reason=why_slow(),
             uptime_s=now - self._started,
         )
@@ -275,6 +268,7 @@ class ApiService:
         """Report all fingers of a touch source of this client."""
         if client.number is None:
             client.number = next(self._next_number)
+            self._clients.add(client)
         plate, origin = self._config.rig.plate, _origin(client)
         touches = tuple(
             Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width)
@@ -282,7 +276,6 @@ class ApiService:
         )
         # The same source name of two clients denotes two sources.
         name = f"{origin}:{params.source}"
-        self._strengths.clients[origin] = client.name
         self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
@@ -335,59 +328,35 @@ class ApiService:
             level_db_sl=params.level_db_sl,
             player=client.name,
         )
-        self._has_played[client] = True
-        self._note_players()
         self._controller.request_update()
         return Empty()
 
     @api_method()
-    async def strength(self, client: Connection, params: StrengthParams) -> StrengthList:
+    async def strength(self, client: Connection, params: StrengthParams) -> Strengths:
         """Set the strength of a touch source or client, or show what is set.
 
         What plays is led there within 100 ms.
         """
-        listed, name, gain_db = self._publisher.strength_list(), params.name, params.gain_db
-        if name is None and gain_db is None:
-            return listed
-        gains_db = {each.name: each.gain_db for each in listed.strengths}
-        connected = sorted({each.name for each in self._has_played})
-        known = [*dict.fromkeys([*gains_db, *connected])]
+        known, name = self._publisher.strengths().strengths, params.name
+        if name is None and params.gain_db is None:
+            return Strengths(strengths=known)
         if name not in known:
             raise RpcError(
                 ErrorCode.REFUSED,
                 f"name must be a touch source or client, got {name!a}",
                 where="name",
-                remedy=f"{did_you_mean(name or '', known)}choose one of {', '.join(known)}",
+                remedy=f"choose one of {', '.join(known)}",
             )
-        if gain_db is None:
-            found = SourceStrength(name=name, gain_db=gains_db.get(name, 0.0))
-            return StrengthList(strengths=[found])
-        if len({*self._strengths.gains_db, name}) > MAX_STRENGTHS:
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"at most {MAX_STRENGTHS} names must have a strength, got one more",
-                where="name",
-                remedy="set others to 0",
-            )
-        self._strengths.set(name, gain_db)
-        _logger.debug("strength: %a has %g dB by %a", name, gain_db, client.name)
-        self._controller.request_update()
-        await self._keep_strengths()
-        return StrengthList(strengths=[SourceStrength(name=name, gain_db=gain_db)])
-
-    async def _keep_strengths(self) -> None:
-        """Write the strengths to their file, if the configuration names one."""
-        file = self._config.strengths
-        if file is None:
-            return
-        async with self._saving:  # the newest last
-            try:
-                await in_thread(partial(save_strengths, self._strengths, file), name="strengths")
-            except OSError as error:
-                _logger.error("strengths: not kept: %s", error)
-
-    def _note_players(self) -> None:
-        self._strengths.played({each.name for each, played in self._has_played.items() if played})
+        if params.gain_db is not None:
+            self._layout.strengths.set(name, params.gain_db)
+            self._controller.request_update()
+            if self._config.strengths is not None:
+                async with self._saving:  # the newest last
+                    try:
+                        await in_thread(self._layout.strengths.save, name="strengths")
+                    except OSError as error:
+                        _logger.error("strengths: not kept: %s", error)
+        return Strengths(strengths={name: self._layout.strengths.gains_db.get(name, 0.0)})
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

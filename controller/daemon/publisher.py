@@ -17,8 +17,7 @@ from controller.api.schema import (
     LearningStatus,
     LearningSummary,
     PlateEvent,
-    SourceStrength,
-    StrengthList,
+    Strengths,
 )
 from controller.api.topics import (
     AmplifiersEvent,
@@ -90,11 +89,10 @@ class EventPublisher:
                 "layout": self.layout_event,
                 "plate": self._plate_event,
                 "inputs": inputs,
-                "strength": self.strength_list,
+                "strength": self.strengths,
             },
             clock=clock.now,
         )
-        player.strengths.changed = lambda: self.hub.publish("strength", self.strength_list)
 
     def observer(self) -> Observer:
         """The observer of the control loop."""
@@ -173,17 +171,11 @@ class EventPublisher:
         """The surface layout as an event."""
         return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
 
-    def strength_list(self) -> StrengthList:
+    def strengths(self) -> Strengths:
         """The strengths of all touch sources and clients that are known."""
-        known = self._player.strengths
-        inputs = [each.name for each in self.inputs().inputs]
-        names = {*inputs, *known.sources, *known.players, *known.gains_db}
-        return StrengthList(
-            strengths=[
-                SourceStrength(name=name, gain_db=known.gains_db.get(name, 0.0))
-                for name in sorted(names)
-            ]
-        )
+        known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
+        names = {*inputs, *known.sources, *[name for _, name in known.clients()], *known.gains_db}
+        return Strengths(strengths={name: known.gains_db.get(name, 0.0) for name in sorted(names)})
 
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""

@@ -1,9 +1,19 @@
-"""Strengths: a gain on all that a touch source or a client brings, by its name."""
+"""Strengths: a gain on all that a touch source or a client brings, kept by its name."""
 
-from collections.abc import Callable, Collection, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
 
-MAX_STRENGTHS = 64
-"""How many names may have a strength, and how many touch sources are remembered."""
+from pydantic import Field, TypeAdapter, ValidationError
+
+from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+
+MAX_SOURCES = 64
+"""How many touch sources are remembered."""
+
+_GAINS = TypeAdapter(dict[str, Annotated[float, Field(le=0, allow_inf_nan=False)]])
 
 
 class Strengths:
@@ -11,49 +21,53 @@ class Strengths:
 
     A name is that of a touch input of the configuration, of a sender there (`table:left@10.0.0.2`),
     of a touch source as its client calls it, or of a client. At a finger the gains of its names and
-    of the client that plays its effect add up, each once.
+    of the client that plays its effect add up, each once. file: where they are kept, None for as
+    long as this object lives. Raises InputError for a file of something else.
     """
 
-    def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
-        self.gains_db: Mapping[str, float] = gains_db or {}
+    def __init__(self, file: Path | None = None) -> None:
+        self._file = file
+        self.gains_db = read_strengths(file)
         """Those that are set, by name."""
-        self.clients: dict[str, str] = {}
-        """Names of clients with touch sources, by the origin with which the keys of these begin."""
-        self.sources: Mapping[str, None] = {}
-        """Names of touch sources that had fingers, the newest last."""
-        self.players: Collection[str] = ()
-        """Names of clients that are connected and have played an effect."""
-        self.changed: Callable[[], None] = lambda: None
-        """Called when a gain was set, or a source or client is new."""
+        self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
+        """The clients: the origin with which the keys of their sources begin, and their names."""
+        self.sources: Sequence[str] = ()
+        """Names of touch sources that had fingers."""
 
     def note(self, source: str) -> None:
         """Note that a touch source has a finger."""
         name, _ = self._names_of(source)
-        if name not in self.sources:
-            self.sources = dict.fromkeys([*self.sources, name][-MAX_STRENGTHS:])
-            self.changed()
+        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_SOURCES:]
 
     def gain_db(self, source: str, player: str | None = None) -> float:
         """Return the gain at a finger of a source; player: the client that plays its effect."""
-        if not self.gains_db:
-            return 0.0
-        names = {*self._names_of(source), player}
+        names = {*self._names_of(source), player} if self.gains_db else ()
         return sum([gain for name, gain in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:
         """Set the gain [dB] of a name from now on; 0 removes it."""
         gains = {**self.gains_db, name: gain_db}
         self.gains_db = {name: gain for name, gain in gains.items() if gain}
-        self.changed()
 
-    def played(self, players: Collection[str]) -> None:
-        """Note which clients that are connected have played an effect."""
-        if players != self.players:
-            self.players = players
-            self.changed()
+    def save(self) -> None:
+        """Write the gains, if they are kept, atomically; raises OSError."""
+        if self._file is not None:
+            with whole_or_nothing(self._file) as stream:
+                stream.write(json.dumps(self.gains_db, indent=1).encode())
 
     def _names_of(self, source: str) -> tuple[str, str]:
         """Return the two names of a source, its own first."""
         first, second, *rest = f"{source}::".split(":", 2)
-        client = self.clients.get(f"{first}:{second}")
+        client = dict(self.clients()).get(f"{first}:{second}")
         return (source, first) if client is None else (rest[0][:-2], client)
+
+
+def read_strengths(file: Path | None) -> Mapping[str, float]:
+    """Read the gains [dB] of a file, none where there is no file; raises InputError."""
+    try:
+        is_kept = file is not None and file.exists()
+        return _GAINS.validate_json(file.read_bytes(), strict=True) if file and is_kept else {}
+    except (ValidationError, OSError) as error:
+        raise InputError(
+            f"{file}: must have strengths of 0 dB or less by name; correct or remove it"
+        ) from error

@@ -50,29 +50,21 @@ class Prediction:
 
         Of its contrasts what is left at least.
         """
-        lost = min(gain_db - others_db, 0.0)
-        promised = _plus(self.promised_contrast_db, lost)
-        verdict, held_back = self.verdict, self.held_back
-        level = _plus(self.level_db_sl, gain_db)
-        if level is not None and self.level_db_sl is not None and level < 0 <= self.level_db_sl:
-            verdict = HELD_BACK
-            held_back = f"a strength of {gain_db:g} dB leaves it below the threshold; raise it"
-        elif verdict in (OWN, MIXED):
-            verdict = verdict_of(promised)
+        gains = {
+            **dict.fromkeys(("level_db_sl", "nominal_db_sl"), gain_db),
+            **dict.fromkeys(("contrast_db", "promised_contrast_db"), min(gain_db - others_db, 0.0)),
+            "foreign_level_db_sl": others_db,
+        }
+        levels = {key: getattr(self, key) for key in gains}
+        weak = {key: level + gains[key] for key, level in levels.items() if level is not None}
+        found: Prediction = replace(self, **weak)
+        if weak.get("level_db_sl", 0.0) < 0 <= (self.level_db_sl or 0.0):
+            reason = f"a strength of {gain_db:g} dB leaves it below the threshold; raise it"
+            return replace(found, verdict=HELD_BACK, held_back=reason)
+        is_alone = self.verdict in (OWN, MIXED)
         return replace(
-            self,
-            level_db_sl=level,
-            contrast_db=_plus(self.contrast_db, lost),
-            verdict=verdict,
-            held_back=held_back,
-            promised_contrast_db=promised,
-            foreign_level_db_sl=_plus(self.foreign_level_db_sl, others_db),
-            nominal_db_sl=_plus(self.nominal_db_sl, gain_db),
+            found, verdict=verdict_of(found.promised_contrast_db) if is_alone else self.verdict
         )
-
-
-def _plus(level: float | None, gain_db: float) -> float | None:
-    return None if level is None else level + gain_db
 
 
 @dataclass(frozen=True)
@@ -100,20 +92,6 @@ class Content:
     def frequency(self) -> float | None:
         """Its frequency [Hz]; None of several."""
         return self.layer.frequency
-
-    @property
-    def chosen_for(self) -> tuple[object, ...]:
-        """What it was chosen for, whatever its strength."""
-        return self.targets, self.placement, self.voice
-
-    def weakened(self, gain_db: float, others_db: float) -> "Content":
-        """Return it with a gain [dB]; others_db: the highest gain of the others."""
-        return replace(
-            self,
-            layer=self.layer.scaled(gain_db),
-            predictions=tuple([each.weakened(gain_db, others_db) for each in self.predictions]),
-            gain_db=gain_db,
-        )
 
 
 @dataclass(frozen=True)
@@ -171,9 +149,10 @@ class Selection:
         for each in self.contents:
             gain = gains[each.targets]
             others = [other for targets, other in gains.items() if targets != each.targets]
-            contents.append(each.weakened(gain, max(others, default=gain)))
-        strongest = max(gains.values())
-        levels = {key: level + strongest for key, level in self.quiet_levels.items()}
+            weak = [one.weakened(gain, max(others, default=gain)) for one in each.predictions]
+            layer = each.layer.scaled(gain)
+            contents.append(replace(each, layer=layer, predictions=tuple(weak), gain_db=gain))
+        levels = {key: level + max(gains.values()) for key, level in self.quiet_levels.items()}
         return replace(self, contents=tuple(contents), quiet_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":

@@ -248,8 +248,10 @@ class Layers:
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return those of the contents that are still wanted that have ended by themselves."""
         if self._over:
-            over = [each.chosen_for for each in self._over]
-            self._over = tuple([each for each in contents if each.chosen_for in over])
+            over = [(each.targets, each.placement, each.voice) for each in self._over]
+            self._over = tuple(
+                [one for one in contents if (one.targets, one.placement, one.voice) in over]
+            )
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
@@ -334,10 +336,9 @@ class Layers:
 
     def _is_led(self, number: int, content: Content) -> bool:
         """Whether a content goes on in its layer at another strength."""
-        if (one := self.contents.get(number)) is None:
-            return False
-        before, pulses = one.content, [each.targets[0][1].pulse for each in (one.content, content)]
-        is_same = before.key == content.key and before.frequency == content.frequency
+        before = self.contents[number].content if number in self.contents else content
+        pulses = [each.targets[0][1].pulse for each in (before, content)]
+        is_same = (before.key, before.frequency) == (content.key, content.frequency)
         return is_same and pulses[0] == pulses[1] and before.gain_db != content.gain_db
 
     def _fades(self, sets: Sets) -> bool:

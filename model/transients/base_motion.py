@@ -157,8 +157,8 @@ class BaseEnvelope:
 
     def scaled(self, factor: float) -> "BaseEnvelope":
         """Return it with all amplitudes times a factor."""
-        start, *knots = [factor * each for each in (self.start, *self.knots)]
-        return BaseEnvelope(self.frequency, start, tuple(knots), self.step)
+        knots = tuple([factor * each for each in self.knots])
+        return BaseEnvelope(self.frequency, factor * self.start, knots, self.step)
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""

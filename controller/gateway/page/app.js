@@ -260,7 +260,8 @@ const HANDLERS = {
   },
   strength({ strengths }) {
     const set = (name, gain) => attempt(() => connection.strength(name, gain));
-    showStrengths(at("strengths-section"), at("strengths"), strengths, set);
+    const others = Object.entries(strengths).filter(([name]) => name !== ownName);
+    showStrengths(at("strengths-section"), at("strengths"), others, set);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

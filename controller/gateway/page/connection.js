@@ -234,8 +234,8 @@ export class Connection {
     this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
   }
 
-  // Set the strength of a touch source or client, -40 to 0 dB, or ask what is set; a promise of
-  // [{ name, gain_db }].
+  // Set the strength of a touch source or client, -40 to 0 dB, or ask what is set; a promise of gains
+  // by name.
   async strength(name = null, gain_db = null) {
     return (await this.call("strength", { name, gain_db })).strengths;
   }

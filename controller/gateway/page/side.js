@@ -4,7 +4,7 @@ import { fixed } from "./plate.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const MAX_EVENTS = 200;
-const OLD_REPLY_S = 1.5;  // three times the interval of status reads while disarmed
+const OLD_REPLY_S = 1;  // twice the interval of status reads while disarmed
 
 function element(name, text, className) {
   const made = document.createElement(name);
@@ -116,9 +116,9 @@ const FADE_MS = 100;  // the daemon leads to another strength within as long
 export function showStrengths(section, container, strengths, set) {
   section.hidden = !strengths.length;
   const before = new Map([...container.children].map((row) => [row.dataset.name, row]));
-  const rows = strengths.map(({ name }) => before.get(name) ?? strengthRow(name, set));
+  const rows = strengths.map(([name]) => before.get(name) ?? strengthRow(name, set));
   if (rows.length !== before.size || rows.some((row) => !before.has(row.dataset.name))) container.replaceChildren(...rows);
-  rows.forEach((row, index) => row.show(strengths[index].gain_db));
+  rows.forEach((row, index) => row.show(strengths[index][1]));
 }
 
 function strengthRow(name, set) {

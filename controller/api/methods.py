@@ -28,7 +28,6 @@ from controller.api.schema import (
     Name,
     PatternFields,
     RigSummary,
-    Strengths,
     TableSummary,
     Topic,
     TouchInputStatus,
@@ -60,7 +59,17 @@ class HelloResult(Message):
     )
 
 
-class StatusResult(Strengths, PatternFields, CauseAndRemedy):
+class StrengthResult(Message):
+    """The strengths of touch sources and clients that are known."""
+
+    strengths: dict[str, float] = Field(
+        default={},
+        description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
+        "sources that had fingers, clients that are connected, and what else is set",
+    )
+
+
+class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")

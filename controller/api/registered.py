@@ -17,7 +17,7 @@ from controller.api.methods import (
     StatusResult,
     StopResult,
     StrengthParams,
-    Strengths,
+    StrengthResult,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
@@ -36,7 +36,7 @@ METHODS: dict[str, Method] = {
     "touch": Method(TouchParams, Empty, is_limited=False),
     "effects": Method(Empty, EffectsResult),
     "play": Method(PlayParams, Empty, is_repeated=False),
-    "strength": Method(StrengthParams, Strengths),
+    "strength": Method(StrengthParams, StrengthResult),
     "subscribe": Method(SubscribeParams, Empty, over_http=False),
     "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
 }

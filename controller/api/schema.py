@@ -165,16 +165,6 @@ class TouchInputStatus(Message):
     )
 
 
-class Strengths(Message):
-    """The strengths of touch sources and clients that are known."""
-
-    strengths: dict[str, float] = Field(
-        default={},
-        description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
-        "sources that had fingers, clients that are connected, and what else is set",
-    )
-
-
 class ContactStatus(Message):
     """A finger on the plate and its predicted sensation."""
 

@@ -148,8 +148,11 @@ def strength(
     """It is kept by this name; what layout and limits allow is 0."""
     with _client(socket) as era:
         found = era.strength(name=name, gain_db=gain_db)
-    lines = [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()]
-    print_report(lines, found.model_dump(), as_json=as_json)
+    print_report(
+        [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()],
+        found.model_dump(),
+        as_json=as_json,
+    )
 
 
 def touch(

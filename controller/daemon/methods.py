@@ -7,6 +7,7 @@ import math
 import secrets
 import time
 from collections.abc import Awaitable, Mapping
+from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -25,6 +26,7 @@ from controller.api.methods import (
     StatusResult,
     StopResult,
     StrengthParams,
+    StrengthResult,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
@@ -34,7 +36,6 @@ from controller.api.registered import METHODS
 from controller.api.schema import (
     AmplifierSilence,
     Empty,
-    Strengths,
     headline,
 )
 from controller.api.server import Handler
@@ -332,14 +333,14 @@ class ApiService:
         return Empty()
 
     @api_method()
-    async def strength(self, client: Connection, params: StrengthParams) -> Strengths:
+    async def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
         """Set the strength of a touch source or client, or show what is set.
 
         What plays is led there within 100 ms.
         """
         known, name = self._publisher.strengths().strengths, params.name
         if name is None and params.gain_db is None:
-            return Strengths(strengths=known)
+            return StrengthResult(strengths=known)
         if name not in known:
             raise RpcError(
                 ErrorCode.REFUSED,
@@ -350,13 +351,15 @@ class ApiService:
         if params.gain_db is not None:
             self._layout.strengths.set(name, params.gain_db)
             self._controller.request_update()
-            if self._config.strengths is not None:
+            if (file := self._config.strengths) is not None:
                 async with self._saving:  # the newest last
                     try:
-                        await in_thread(self._layout.strengths.save, name="strengths")
+                        await in_thread(
+                            partial(self._layout.strengths.save, file), name="strengths"
+                        )
                     except OSError as error:
                         _logger.error("strengths: not kept: %s", error)
-        return Strengths(strengths={name: self._layout.strengths.gains_db.get(name, 0.0)})
+        return StrengthResult(strengths={name: self._layout.strengths.gains_db.get(name, 0.0)})
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

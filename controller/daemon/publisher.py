@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 
 from controller.api.amplifier_status import AmplifierStatus
+from controller.api.methods import StrengthResult
 from controller.api.schema import (
     STATE_WORDS,
     LatencySummary,
     LearningStatus,
     LearningSummary,
     PlateEvent,
-    Strengths,
 )
 from controller.api.topics import (
     AmplifiersEvent,
@@ -171,11 +171,13 @@ class EventPublisher:
         """The surface layout as an event."""
         return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
 
-    def strengths(self) -> Strengths:
+    def strengths(self) -> StrengthResult:
         """The strengths of all touch sources and clients that are known."""
         known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
         names = {*inputs, *known.sources, *[name for _, name in known.clients()], *known.gains_db}
-        return Strengths(strengths={name: known.gains_db.get(name, 0.0) for name in sorted(names)})
+        return StrengthResult(
+            strengths={name: known.gains_db.get(name, 0.0) for name in sorted(names)}
+        )
 
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""

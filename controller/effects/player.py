@@ -92,7 +92,11 @@ class EffectPlayer:
         felt.sort()
         elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
         waiting, self._waiting = self._waiting, {}
-        sensing, targets, gains_db = set[ContactKey](), list[Target](), dict[tuple[ContactKey, bool], float]()
+        sensing, targets, gains_db = (
+            set[ContactKey](),
+            list[Target](),
+            dict[tuple[ContactKey, bool], float](),
+        )
         for number, play, contact, stimulus in felt:
             sensing.add(contact.key)
             if number in elsewhere[:-1]:

@@ -3,9 +3,8 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, NonPositiveFloat, TypeAdapter, ValidationError
 
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
@@ -13,7 +12,7 @@ from model.files.array_file import whole_or_nothing
 MAX_SOURCES = 64
 """How many touch sources are remembered."""
 
-_GAINS = TypeAdapter(dict[str, Annotated[float, Field(le=0, allow_inf_nan=False)]])
+_GAINS = TypeAdapter(dict[str, NonPositiveFloat], config=ConfigDict(allow_inf_nan=False))
 
 
 class Strengths:
@@ -21,13 +20,11 @@ class Strengths:
 
     A name is that of a touch input of the configuration, of a sender there (`table:left@10.0.0.2`),
     of a touch source as its client calls it, or of a client. At a finger the gains of its names and
-    of the client that plays its effect add up, each once. file: where they are kept, None for as
-    long as this object lives. Raises InputError for a file of something else.
+    of the client that plays its effect add up, each once.
     """
 
-    def __init__(self, file: Path | None = None) -> None:
-        self._file = file
-        self.gains_db = read_strengths(file)
+    def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
+        self.gains_db = gains_db or {}
         """Those that are set, by name."""
         self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
         """The clients: the origin with which the keys of their sources begin, and their names."""
@@ -49,11 +46,10 @@ class Strengths:
         gains = {**self.gains_db, name: gain_db}
         self.gains_db = {name: gain for name, gain in gains.items() if gain}
 
-    def save(self) -> None:
-        """Write the gains, if they are kept, atomically; raises OSError."""
-        if self._file is not None:
-            with whole_or_nothing(self._file) as stream:
-                stream.write(json.dumps(self.gains_db, indent=1).encode())
+    def save(self, file: Path) -> None:
+        """Write the gains that are set, atomically; raises OSError."""
+        with whole_or_nothing(file) as stream:
+            stream.write(json.dumps(self.gains_db, indent=1).encode())
 
     def _names_of(self, source: str) -> tuple[str, str]:
         """Return the two names of a source, its own first."""
@@ -65,8 +61,9 @@ class Strengths:
 def read_strengths(file: Path | None) -> Mapping[str, float]:
     """Read the gains [dB] of a file, none where there is no file; raises InputError."""
     try:
-        is_kept = file is not None and file.exists()
-        return _GAINS.validate_json(file.read_bytes(), strict=True) if file and is_kept else {}
+        return (
+            _GAINS.validate_json(file.read_bytes(), strict=True) if file and file.exists() else {}
+        )
     except (ValidationError, OSError) as error:
         raise InputError(
             f"{file}: must have strengths of 0 dB or less by name; correct or remove it"

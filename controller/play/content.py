@@ -18,6 +18,7 @@ from model.table.table import LocalizationTable
 Targets = tuple[tuple[Contact, Target], ...]
 
 BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
+TOO_WEAK = "a strength of %g dB leaves it below the threshold; raise it"
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,14 @@ class Prediction:
             **dict.fromkeys(("contrast_db", "promised_contrast_db"), min(gain_db - others_db, 0.0)),
             "foreign_level_db_sl": others_db,
         }
-        levels = {key: getattr(self, key) for key in gains}
-        weak = {key: level + gains[key] for key, level in levels.items() if level is not None}
+        weak = {
+            key: value + gains[key] for key in gains if (value := getattr(self, key)) is not None
+        }
         found: Prediction = replace(self, **weak)
         if weak.get("level_db_sl", 0.0) < 0 <= (self.level_db_sl or 0.0):
-            reason = f"a strength of {gain_db:g} dB leaves it below the threshold; raise it"
-            return replace(found, verdict=HELD_BACK, held_back=reason)
-        is_alone = self.verdict in (OWN, MIXED)
-        return replace(
-            found, verdict=verdict_of(found.promised_contrast_db) if is_alone else self.verdict
-        )
+            return replace(found, verdict=HELD_BACK, held_back=TOO_WEAK % gain_db)
+        verdict = verdict_of(found.promised_contrast_db)
+        return replace(found, verdict=verdict) if self.verdict in (OWN, MIXED) else found
 
 
 @dataclass(frozen=True)
@@ -142,10 +141,13 @@ class Selection:
         """Return it with the strengths of fingers; what several share has the lowest."""
         if not (self.contents and any(gains_db.values())):
             return self
-        gains, contents = dict[Targets, float](), list[Content]()
-        for each in self.contents:
-            keys = [(contact.key, target.is_short) for contact, target in each.targets]
-            gains[each.targets] = min(0.0, *[gains_db.get(key, 0.0) for key in keys])
+        gains = {
+            each.targets: min(
+                0.0, *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets]
+            )
+            for each in self.contents
+        }
+        contents = []
         for each in self.contents:
             gain = gains[each.targets]
             others = [other for targets, other in gains.items() if targets != each.targets]

@@ -337,9 +337,8 @@ class Layers:
     def _is_led(self, number: int, content: Content) -> bool:
         """Whether a content goes on in its layer at another strength."""
         before = self.contents[number].content if number in self.contents else content
-        pulses = [each.targets[0][1].pulse for each in (before, content)]
-        is_same = (before.key, before.frequency) == (content.key, content.frequency)
-        return is_same and pulses[0] == pulses[1] and before.gain_db != content.gain_db
+        same = [(one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content)]
+        return same[0] == same[1] and before.gain_db != content.gain_db
 
     def _fades(self, sets: Sets) -> bool:
         """Whether anything that plays is ended or replaced."""

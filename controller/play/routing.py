@@ -101,8 +101,9 @@ class SetBuilder:
         onset = ending = None
         restarted = restarted_by(tones, {} if restarts else playing)
         if is_shaped:
-            frequencies = {tone.frequency for tone in tones.values()}
-            is_continued = is_led or not restarted >= frequencies
+            is_continued = is_led or not restarted.issuperset(
+                [tone.frequency for tone in tones.values()]
+            )
             is_ended = lasts > KNOT_STEP * ONSET_KNOTS
             layer = self.shape(placement, layer, is_continued, is_ended=is_ended)
             onset, ending = layer.onset, layer.ending

@@ -635,8 +635,8 @@ async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client)
             "document.querySelectorAll('[data-name=page] input').forEach((slider) => {"
             " slider.value = -6; slider.dispatchEvent(new Event('input')); })"
         )
-        while era.strength(name="page").strengths["page"] != -6:
-            await asyncio.sleep(0.02)
+        await asyncio.to_thread(wait_for, lambda: era.status().strengths["page"] == -6)
+        era.strength(name="page", gain_db=0)
         await page.click("#effects button")
         await page.until("document.querySelectorAll('.contact.target').length")
         assert await page.evaluate("document.querySelector('#problem').innerText") == ""

@@ -136,7 +136,7 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         for gain, what in ((3.0, "at most 0"), (-41.0, "at least -40"), (math.nan, "finite")):
             with pytest.raises(InputError, match=f"^strength: gain_db must be .*{what}.*, got"):
                 await era.strength(name="pen", gain_db=gain)
-        with pytest.raises(RpcError, match="^name must be .*, got 'pan'; choose one of pen, "):
+        with pytest.raises(RpcError, match=r"^name must be .*, got 'pan'; choose one of pen, "):
             await era.strength(name="pan", gain_db=-6)
         held.cancel()
         await asyncio.gather(one.close(), other.close())

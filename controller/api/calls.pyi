@@ -1,4 +1,5 @@
 # Written by docs/generators/client_stub.py.
+# ruff: noqa: E501
 
 import inspect
 

@@ -93,8 +93,7 @@ def stub() -> str:
     made = {name: each for name, (each, _) in registered().items() if name not in BY_HAND}
     results = {each.result.__name__ for each in made.values() if each.result is not Empty}
     lines = [
-        _HEAD,
-        "",
+        *(_HEAD, "# ruff: noqa: E501", ""),
         "import inspect",
         "",
         *_import("controller.api.methods", "Method", *results),

@@ -15,6 +15,7 @@ from controller.daemon.methods import ApiService
 from drivers.protocol.table import READINGS
 
 _HEAD = "# Written by docs/generators/client_stub.py."
+_WIDTH = 100  # of a line, as ruff has it
 
 
 def registered() -> dict[str, tuple[Method, str]]:
@@ -93,7 +94,8 @@ def stub() -> str:
     made = {name: each for name, (each, _) in registered().items() if name not in BY_HAND}
     results = {each.result.__name__ for each in made.values() if each.result is not Empty}
     lines = [
-        *(_HEAD, "# ruff: noqa: E501", ""),
+        _HEAD,
+        "",
         "import inspect",
         "",
         *_import("controller.api.methods", "Method", *results),
@@ -107,7 +109,10 @@ def stub() -> str:
         for name, method in made.items():
             signature = signature_of(method)
             result = "None" if method.result is Empty else method.result.__name__
-            lines.append(f"    {keyword} {name}({_parameters(signature)}) -> {result}: ...")
+            line = f"    {keyword} {name}({_parameters(signature)}) -> {result}: ..."
+            if len(line) > _WIDTH:
+                line = line.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
+            lines.append(line)
     return "\n".join(lines) + "\n"
 
 

@@ -624,7 +624,10 @@ async def test_texts_on_the_plate_do_not_overlap(page: Page) -> None:
 
 
 async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client) -> None:
-    """Only while armed, and with a finger on the plate, whose strength a slider sets."""
+    """Only while armed, and with a finger on the plate.
+
+    A slider sets the strength of its fingers, and a page of its own that by its name.
+    """
     assert await page.until("document.querySelector('#effects button:disabled') !== null")
     await arm(page, era)
     async with fingers_down(page, PLACES[0]):
@@ -636,7 +639,16 @@ async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client)
             " slider.value = -6; slider.dispatchEvent(new Event('input')); })"
         )
         await asyncio.to_thread(wait_for, lambda: era.status().strengths["page"] == -6)
-        era.strength(name="page", gain_db=0)
+        kept = await page.evaluate(
+            "import('./connection.js').then(({ Connection }) => new Promise((done) => {"
+            " const token = sessionStorage.getItem('era-haptics-token');"
+            " const opened = () => seat.strength('seat 1', -3).then(done);"
+            " const seat = new Connection(token, ['state'], { opened }, undefined, 'seat 1');"
+            " })).then(() => 'kept')"
+        )
+        assert (kept, era.status().strengths["seat 1"]) == ("kept", -3)
+        for name in ("page", "seat 1"):
+            era.strength(name=name, gain_db=0)
         await page.click("#effects button")
         await page.until("document.querySelectorAll('.contact.target').length")
         assert await page.evaluate("document.querySelector('#problem').innerText") == ""

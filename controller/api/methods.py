@@ -196,9 +196,7 @@ class PlayParams(Message):
 class StrengthParams(Message):
     """A touch source or client and its gain; without a gain nothing is set."""
 
-    name: Name | None = Field(
-        None, description="of an input, a source or a client; null for all that are known"
-    )
+    name: Name = Field(description="of an input, a source or a client")
     gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )

@@ -136,9 +136,8 @@ def of_method(method: str) -> Callable[..., None]:
 
 def strength(
     name: Annotated[
-        str | None,
-        typer.Argument(metavar="[SOURCE|CLIENT]", help="As the status has it; default: all."),
-    ] = None,
+        str, typer.Argument(metavar="SOURCE|CLIENT", help="As the JSON of era status has it.")
+    ],
     gain_db: Annotated[
         float | None, typer.Argument(metavar="[DB]", help="-40 to 0; default: show what is set.")
     ] = None,
@@ -147,7 +146,7 @@ def strength(
 ) -> None:
     """It is kept by this name; what layout and limits allow is 0."""
     with _client(socket) as era:
-        found = era.strength(name=name, gain_db=gain_db)
+        found = era.strength(name, gain_db=gain_db)
     print_report(
         [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()],
         found.model_dump(),

@@ -33,11 +33,7 @@ from controller.api.methods import (
     api_method,
 )
 from controller.api.registered import METHODS
-from controller.api.schema import (
-    AmplifierSilence,
-    Empty,
-    headline,
-)
+from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.messages import effects_result, hello_result, playing_of
@@ -334,13 +330,11 @@ class ApiService:
 
     @api_method()
     async def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
-        """Set the strength of a touch source or client, or show what is set.
+        """Set the strength of a touch source or client, or show it; the status shows all.
 
         What plays is led there within 100 ms.
         """
         known, name = self._publisher.strengths().strengths, params.name
-        if name is None and params.gain_db is None:
-            return StrengthResult(strengths=known)
         if name not in known:
             raise RpcError(
                 ErrorCode.REFUSED,

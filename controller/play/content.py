@@ -62,8 +62,9 @@ class Prediction:
         found: Prediction = replace(self, **weak)
         if weak.get("level_db_sl", 0.0) < 0 <= (self.level_db_sl or 0.0):
             return replace(found, verdict=HELD_BACK, held_back=TOO_WEAK % gain_db)
-        verdict = verdict_of(found.promised_contrast_db)
-        return replace(found, verdict=verdict) if self.verdict in (OWN, MIXED) else found
+        if self.verdict in (OWN, MIXED):
+            return replace(found, verdict=verdict_of(found.promised_contrast_db))
+        return found
 
 
 @dataclass(frozen=True)
@@ -152,8 +153,14 @@ class Selection:
             gain = gains[each.targets]
             others = [other for targets, other in gains.items() if targets != each.targets]
             weak = [one.weakened(gain, max(others, default=gain)) for one in each.predictions]
-            layer = each.layer.scaled(gain)
-            contents.append(replace(each, layer=layer, predictions=tuple(weak), gain_db=gain))
+            contents.append(
+                replace(
+                    each,
+                    layer=each.layer.scaled(gain),
+                    predictions=tuple(weak),
+                    gain_db=gain,
+                )
+            )
         levels = {key: level + max(gains.values()) for key, level in self.quiet_levels.items()}
         return replace(self, contents=tuple(contents), quiet_levels=levels)
 

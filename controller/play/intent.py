@@ -103,8 +103,8 @@ class HapticIntent:
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
     none. until: when [s] the intent may change though no contact has; None for never. protected:
-    contacts that must not notice the contents of others. gains_db: by which what is
-    chosen for targets is played weaker.
+    contacts that must not notice the contents of others. gains_db: by which what is chosen for
+    targets is played weaker.
     """
 
     targets: tuple[Target, ...]

@@ -234,10 +234,9 @@ export class Connection {
     this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
   }
 
-  // Set the strength of a touch source or client, -40 to 0 dB, or ask what is set; a promise of gains
-  // by name.
-  async strength(name = null, gain_db = null) {
-    return (await this.call("strength", { name, gain_db })).strengths;
+  // Set the strength of a touch source or client, -40 to 0 dB, or ask for it; a promise of it.
+  async strength(name, gain_db = null) {
+    return (await this.call("strength", { name, gain_db })).strengths[name];
   }
 
   // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.

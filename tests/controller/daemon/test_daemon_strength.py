@@ -141,7 +141,7 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         held.cancel()
         await asyncio.gather(one.close(), other.close())
     async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
-        assert (await era.strength()).strengths == {"pen": -3, "seat": -6, "test": -2}
+        assert (await era.status()).strengths == {"pen": -3, "seat": -6, "test": -2}
         one, other = await bench.client("seat"), await bench.client("another")
         held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
         assert await levels(era) == [11, 20]

@@ -80,8 +80,9 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        strengths = Strengths(read_strengths(config.strengths))
-        self._layout = EffectPlayer(config.effective_layout, strengths)
+        self._layout = EffectPlayer(
+            config.effective_layout, Strengths(read_strengths(config.strengths))
+        )
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
         self._publisher = EventPublisher(

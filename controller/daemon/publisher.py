@@ -174,10 +174,8 @@ class EventPublisher:
     def strengths(self) -> StrengthResult:
         """The strengths of all touch sources and clients that are known."""
         known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
-        names = {*inputs, *known.sources, *[name for _, name in known.clients()], *known.gains_db}
-        return StrengthResult(
-            strengths={name: known.gains_db.get(name, 0.0) for name in sorted(names)}
-        )
+        names = sorted({*inputs, *known.sources, *[name for _, name in known.clients()]})
+        return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
 
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""

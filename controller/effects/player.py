@@ -105,8 +105,9 @@ class EffectPlayer:
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
             targets.append(target)
-            gain = self.strengths.gain_db(contact.key.source, play.player)
-            gains_db[target.key, target.is_short] = gain
+            gains_db[target.key, target.is_short] = self.strengths.gain_db(
+                contact.key.source, play.player
+            )
             if target.key in waiting and target.is_short:
                 self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])

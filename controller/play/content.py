@@ -18,7 +18,6 @@ from model.table.table import LocalizationTable
 Targets = tuple[tuple[Contact, Target], ...]
 
 BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
-TOO_WEAK = "a strength of %g dB leaves it below the threshold; raise it"
 
 
 @dataclass(frozen=True)
@@ -56,15 +55,25 @@ class Prediction:
             **dict.fromkeys(("contrast_db", "promised_contrast_db"), min(gain_db - others_db, 0.0)),
             "foreign_level_db_sl": others_db,
         }
-        weak = {
-            key: value + gains[key] for key in gains if (value := getattr(self, key)) is not None
-        }
-        found: Prediction = replace(self, **weak)
-        if weak.get("level_db_sl", 0.0) < 0 <= (self.level_db_sl or 0.0):
-            return replace(found, verdict=HELD_BACK, held_back=TOO_WEAK % gain_db)
-        if self.verdict in (OWN, MIXED):
-            return replace(found, verdict=verdict_of(found.promised_contrast_db))
-        return found
+        found: Prediction = replace(
+            self,
+            **{
+                key: level + gains[key]
+                for key in gains
+                if (level := getattr(self, key)) is not None
+            },
+        )
+        if (found.level_db_sl or 0.0) < 0 <= (self.level_db_sl or 0.0):
+            return replace(
+                found,
+                verdict=HELD_BACK,
+                held_back=f"a strength of {gain_db:g} dB leaves it below the threshold; raise it",
+            )
+        return (
+            replace(found, verdict=verdict_of(found.promised_contrast_db))
+            if self.verdict in (OWN, MIXED)
+            else found
+        )
 
 
 @dataclass(frozen=True)
@@ -152,12 +161,12 @@ class Selection:
         for each in self.contents:
             gain = gains[each.targets]
             others = [other for targets, other in gains.items() if targets != each.targets]
-            weak = [one.weakened(gain, max(others, default=gain)) for one in each.predictions]
+            loudest = max(others, default=gain)
             contents.append(
                 replace(
                     each,
                     layer=each.layer.scaled(gain),
-                    predictions=tuple(weak),
+                    predictions=tuple([one.weakened(gain, loudest) for one in each.predictions]),
                     gain_db=gain,
                 )
             )

@@ -313,10 +313,9 @@ class Layers:
         for number in starting:
             content = numbers[number]
             left, is_led = _all_left(content, now), self._is_led(number, content)
-            layer = replace(content.layer, ramp=STRENGTH_FADE) if is_led else content.layer
             layers[number], played = self.builder.build_pattern(
                 number,
-                layer,
+                replace(content.layer, ramp=STRENGTH_FADE) if is_led else content.layer,
                 content.placement,
                 playing=self._drive_of(number),
                 valid_for=self._lasts(content, left, now),

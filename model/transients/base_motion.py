@@ -157,8 +157,12 @@ class BaseEnvelope:
 
     def scaled(self, factor: float) -> "BaseEnvelope":
         """Return it with all amplitudes times a factor."""
-        knots = tuple([factor * each for each in self.knots])
-        return BaseEnvelope(self.frequency, factor * self.start, knots, self.step)
+        return BaseEnvelope(
+            self.frequency,
+            factor * self.start,
+            tuple([factor * each for each in self.knots]),
+            self.step,
+        )
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""

@@ -12,6 +12,7 @@ const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: the events before or after them are shown.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
+const UNNAMED = /^(gateway|era|web:\d+ .*)$/;  // clients that no strength is kept for
 // Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
   daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],
@@ -260,8 +261,8 @@ const HANDLERS = {
   },
   strength({ strengths }) {
     const set = (name, gain) => attempt(() => connection.strength(name, gain));
-    const others = Object.entries(strengths).filter(([name]) => name !== ownName);
-    showStrengths(at("strengths-section"), at("strengths"), others, set);
+    const shown = Object.entries(strengths).filter(([name, gain]) => gain || !UNNAMED.test(name));
+    showStrengths(at("strengths-section"), at("strengths"), shown, set);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

@@ -12,7 +12,7 @@ const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: the events before or after them are shown.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
-const UNNAMED = /^(gateway|era|web:\d+ .*)$/;  // clients that no strength is kept for
+const UNNAMED = /^(gateway|era|web:\d+ .*|http .*)$/;  // clients that no strength is kept for
 // Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
   daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],

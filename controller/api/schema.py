@@ -65,6 +65,7 @@ Topic: TypeAlias = Literal[
     "layout",
     "plate",
     "inputs",
+    "strength",
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"

@@ -33,6 +33,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
         *map(_contact, status.contacts),
+        *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),
     ]

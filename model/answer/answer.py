@@ -106,13 +106,23 @@ class Layer:
         return (replace(self, side_bands=()), *beside)
 
     def scaled(self, gain_db: float) -> "Layer":
-        """The layer louder by so much [dB]: contrasts stay."""
+        """The layer louder by so much [dB], its envelopes too: contrasts stay."""
         factor = 10 ** (gain_db / 20)
         louder = [
             {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
             for each in self.excitations
         ]
-        return replace(self, excitation=louder[0], side_bands=tuple(louder[1:]))
+        onset, ending = [
+            each and {name: one.scaled(factor) for name, one in each.items()}
+            for each in (self.onset, self.ending)
+        ]
+        return replace(
+            self,
+            excitation=louder[0],
+            side_bands=tuple(louder[1:]),
+            onset=onset,
+            ending=ending,
+        )
 
 
 @dataclass(frozen=True)

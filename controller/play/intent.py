@@ -4,7 +4,7 @@ The interface between the meaning of touches and their playback. All other conta
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
@@ -28,6 +28,9 @@ NO_CONTACTS = "no contact on the plate"
 
 Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]; equal ones stand for the nearest that a table has."""
+
+Gains = Mapping[tuple[ContactKey, bool], float]
+"""Strengths [dB], 0 at most, of what is felt by a contact, and whether that is a short pulse."""
 
 _TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 
@@ -104,13 +107,15 @@ class HapticIntent:
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
     none. until: when [s] the intent may change though no contact has. protected: contacts that must
-    not notice the contents of others.
+    not notice the contents of others. gains_db: by which what is chosen for targets is played
+    weaker.
     """
 
     targets: tuple[Target, ...]
     reason: str = "no target"
     until: float = math.inf
     protected: frozenset[ContactKey] = frozenset()
+    gains_db: Gains = field(default_factory=dict)
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""

@@ -132,11 +132,7 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        contact, placed, voices = own[0][0], found.placement(layer), [layer]
-        if layer.side_bands:
-            voices = [
-                replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations
-            ]
+        contact, placed, voices = own[0][0], found.placement(layer), layer.voices
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None

@@ -22,7 +22,7 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
 from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.strength import Limits
+from model.answer.answer import Limits
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle

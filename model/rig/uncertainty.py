@@ -15,7 +15,10 @@ BOUNDS = {
     "common_gain": (0.0, 0.5),
     "field": (0.0, 0.5),
 }
-"""Of each parameter of an `Uncertainty`: exactly known, and the most for which answers are made."""
+"""What a rig may state of each parameter: exactly known, and the most."""
+
+MAX_UNCERTAINTY = 1000.0
+"""Of any of them, also in a study of plates beyond BOUNDS."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,9 @@ class Uncertainty:
     field: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse values beyond BOUNDS."""
-        for key, bounds in BOUNDS.items():
-            expect_between(getattr(self, key), *bounds, what=f"uncertainty: {key}")
+        """Refuse values that are not finite, negative ones, and a factor below 1."""
+        for key, (exact, _) in BOUNDS.items():
+            expect_between(getattr(self, key), exact, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
 
     @classmethod
     def none(cls) -> "Uncertainty":
@@ -51,7 +54,7 @@ class Uncertainty:
 
     @classmethod
     def clipped(cls, **estimates: float) -> "Uncertainty":
-        """Estimates of a fit, each brought within BOUNDS."""
+        """An uncertainty by estimates, each brought within BOUNDS."""
         return cls(
             **{
                 key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])

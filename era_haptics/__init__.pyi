@@ -20,6 +20,10 @@ from era_haptics.pictures import draw_answer as draw_answer
 from era_haptics.pictures import draw_contrast_map as draw_contrast_map
 from era_haptics.pictures import draw_map as draw_map
 from era_haptics.pictures import draw_playback as draw_playback
+from era_haptics.rigs import Era as Era
+from era_haptics.rigs import Plate as Plate
+from era_haptics.rigs import rig as rig
+from era_haptics.rigs import save_rig as save_rig
 from era_haptics.solved_plate import SolvedPlate as SolvedPlate
 from era_haptics.tables import answer as answer
 from era_haptics.tables import contrast_map as contrast_map

@@ -45,6 +45,8 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()
+    if mesh is not None:
+        document = Document(document.source, "", document.data | {"mesh": mesh}, {})
     plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     everything = {
@@ -84,6 +86,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             for name, amplifier in section.amplifiers.items()
             if amplifier.full_level == "output"
         ),
+        document=document,
     )
 
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
+from model.arguments import shown
 from model.errors import InputError
 from model.version import code_version
 
@@ -17,12 +18,12 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def check_address(address: str) -> None:
+def check_address(address: object) -> None:
     """Raise InputError for what is not the address of a scheduler."""
-    if not _ADDRESS.fullmatch(address):
+    if not (isinstance(address, str) and _ADDRESS.fullmatch(address)):
         raise InputError(
-            f"--cluster must be the address that `dask scheduler` prints, for example "
-            f"tcp://192.168.1.5:8786, got {address[:60]!r}"
+            f"cluster must be the address that `dask scheduler` prints, for example "
+            f"tcp://192.168.1.5:8786, got {shown(address)}"
         )
 
 
@@ -42,7 +43,7 @@ def on_cluster(
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:
         raise InputError(
-            "--cluster needs Dask, which is not installed; install it in a checkout with  "
+            "cluster needs Dask, which is not installed; install it in a checkout with  "
             "pip install -e '.[cluster]'"
         ) from error
     try:

@@ -1,7 +1,7 @@
 """Check of a surface layout on the plate of a table: how every region will feel."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from controller.effects.band import band_problem
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.region import Region
 from controller.play.intent import Target
+from model.progress import Progress, unseen
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
@@ -103,7 +104,7 @@ def check_layout(
     layout: SurfaceLayout,
     table: LocalizationTable,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[CheckedEffect]:
     """Simulate touches over every region of a layout, alone and with a resting second finger.
 

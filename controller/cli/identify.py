@@ -4,7 +4,7 @@ Also how commands measure it.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +14,7 @@ import typer
 from model.commands.fitted_rig_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
 from model.commands.options import JsonOption
 from model.errors import InputError
+from model.progress import Progress, unseen
 
 if TYPE_CHECKING:
     from model.config.document import Document
@@ -144,7 +145,8 @@ def identify(
             )
     started = time.perf_counter()
     try:
-        found = fit(rig, measured.measurement, seed=seed)
+        with shown_progress("fits", is_shown=not as_json) as progress:
+            found = fit(rig, measured.measurement, seed=seed, progress=progress)
     except InputError as error:
         typer.echo(f"era: {error}; no rig is written", err=True)
         raise typer.Exit(NO_FIT) from error
@@ -240,21 +242,19 @@ def measured_by_amplifiers(
     at = _urls_of(rig, urls)
 
     async def measure() -> "MeasuredPlate":
-        with shown_progress("steps", is_shown=is_shown) as on_step:
+        with shown_progress("steps", is_shown=is_shown) as progress:
             return await PlateSelfMeasurement(
-                rig, Lines, at, level=level, is_quick=is_quick, on_step=on_step
+                rig, Lines, at, level=level, is_quick=is_quick, progress=progress
             ).run()
 
     return asyncio.run(measure())
 
 
-def shown_progress(
-    unit: str, *, is_shown: bool
-) -> AbstractContextManager[Callable[[int, int], None]]:
+def shown_progress(unit: str, *, is_shown: bool) -> AbstractContextManager[Progress]:
     """A progress bar of units in plural, or nothing, which yields its update(done, total)."""
     from model.commands.options import progress_bar
 
-    return progress_bar(unit) if is_shown else nullcontext(lambda done, total: None)
+    return progress_bar(unit) if is_shown else nullcontext(unseen)
 
 
 def _urls_of(rig: "Rig", texts: Sequence[str]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from model.commands.fitted_rig_cli import check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument, progress_bar
 from model.counting import counted
 from model.files.replacing import check_picture
 
@@ -55,7 +55,8 @@ def calibrate(
     responses = responses_of(read_measured(measured_file), rig)
     started = time.perf_counter()
     screened = check_consistency(rig, responses)
-    calibration = fit(rig, responses, screened, all_scales=all_scales)
+    with progress_bar("fits") as progress:
+        calibration = fit(rig, responses, screened, all_scales=all_scales, progress=progress)
     elapsed = time.perf_counter() - started
     rows = calibration_report.change_rows(calibration)
     notes = [

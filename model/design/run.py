@@ -5,7 +5,7 @@ A layout is judged by the answers of its localization table to fresh contact set
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
@@ -22,6 +22,7 @@ from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.processes import on_processes
+from model.progress import Progress, unseen
 from model.rig.rig import Rig
 from model.structure.support import support_problem
 from model.table.build import build_table
@@ -174,21 +175,15 @@ class Design:
         return max((self.best.mean_db - each.mean_db for each in self.starts), default=0.0)
 
 
-@contextmanager
-def _unseen(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Progress that is not shown."""
-    yield lambda done, total: None
-
-
 @dataclass(frozen=True)
 class Runner:
     """Solves tasks on machines.
 
-    progress: shows what is being done; yields an update(done, total).
+    progress: of a stage by the name of its tasks.
     """
 
     machines: Machines = _HERE
-    progress: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = _unseen
+    progress: Callable[[str], AbstractContextManager[Progress]] = lambda what: nullcontext(unseen)
 
     def run(
         self, what: str, solve: Callable[[Any, Any], Any], shared: object, tasks: Sequence[Any]

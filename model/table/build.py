@@ -16,6 +16,7 @@ from model.files.array_file import Arrays
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.processes import on_processes
+from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json
@@ -99,6 +100,7 @@ def build_table(
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Build the localization table of a rig.
 
@@ -107,7 +109,8 @@ def build_table(
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
-    return solve_table(TableProblem(rig, frequencies, grid), drive_mode=drive_mode)
+    problem = TableProblem(rig, frequencies, grid)
+    return solve_table(problem, drive_mode=drive_mode, progress=progress)
 
 
 def solve_table(
@@ -115,7 +118,7 @@ def solve_table(
     *,
     drive_mode: str,
     workers: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Solve modes and discretisation error by several processes.
 

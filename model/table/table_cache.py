@@ -9,6 +9,7 @@ from model.arrays import FloatArray
 from model.cache_folder import cache_folder
 from model.errors import InputError
 from model.finger.grid import Grid
+from model.progress import Progress, unseen
 from model.rig.rig import Rig
 from model.table.build import TableProblem, solve_table
 from model.table.file import FORMAT_VERSION, load_table, save_table
@@ -28,6 +29,7 @@ def cached_table(
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
+    progress: Progress = unseen,
 ) -> tuple[LocalizationTable, Path | None]:
     """Return a rig's table from the user's cache folder, built if it is not there, and its file.
 
@@ -41,7 +43,7 @@ def cached_table(
         folder = cache_folder()
     except OSError as error:
         _logger.warning("table cache: table not kept for the next run: %s", error)
-        return solve_table(problem, drive_mode=drive_mode), None
+        return solve_table(problem, drive_mode=drive_mode, progress=progress), None
     path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
     try:
         table = load_table(path, rig=rig)
@@ -52,7 +54,7 @@ def cached_table(
         with suppress(OSError):
             os.utime(path)
         return table, path
-    table = solve_table(problem, drive_mode=drive_mode)
+    table = solve_table(problem, drive_mode=drive_mode, progress=progress)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         save_table(table, path)

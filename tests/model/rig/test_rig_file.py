@@ -333,7 +333,7 @@ def test_load_rig_reads_masses_and_fingerprints_them(tmp_path: Path) -> None:
 
 
 def test_load_rig_reads_uncertainty(tmp_path: Path) -> None:
-    """A key left out has the value of a plate that was not measured; 0, of a factor 1, means exact."""
+    """A key left out has the value of a plate that was not measured; 0, or a factor 1, is exact."""
     built = Uncertainty(
         gain=0.05, phase_deg=5, thickness=0.02, stiffness=0.1, damping=1.5, fingertip=0.5
     )

@@ -25,6 +25,10 @@ _OF_THEORY = {"length", "width", "thickness", "material", "layers", "bond", "air
 """Keys of a plate that decide the modes to which its `modes` are relative."""
 
 
+_SECTIONS = RigSection.model_fields.keys() - {"plate"}
+"""Keys that are given as a whole."""
+
+
 def plain_data(value: Any) -> Any:
     """Keys that a program gives as data of a file: without None, dataclasses and arrays."""
     if is_dataclass(value) and not isinstance(value, type):
@@ -45,7 +49,7 @@ def keys_of(source: str, keys: Mapping[str, Any]) -> Document:
 
 def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
     """Make a rig with other keys, see `Rig.replaced`."""
-    whole = {key: value for key, value in changes.items() if key in RigSection.model_fields}
+    whole = {key: value for key, value in changes.items() if key in _SECTIONS}
     data: dict[str, Any] = {**stated(rig).data, **whole}
     of_plate = {key: value for key, value in changes.items() if key not in whole}
     if data["plate"].get("modes") and _OF_THEORY & of_plate.keys() and "modes" not in of_plate:

@@ -1,7 +1,6 @@
 """Checks of arguments that several functions take: positions of fingers, loads, frequencies."""
 
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,7 +8,6 @@ import numpy as np
 from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray, Point
 from model.errors import InputError
-from model.progress import Progress, unseen
 from model.rig.rig import Rig
 
 Positions: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
@@ -21,24 +19,11 @@ def expect_rig(value: object) -> None:
     expect(value, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
 
 
-def as_progress(given: Progress | None) -> Progress:
-    """What is called with what is done and all; nothing for None."""
-    if not (given is None or callable(given)):
-        raise InputError(f"progress must be a function of done and total, got {shown(given)}")
-    return given or unseen
-
-
 def as_frequencies(given: object) -> FloatArray:
     """Frequencies (f,) [Hz] in the order given."""
     return _row(
         given, "frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10)"
     )
-
-
-def as_stiffnesses(given: object) -> tuple[float, ...]:
-    """One stiffness [N/m], or several."""
-    rule = "stiffness must be a number of N/m, or several, such as [10e3, 17e3]"
-    return tuple(_row([given] if isinstance(given, Real) else given, rule).tolist())
 
 
 def as_loads(given: object) -> tuple[float, ...]:

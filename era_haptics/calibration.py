@@ -2,19 +2,19 @@
 
 from pathlib import Path
 
-from era_haptics.arguments import as_progress, expect_rig
+from era_haptics.arguments import expect_rig
 from model.arguments import expect_path
 from model.calibration.calibrate import calibrate as fit
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
 from model.diagnosis.consistency import check_consistency
-from model.progress import Progress
+from model.progress import Progress, check_progress, unseen
 from model.rig.rig import Rig
 
 
 def calibrate(
-    rig: Rig, measured: Path | str, *, all_scales: bool = False, progress: Progress | None = None
+    rig: Rig, measured: Path | str, *, all_scales: bool = False, progress: Progress = unseen
 ) -> Calibration:
     """Fit a rig to measured responses, a .csv, .uff or .unv file, as `era calibrate` does.
 
@@ -24,6 +24,7 @@ def calibrate(
     that are not what they claim, by their cause.
     """
     expect_rig(rig)
+    check_progress(progress)
     responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
-    screened, update = check_consistency(rig, responses), as_progress(progress)
-    return fit(rig, responses, screened, all_scales=all_scales, progress=update)
+    screened = check_consistency(rig, responses)
+    return fit(rig, responses, screened, all_scales=all_scales, progress=progress)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import TypeAlias, cast
 
-from era_haptics.arguments import Positions, as_frequencies, as_points, as_progress, expect_rig
+from era_haptics.arguments import Positions, as_frequencies, as_points, expect_rig
 from model.answer.answer import Answer
 from model.answer.fingers import MUST, Finger, Stimulus
 from model.answer.measures import Measures
@@ -17,7 +17,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
-from model.progress import Progress
+from model.progress import Progress, check_progress, unseen
 from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
 from model.table.table import PAPER_GRID, LocalizationTable
@@ -33,7 +33,7 @@ def table(
     drive_mode: str = "switched",
     frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
-    progress: Progress | None = None,
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Load the rig's localization table from the user's cache, or build it in a second or two.
 
@@ -46,10 +46,10 @@ def table(
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
     chosen = None if frequencies is None else as_frequencies(frequencies)
-    update = as_progress(progress)
-    return cached_table(rig, frequencies=chosen, grid=grid, drive_mode=drive_mode, progress=update)[
-        0
-    ]
+    check_progress(progress)
+    return cached_table(
+        rig, frequencies=chosen, grid=grid, drive_mode=drive_mode, progress=progress
+    )[0]
 
 
 def query(
@@ -131,7 +131,7 @@ def contrast_map(
     drive_modes: Sequence[str] = (),
     level_db_sl: float = STRONG_DB_SL,
     grid: Grid | None = None,
-    progress: Progress | None = None,
+    progress: Progress = unseen,
 ) -> ContrastMap:
     """Map the contrast of a finger at every place to these quiet fingers [m], as `era table map`.
 
@@ -146,13 +146,14 @@ def contrast_map(
         expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     for mode in drive_modes:
         _expect_mode(mode)
+    check_progress(progress)
     return map_contrast(
         table,
         as_points(quiet, what="quiet"),
         drive_modes=drive_modes,
         level_db_sl=float(level_db_sl),
         grid=grid,
-        progress=as_progress(progress),
+        progress=progress,
     )
 
 

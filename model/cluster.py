@@ -18,15 +18,6 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def check_address(address: object) -> None:
-    """Raise InputError for what is not the address of a scheduler."""
-    if not (isinstance(address, str) and _ADDRESS.fullmatch(address)):
-        raise InputError(
-            f"cluster must be the address that `dask scheduler` prints, for example "
-            f"tcp://192.168.1.5:8786, got {shown(address)}"
-        )
-
-
 def on_cluster(
     address: str,
     solve: Callable[[Shared, Task], Result],
@@ -39,6 +30,11 @@ def on_cluster(
     shared: its first argument. A task whose worker is lost is solved again. Raises InputError where
     no scheduler answers, it has no workers, or one runs other code.
     """
+    if not _ADDRESS.fullmatch(str(address)):
+        raise InputError(
+            f"cluster must be the address that `dask scheduler` prints, for example "
+            f"tcp://192.168.1.5:8786, got {shown(address)}"
+        )
     try:
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:

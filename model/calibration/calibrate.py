@@ -35,7 +35,6 @@ from model.rig.rig import Rig
 
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
-_FITS = 3  # with all scales free, of what is identified, without held-out sensors
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
@@ -70,7 +69,7 @@ def calibrate(
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     fit = _with_median_scale_one(part, solve(part, start))
-    progress(1, _FITS)
+    progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
     free_scales = part.free_scales
     if not all_scales:
         scales, error = part.scales(fit.z), part.scale_errors(fit)
@@ -79,7 +78,7 @@ def calibrate(
     problem, found = _identified(replace(part, free_scales=free_scales), fit)
     if all_scales:
         found = _with_median_scale_one(problem, found)
-    progress(2, _FITS)
+    progress(2, 3)
     _check_sides(problem, found)
     _check_outliers(problem, found)
     report = _report(
@@ -89,7 +88,7 @@ def calibrate(
         dead_sensors=tuple(compress(responses.sensors, dead)),
         dead_eras=tuple(compress((era.name for era in rig.eras), dead_eras)),
     )
-    progress(_FITS, _FITS)
+    progress(3, 3)
     return report
 
 

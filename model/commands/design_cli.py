@@ -88,33 +88,35 @@ def design(
     """Find or rank places of ERAs for the best promised contrast."""
     from model.config.document import read_document
     from model.design.outcome import summary, write_design
-    from model.design.request import find_design, machines_of
-    from model.design.run import Runner
+    from model.design.request import design as find
     from model.rig.file import rig_of
 
-    machines = machines_of(cluster, workers, default=2)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
-    counts = _counts(eras or str(len(rig.eras)))
+    counts = _counts(eras) if eras else None
     distance = _quantity(apart, LENGTH, "--apart")
+    springs = [_quantity(each, STIFFNESS, "--stiffness") for each in _listed(stiffness)]
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    found = find_design(
-        rig,
-        counts,
-        layouts=layouts,
-        keep=_listed(keep),
-        where=where,
-        contacts=contacts,
-        contents=contents,
-        apart=distance,
-        lowest=lowest,
-        stiffnesses=[_quantity(each, STIFFNESS, "--stiffness") for each in _listed(stiffness)],
-        finalists=finalists,
-        starts=starts,
-        seed=seed,
-        runner=Runner(machines, progress_bar),
-    )
+    with progress_bar("tasks") as progress:
+        found = find(
+            rig,
+            counts,
+            layouts=layouts or None,
+            keep=_listed(keep),
+            where=where,
+            contacts=contacts,
+            contents=contents,
+            apart=distance,
+            lowest=lowest,
+            stiffness=springs,
+            finalists=finalists,
+            starts=starts,
+            seed=seed,
+            workers=workers or (None if cluster else 2),
+            cluster=cluster,
+            progress=progress,
+        )
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
     _warn_of_light(result["eras"])

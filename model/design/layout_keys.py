@@ -4,19 +4,21 @@ from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
-from model.design.run import Layout
+from model.arrays import FloatArray
+from model.design.problem import DesignProblem
 from model.rig.rig import Channel, Rig
 
 MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
 
 
-def layout_keys(layout: Layout, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Data of a rig file with the ERAs of a layout, on free channels; data: of the rig's file.
+def layout_keys(
+    problem: DesignProblem, positions: FloatArray, data: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Data of a rig file with ERAs at positions [m], on free channels; data: of the rig's file.
 
     Amplifiers that are missing are added, simulated.
     """
-    problem = layout.problem
     rig = problem.rig
     before, amplifiers = data["eras"], data["amplifiers"]
     channels = iter(_free_channels(rig, problem.kept, count=problem.count))
@@ -25,7 +27,7 @@ def layout_keys(layout: Layout, data: Mapping[str, Any]) -> dict[str, Any]:
     for name, mount in zip(rig.supports, mounts, strict=True):
         eras[name] = _damped(before[name], mount.damping)
     used = {}
-    for era in problem.eras(layout.found.positions):
+    for era in problem.eras(positions):
         if era.name in problem.kept:
             eras[era.name] = _damped(before[era.name], era.damping)
             continue

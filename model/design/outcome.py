@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from model.config.document import Value
 from model.config.editing import data_text
 from model.design.layout_keys import layout_keys
-from model.design.run import Design, Layout
+from model.design.run import Design, RankedLayout
 from model.figures import save_figure
 from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.files.array_file import whole_or_nothing
@@ -36,7 +36,7 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     return [rig, table, *(folder / name for name in pictures)]
 
 
-def _columns(layouts: Sequence[Layout]) -> Columns:
+def _columns(layouts: Sequence[RankedLayout]) -> Columns:
     """A row for each layout, in the order of their ranks."""
     rows = [_row(each) for each in layouts]
     at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
@@ -45,23 +45,22 @@ def _columns(layouts: Sequence[Layout]) -> Columns:
     return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
 
 
-def _row(layout: Layout) -> dict[str, Any]:
+def _row(layout: RankedLayout) -> dict[str, Any]:
     """A layout for JSON."""
-    found = layout.found
-    eras = layout.problem.eras(found.positions)
+    eras = layout.eras
     return {
         "layout": layout.name,
         "at_m": {era.name: [era.x, era.y] for era in eras},
         "stiffness_n_m": eras[-1].stiffness,
-        "supported": found.is_supported,
-        "expected_contrast_db": found.score_db if found.is_supported else None,
+        "supported": layout.found.is_supported,
+        "expected_contrast_db": layout.expected_contrast,
         "contrast_db": layout.judged.summary if layout.judged else None,
     }
 
 
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     """The text of the rig's file with the ERAs of the best layout, on free channels."""
-    keys = layout_keys(design.best, data)
+    keys = layout_keys(design.problem, design.best.found.positions, data)
     added = [name for name in keys["amplifiers"] if name not in design.problem.rig.amplifiers]
     comment = (
         f"# Designed for contrast: {design.problem.count} ERAs, "
@@ -75,8 +74,7 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
 def summary(design: Design) -> dict[str, Any]:
     """The design for JSON."""
     problem, best = design.problem, design.best
-    eras = problem.eras(best.found.positions)
-    rig = problem.rig
+    eras, rig = best.eras, problem.rig
     loads = static_loads(rig.plate, eras, loads=rig.masses)
     lowest = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
     return {
@@ -113,7 +111,7 @@ def contrast_figure(design: Design) -> Figure:
     """Promised felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
-    eras = design.problem.eras(design.best.found.positions)
+    eras = design.best.eras
     ratio = plate.width / plate.length
     kinds = judged.kinds
     figure = Figure(figsize=(3.4 * len(kinds) + 1, 3.0 * ratio + 1.2), layout="compressed")

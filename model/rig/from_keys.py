@@ -1,79 +1,143 @@
-"""Rigs by the keys of a rig file that a program gives: made, changed, and as text.
+"""Rigs by the keys of a rig file that a program gives: made, changed, and written.
 
 A rig keeps the keys that it was made of, so that what follows from one follows its change: the
 damping of a ratio, a mesh that is chosen, the homogeneous plate that a laminate is like.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
 
+from pydantic_core import to_jsonable_python
+
+from model.arguments import expect, expect_path
 from model.config.document import Document, parse_document
 from model.config.editing import data_text
-from model.config.sections import Validation
+from model.config.sections import Section, Validation
 from model.config.units import LENGTH, quantity
 from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+from model.files.replacing import check_ending
 from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
-from model.rig.sections import PlateSection, RigSection
+from model.rig.sections import EraSection, PlateSection, RigSection
 
-_REWRITTEN = {"plate", "mesh", "eras", "masses", "laminate", "uncertainty"}
-"""Fields of a rig that the text of a fitted one states."""
+_SECTIONS = RigSection.model_fields.keys() - {"plate"}
+"""Keys that are changed as a whole."""
 
 _OF_THEORY = {"length", "width", "thickness", "material", "layers", "bond", "air_gap"}
 """Keys of a plate that decide the modes to which its `modes` are relative."""
 
-
-_SECTIONS = RigSection.model_fields.keys() - {"plate"}
-"""Keys that are given as a whole."""
-
-
-def plain_data(value: Any) -> Any:
-    """Keys that a program gives as data of a file: without None, dataclasses and arrays."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {str(key): plain_data(each) for key, each in value.items() if each is not None}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain_data(each) for each in value]
-    return value
+_REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
+"""Fields of a rig that the text of a fitted one states."""
 
 
-def keys_of(source: str, keys: Mapping[str, Any]) -> Document:
-    """The document of keys that a program gives; source: what it calls with them."""
-    return Document(source, "", plain_data(keys), {})
+class _Keys(dict[str, Any]):
+    """Keys of a section of a rig file."""
+
+    _section: ClassVar[type[Section]]
+
+    def __init__(self, **keys: Any) -> None:
+        super().__init__(_document(f"era.{type(self).__name__}", keys, self._section).data)
+
+
+class Plate(_Keys):
+    """A plate by the keys of `plate` in a rig file, values with units or SI numbers.
+
+    `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
+    ConfigError, an InputError, with all problems.
+    """
+
+    _section = PlateSection
+
+
+class Era(_Keys):
+    """An ERA by the keys below `eras` in a rig file.
+
+    `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
+    """
+
+    _section = EraSection
+
+
+def rig(
+    plate: Mapping[str, Any],
+    eras: Mapping[str, Mapping[str, Any]],
+    *,
+    amplifiers: Mapping[str, Mapping[str, Any]],
+    masses: Mapping[str, Mapping[str, Any]] | None = None,
+    mesh: str | None = None,
+    limits: Mapping[str, Any] | None = None,
+    uncertainty: Any = None,
+    fingertip: Any = None,
+    threshold: str | None = None,
+) -> Rig:
+    """Make a rig of a `Plate` and an `Era` for each name, as of a file with these sections.
+
+    amplifiers: `{"main": {"url": "sim://"}}`; uncertainty, fingertip: also an `Uncertainty` and a
+    `Fingertip`, `"none"` for weightless ones. What is left out has the file's default. Raises
+    ConfigError with all problems, by argument and key.
+    """
+    sections = {
+        "plate": plate,
+        "eras": eras,
+        "amplifiers": amplifiers,
+        "masses": masses,
+        "mesh": mesh,
+        "limits": limits,
+        "uncertainty": uncertainty,
+        "fingertip": fingertip,
+        "threshold": threshold,
+    }
+    return rig_of(_document("era.rig", sections))
+
+
+def save_rig(rig: Rig, path: Path | str) -> None:
+    """Write a rig file that reads back as this rig: its file's text, or its keys.
+
+    Of a fitted rig, as of `calibrate`, the values are rounded to six digits. Raises InputError for
+    a rig that no file states, OSError if the file cannot be written.
+    """
+    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    place, document = expect_path(path, what="path"), stated(rig)
+    check_ending(place, ".yaml", ".yml", what="a rig file")
+    text = document.text or data_text(document.data)
+    rig_of(parse_document(str(place), text))
+    with whole_or_nothing(place) as stream:
+        stream.write(text.encode())
 
 
 def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
     """Make a rig with other keys, see `Rig.replaced`."""
-    whole = {key: value for key, value in changes.items() if key in _SECTIONS}
-    data: dict[str, Any] = {**stated(rig).data, **whole}
-    of_plate = {key: value for key, value in changes.items() if key not in whole}
-    if data["plate"].get("modes") and _OF_THEORY & of_plate.keys() and "modes" not in of_plate:
+    data: dict[str, Any] = {**stated(rig).data}
+    plate = {**data["plate"], **{k: v for k, v in changes.items() if k not in _SECTIONS}}
+    if plate.get("modes") and _OF_THEORY & changes.keys() and "modes" not in changes:
         raise InputError(
             "rig.replaced: plate.modes must be given with another plate, got those identified on "
             "this one; modes=None for the theory's"
         )
-    data = plain_data({**data, "plate": {**data["plate"], **of_plate}})
-    document = Document("rig.replaced", "", data, {})
-    validation = Validation(document, RigSection)
-    sides = {"length": rig.plate.length, "width": rig.plate.width}
-    read = {key: validation.field(("plate", key), PlateSection) for key in sides}
-    factors = [(read[key] or own) / own for key, own in sides.items()]
-    for kind in {"eras", "masses"} - whole.keys() if factors != [1, 1] else ():
-        for section in data.get(kind, {}).values():
-            at = zip(factors, section["at"], strict=True)
-            section["at"] = [factor * quantity(place, LENGTH) for factor, place in at]
+    data |= {key: changes[key] for key in _SECTIONS & changes.keys()}
+    document = _document("rig.replaced", data | {"plate": _given(plate)})
+    read, sides = Validation(document, RigSection).field, (rig.plate.length, rig.plate.width)
+    wanted = (read(("plate", key), PlateSection) for key in ("length", "width"))
+    factors = [(new or own) / own for new, own in zip(wanted, sides, strict=True)]
+    moved: Any = document.data if factors != [1, 1] else {}
+    for section in (
+        each
+        for kind in {"eras", "masses"} & moved.keys() - changes.keys()
+        for each in moved[kind].values()
+    ):
+        at = zip(factors, section["at"], strict=True)
+        section["at"] = [factor * quantity(place, LENGTH) for factor, place in at]
     return rig_of(document)
 
 
 def stated(rig: Rig) -> Document:
     """A document that states a rig; raises InputError for one that was not made of keys.
 
-    Of a rig that was fitted those of its plate, ERAs, masses and uncertainty, rounded.
+    Of a rig that was fitted it has the plate, ERAs, masses and uncertainty, rounded.
     """
     document = rig.document
     if document is None:
@@ -81,21 +145,31 @@ def stated(rig: Rig) -> Document:
     before = rig_of(document)
     if before == rig:
         return document
-    text = rewritten_text(
-        parse_document(document.source, document.text or data_text(document.data)),
-        before,
-        rig,
-        comment="Fitted",
+    source, text = document.source, document.text or data_text(document.data)
+    fitted = rewritten_text(parse_document(source, text), before, rig, comment="Fitted")
+    document = parse_document(source, fitted)
+    if replace(rig_of(document), **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
+        raise InputError(
+            "rig must have other plate, ERAs, masses and uncertainty than its keys alone; change "
+            "others by rig.replaced"
+        )
+    return document
+
+
+def _document(
+    source: str, keys: Mapping[str, Any], section: type[Section] | None = None
+) -> Document:
+    """The keys that a program gives, as data of a file; checked as those of a section, if given."""
+    data = to_jsonable_python(
+        _given(keys),
+        fallback=lambda each: each.tolist() if hasattr(each, "tolist") else repr(each),
     )
-    made = parse_document(document.source, text)
-    back = rig_of(made)
-    for name in (each.name for each in fields(rig) if each.compare):
-        if name not in _REWRITTEN and getattr(back, name) != getattr(rig, name):
-            raise InputError(f"rig must have the {name} of its file; use rig.replaced")
-    return made
+    document = Document(source, "", data, {})
+    if section is not None:
+        Validation(document, section).finish()
+    return document
 
 
-def rig_text(rig: Rig) -> str:
-    """The text of a rig's file: as it was read, or its keys."""
-    document = stated(rig)
-    return document.text or data_text(document.data)
+def _given(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys that are not left out."""
+    return {key: value for key, value in keys.items() if value is not None}

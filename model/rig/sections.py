@@ -275,8 +275,7 @@ class AmplifierSection(Section):
 
 def _within(key: str) -> Quantity:
     """The bounds of a parameter of an `Uncertainty`."""
-    least, most = BOUNDS[key]
-    return Quantity(RATIO, at_least=least, at_most=most)
+    return Quantity(RATIO, at_least=BOUNDS[key][0], at_most=BOUNDS[key][1])
 
 
 class UncertaintySection(Section):

@@ -1,7 +1,7 @@
 """How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from model.arguments import expect_between
 
@@ -65,11 +65,10 @@ class Uncertainty:
     @property
     def exactly_known(self) -> tuple[str, ...]:
         """Keys of the parameters that are taken as none, though a plate that is built has some."""
-        none, built = Uncertainty.none(), Uncertainty()
         return tuple(
             key
-            for key, value in asdict(self).items()
-            if value == getattr(none, key) != getattr(built, key)
+            for key, (exact, _) in BOUNDS.items()
+            if getattr(self, key) == exact != getattr(Uncertainty, key)
         )
 
     @property

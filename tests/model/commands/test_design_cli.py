@@ -189,10 +189,10 @@ def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
     names = ("--layouts", "random:10", "--finalists", "1", "--keep", "NE")
     assert design(*names, "--stiffness", "8 kN/m,30 kN/m", "-o", str(tmp_path)).exit_code == 0
     steps: list[tuple[int, int]] = []
-    best, *_ = era.design(
+    found = era.design(
         load_rig(RIG), layouts="random:10", finalists=1, keep=["NE"], stiffness=[8e3, 30e3],
         progress=lambda *done: steps.append(done),
     )  # fmt: skip
-    era.save_rig(best.rig, tmp_path / "best.yaml")
+    era.save_rig(found.best.rig, tmp_path / "best.yaml")
     assert load_rig(tmp_path / "best.yaml") == load_rig(tmp_path / "rig.yaml")
     assert steps[-1][0] == steps[-1][1] > 0

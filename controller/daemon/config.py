@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
@@ -83,6 +82,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 
 def daemon_config_of(document: Document) -> DaemonConfig:
     """Load what a daemon's file names; raises as `load_daemon_config`."""
+    from controller.api.place import default_socket  # not on Windows, where rigs are checked
+
     _check_kind(document)
     validation = Validation(document, DaemonSection)
     rig_file = file_of(document, "rig")

@@ -150,20 +150,17 @@ class RankedLayout:
 
     @property
     def contrast(self) -> float | None:
-        """Promised felt contrast [dB], mean over the numbers of quiet fingers, if it was judged."""
+        """Promised felt contrast [dB], mean over numbers of quiet fingers, if it was judged."""
         return None if self.judged is None else self.mean_db
 
     @property
     def expected_contrast(self) -> float | None:
-        """The score by which others are ranked [dB], None where it does not support the plate."""
+        """The score [dB] that ranks others, None where it does not support the plate."""
         return self.found.score_db if self.found.is_supported else None
 
     @property
     def rig(self) -> Rig:
-        """The rig with these ERAs on free channels, further amplifiers simulated.
-
-        As `era design` writes it. Raises InputError for a rig that no file states.
-        """
+        """The rig with these ERAs, as `era design` writes it: on free channels."""
         data = stated(self.problem.rig).data
         keys = layout_keys(self.problem, self.found.positions, data)
         return rig_of(Document("RankedLayout.rig", "", keys, {}))
@@ -190,7 +187,7 @@ class Design:
 
     @property
     def best(self) -> RankedLayout:
-        """That of the most contrast of as many ERAs as were sought."""
+        """The layout of the most contrast of as many ERAs as were sought."""
         return self.layouts[0]
 
     @property

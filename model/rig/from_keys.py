@@ -44,7 +44,7 @@ class _Keys(dict[str, Any]):
 
 
 class Plate(_Keys):
-    """A plate by the keys of `plate` in a rig file, values with units or SI numbers.
+    """A plate by the keys of `plate` in a rig file.
 
     `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
     ConfigError, an InputError, with all problems.
@@ -76,9 +76,9 @@ def rig(
 ) -> Rig:
     """Make a rig of a `Plate` and an `Era` for each name, as of a file with these sections.
 
-    amplifiers: `{"main": {"url": "sim://"}}`; uncertainty, fingertip: also an `Uncertainty` and a
-    `Fingertip`, `"none"` for weightless ones. What is left out has the file's default. Raises
-    ConfigError with all problems, by argument and key.
+    amplifiers: such as `{"main": {"url": "sim://"}}`; uncertainty, fingertip: also an `Uncertainty`
+    and a `Fingertip`. What is left out has the file's default. Raises ConfigError with all
+    problems, by argument and key.
     """
     sections = {
         "plate": plate,
@@ -97,8 +97,8 @@ def rig(
 def save_rig(rig: Rig, path: Path | str) -> None:
     """Write a rig file that reads back as this rig: its file's text, or its keys.
 
-    Of a fitted rig, as of `calibrate`, the values are rounded to six digits. Raises InputError for
-    a rig that no file states, OSError if the file cannot be written.
+    Values of a fitted rig, as of `calibrate`, are rounded. Raises InputError for a rig that no file
+    states, OSError if the file cannot be written.
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)

@@ -46,7 +46,7 @@ class Rig:
     of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
     threshold: name of the set of detection thresholds (`model.finger.perception`); outputs: the
     amplifiers whose full level is an output, to which bases move by their gains, not a motion;
-    document: what it was read from or made of.
+    document: its keys.
     """
 
     plate: Plate
@@ -100,10 +100,9 @@ class Rig:
     def replaced(self, **changes: Any) -> "Rig":
         """Make a rig with other keys: of its plate, as thickness=0.002, or whole sections.
 
-        What follows from them follows: damping by `damping_ratio`, a mesh `auto`, the homogeneous
-        plate of a laminate; ERAs and masses keep their share of the plate's sides. None leaves a
-        key out. Raises ConfigError with all problems, and InputError for `modes` that were
-        identified on another plate.
+        What follows from them follows: damping by `damping_ratio`, a mesh `auto`, a laminate's
+        equivalent plate; ERAs and masses keep their share of the sides. None leaves a key out.
+        Raises ConfigError with all problems, InputError for `modes` identified on another plate.
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made

@@ -32,14 +32,14 @@ def on_cluster(
     """
     if not _ADDRESS.fullmatch(str(address)):
         raise InputError(
-            f"cluster must be the address that `dask scheduler` prints, for example "
+            "--cluster must be the address that `dask scheduler` prints, for example "
             f"tcp://192.168.1.5:8786, got {shown(address)}"
         )
     try:
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:
         raise InputError(
-            "cluster needs Dask, which is not installed; install it in a checkout with  "
+            "--cluster needs Dask, which is not installed; install it in a checkout with  "
             "pip install -e '.[cluster]'"
         ) from error
     try:

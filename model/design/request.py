@@ -94,15 +94,17 @@ def design(
         expect_number(number, what=what, unit=unit)
     expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
     if not 0 < apart < max(rig.plate.length, rig.plate.width):
-        raise InputError(f"apart must be above 0 and below the plate's length, got {apart:g} m")
-    for name in keep:
-        rig.era(name)
-    if len(set(keep)) < len(keep) or len(keep) > min(counts):
-        raise InputError(f"keep must be at most {min(counts)} different ERAs, got {shown(keep)}")
+        raise InputError(f"--apart must be above 0 and below the plate's length, got {apart:g} m")
+    own = [era.name for era in rig.eras]
+    if any(each not in own or keep.count(each) > 1 for each in keep) or len(keep) > min(counts):
+        raise InputError(
+            f"--keep must be up to {min(counts)} different ERAs of the rig, {', '.join(own)}, got "
+            f"{', '.join(map(str, keep))}"
+        )
     tried = sorted({float(each) for each in stiffness if 0 < each < math.inf})
     if len(tried) < len(stiffness) or len(tried) > MAX_STIFFNESSES:
         raise InputError(
-            f"stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
+            f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
             f"{', '.join(f'{each:g}' for each in stiffness)}"
         )
     path = None if contacts is None else expect_path(contacts, what="contacts")
@@ -116,7 +118,7 @@ def design(
         for each in (tried or (None,))
     ]
     if cluster is not None and workers is not None:
-        raise InputError("only one of workers and cluster can be given")
+        raise InputError("only one of --workers and --cluster can be given")
     machines: Machines = (
         partial(on_processes, workers or 1) if cluster is None else partial(on_cluster, cluster)
     )

@@ -124,5 +124,8 @@ def design(
     )
     if layouts is None:
         return search_layouts(problems, starts=starts, runner=Runner(machines, progress))
-    given = supported_layouts(str(expect_path(layouts, what="layouts")), problems)
-    return rank_layouts(given, finalists=finalists, runner=Runner(machines, progress))
+    return rank_layouts(
+        supported_layouts(str(expect_path(layouts, what="layouts")), problems),
+        finalists=finalists,
+        runner=Runner(machines, progress),
+    )

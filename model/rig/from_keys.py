@@ -40,7 +40,9 @@ class _Keys(dict[str, Any]):
     _section: ClassVar[type[Section]]
 
     def __init__(self, **keys: Any) -> None:
-        super().__init__(_document(f"era.{type(self).__name__}", keys, self._section).data)
+        document = _document(f"era.{type(self).__name__}", keys)
+        Validation(document, self._section).finish()
+        super().__init__(document.data)
 
 
 class Plate(_Keys):
@@ -103,10 +105,10 @@ def save_rig(rig: Rig, path: Path | str) -> None:
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)
     check_ending(place, ".yaml", ".yml", what="a rig file")
-    text = document.text or data_text(document.data)
-    rig_of(parse_document(str(place), text))
+    written = parse_document(str(place), document.text or data_text(document.data))
+    rig_of(written)
     with whole_or_nothing(place) as stream:
-        stream.write(text.encode())
+        stream.write(written.text.encode())
 
 
 def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
@@ -129,8 +131,9 @@ def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
         for kind in {"eras", "masses"} & moved.keys() - changes.keys()
         for each in moved[kind].values()
     ):
-        at = zip(factors, section["at"], strict=True)
-        section["at"] = [factor * quantity(place, LENGTH) for factor, place in at]
+        section["at"] = [
+            f * quantity(x, LENGTH) for f, x in zip(factors, section["at"], strict=True)
+        ]
     return rig_of(document)
 
 
@@ -142,12 +145,11 @@ def stated(rig: Rig) -> Document:
     document = rig.document
     if document is None:
         raise InputError("rig must be read from a file or made by era.rig, got one without keys")
-    before = rig_of(document)
-    if before == rig:
+    if rig_of(document) == rig:
         return document
-    source, text = document.source, document.text or data_text(document.data)
-    fitted = rewritten_text(parse_document(source, text), before, rig, comment="Fitted")
-    document = parse_document(source, fitted)
+    before = parse_document(document.source, document.text or data_text(document.data))
+    text = rewritten_text(before, rig_of(document), rig, comment="Fitted")
+    document = parse_document(document.source, text)
     if replace(rig_of(document), **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
         raise InputError(
             "rig must have other plate, ERAs, masses and uncertainty than its keys alone; change "
@@ -156,18 +158,17 @@ def stated(rig: Rig) -> Document:
     return document
 
 
-def _document(
-    source: str, keys: Mapping[str, Any], section: type[Section] | None = None
-) -> Document:
-    """The keys that a program gives, as data of a file; checked as those of a section, if given."""
-    data = to_jsonable_python(
-        _given(keys),
-        fallback=lambda each: each.tolist() if hasattr(each, "tolist") else repr(each),
+def _document(source: str, keys: Mapping[str, Any]) -> Document:
+    """The keys that a program gives, as data of a file."""
+    return Document(
+        source,
+        "",
+        to_jsonable_python(
+            _given(keys),
+            fallback=lambda each: each.tolist() if hasattr(each, "tolist") else repr(each),
+        ),
+        {},
     )
-    document = Document(source, "", data, {})
-    if section is not None:
-        Validation(document, section).finish()
-    return document
 
 
 def _given(keys: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Rigs made in Python: as those of files, changed with what follows, written and read back."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,3 +115,17 @@ def test_errors_name_the_argument_as_a_file_its_key(make, named: list[str]) -> N
 
 
 RIG = era.rig(SHEET, SPRINGS, amplifiers=MAIN)
+
+
+def test_fitted_rig_is_saved_and_changed_but_not_another(tmp_path: Path) -> None:
+    """Of values that a calibration changes; without the finger of its keys a rig is another one."""
+    plate = replace(RIG.plate, material=replace(RIG.plate.material, E=72.5e9))
+    fitted = replace(RIG, plate=plate, uncertainty=era.Uncertainty(thickness=0.002))
+    era.save_rig(fitted, tmp_path / "rig.yaml")
+    back = era.load_rig(tmp_path / "rig.yaml")
+    assert (back.plate, back.uncertainty) == (plate, fitted.uncertainty)
+    assert back.eras[0].damping == pytest.approx(RIG.eras[0].damping, rel=1e-5)
+    assert fitted.replaced(thickness=0.002).plate == replace(plate, thickness=0.002)
+    for other in (replace(RIG, fingertip=None), replace(RIG, document=None)):
+        with pytest.raises(era.InputError, match="rig must"):
+            era.save_rig(other, tmp_path / "rig.yaml")

@@ -170,11 +170,11 @@ class RankedLayout:
 class Design:
     """Result of a design.
 
-    layouts: all of them, judged ones first by their mean contrast, then others by score; starts: of
-    these the ends of the searches of the best one's problem, none if layouts were given; by_count:
-    the best judged for each number of ERAs of that problem; by_stiffness: the best for each
-    stiffness [N/m] tried; sensitivities (n,): change of the score [dB/m] with the place of each
-    ERA of the best; own: the rig's own layout, None if it does not support the plate.
+    layouts: judged ones first by their mean contrast, then others by score; starts: ends of the
+    best problem's searches; by_count: the best judged for each number of ERAs of that problem;
+    by_stiffness: the best for each stiffness [N/m] tried; sensitivities (n,): change of the score
+    [dB/m] with the place of each ERA of the best; own: the rig's own layout, None if it does not
+    support the plate.
     """
 
     layouts: tuple[RankedLayout, ...]

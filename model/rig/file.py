@@ -91,10 +91,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
 
 
 def example_rig_path() -> Path:
-    """The path of the commented rig of the paper's plate.
-
-    A wheel has it in the model's data, a checkout in its examples.
-    """
-    here = Path(__file__).parents[1]
+    """The path of the commented rig of the paper's plate."""
+    here = Path(__file__).parents[1]  # a wheel has it in the model's data
     installed = here / "data" / "paper_plate.yaml"
     return installed if installed.exists() else here.parent / "examples" / "paper_plate.yaml"

@@ -18,6 +18,8 @@ from era_haptics.pictures import draw_answer as draw_answer
 from era_haptics.pictures import draw_contrast_map as draw_contrast_map
 from era_haptics.pictures import draw_map as draw_map
 from era_haptics.pictures import draw_playback as draw_playback
+from era_haptics.rigs import Era as Era
+from era_haptics.rigs import Plate as Plate
 from era_haptics.solved_plate import SolvedPlate as SolvedPlate
 from era_haptics.tables import answer as answer
 from era_haptics.tables import contrast_map as contrast_map
@@ -39,8 +41,6 @@ from model.finger.grid import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes
 from model.rig.file import example_rig_path as example_rig_path
 from model.rig.file import load_rig as load_rig
-from model.rig.from_keys import Era as Era
-from model.rig.from_keys import Plate as Plate
 from model.rig.from_keys import rig as rig
 from model.rig.from_keys import save_rig as save_rig
 from model.rig.rig import Rig as Rig

@@ -107,8 +107,9 @@ def design(
             f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
             f"{', '.join(f'{each:g}' for each in stiffness)}"
         )
-    path = None if contacts is None else expect_path(contacts, what="contacts")
-    rule = contact_rule(path, rig.plate, contents)
+    rule = contact_rule(
+        None if contacts is None else expect_path(contacts, what="contacts"), rig.plate, contents
+    )
     area = area_of(str(expect_path(where, what="where")), rig.plate)
     problems = [
         DesignProblem(

@@ -161,8 +161,7 @@ class RankedLayout:
     @property
     def rig(self) -> Rig:
         """The rig with these ERAs, as `era design` writes it: on free channels."""
-        data = stated(self.problem.rig).data
-        keys = layout_keys(self.problem, self.found.positions, data)
+        keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
         return rig_of(Document("RankedLayout.rig", "", keys, {}))
 
 

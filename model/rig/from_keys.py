@@ -7,7 +7,7 @@ damping of a ratio, a mesh that is chosen, the homogeneous plate that a laminate
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic_core import to_jsonable_python
 
@@ -22,7 +22,7 @@ from model.files.replacing import check_ending
 from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
-from model.rig.sections import EraSection, PlateSection, RigSection
+from model.rig.sections import PlateSection, RigSection
 
 _SECTIONS = RigSection.model_fields.keys() - {"plate"}
 """Keys that are changed as a whole."""
@@ -34,34 +34,11 @@ _REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
 """Fields of a rig that the text of a fitted one states."""
 
 
-class _Keys(dict[str, Any]):
-    """Keys of a section of a rig file."""
-
-    _section: ClassVar[type[Section]]
-
-    def __init__(self, **keys: Any) -> None:
-        document = _document(f"era.{type(self).__name__}", keys)
-        Validation(document, self._section).finish()
-        super().__init__(document.data)
-
-
-class Plate(_Keys):
-    """A plate by the keys of `plate` in a rig file.
-
-    `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
-    ConfigError, an InputError, with all problems.
-    """
-
-    _section = PlateSection
-
-
-class Era(_Keys):
-    """An ERA by the keys below `eras` in a rig file.
-
-    `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
-    """
-
-    _section = EraSection
+def checked_keys(source: str, section: type[Section], keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of a section as data of a file; source: what is called with them. Raises ConfigError."""
+    document = _document(source, keys)
+    Validation(document, section).finish()
+    return document.data
 
 
 def rig(
@@ -120,15 +97,17 @@ def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
             "rig.replaced: plate.modes must be given with another plate, got those identified on "
             "this one; modes=None for the theory's"
         )
-    data |= {key: changes[key] for key in _SECTIONS & changes.keys()}
-    document = _document("rig.replaced", data | {"plate": _given(plate)})
-    read, sides = Validation(document, RigSection).field, (rig.plate.length, rig.plate.width)
-    wanted = (read(("plate", key), PlateSection) for key in ("length", "width"))
-    factors = [(new or own) / own for new, own in zip(wanted, sides, strict=True)]
+    whole = {key: changes[key] for key in _SECTIONS & changes.keys()}
+    document = _document("rig.replaced", {**data, **whole, "plate": _given(plate)})
+    read = Validation(document, RigSection).field
+    factors = [
+        (read(("plate", key), PlateSection) or own) / own
+        for key, own in (("length", rig.plate.length), ("width", rig.plate.width))
+    ]
     moved: Any = document.data if factors != [1, 1] else {}
     for section in (
         each
-        for kind in {"eras", "masses"} & moved.keys() - changes.keys()
+        for kind in {"eras", "masses"} & moved.keys() - whole.keys()
         for each in moved[kind].values()
     ):
         section["at"] = [

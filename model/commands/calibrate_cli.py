@@ -1,13 +1,12 @@
 """`era calibrate`: fit a rig to responses measured on it."""
 
-import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from model.commands.fitted_rig_cli import check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption, MeshOption, RigArgument, progress_bar
+from model.commands.options import JsonOption, MeshOption, RigArgument, Stopwatch, progress_bar
 from model.counting import counted
 from model.files.replacing import check_picture
 
@@ -53,11 +52,9 @@ def calibrate(
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_measured(measured_file), rig)
-    started = time.perf_counter()
-    screened = check_consistency(rig, responses)
-    with progress_bar("fits") as progress:
+    with Stopwatch() as timed, progress_bar("fits") as progress:
+        screened = check_consistency(rig, responses)
         calibration = fit(rig, responses, screened, all_scales=all_scales, progress=progress)
-    elapsed = time.perf_counter() - started
     rows = calibration_report.change_rows(calibration)
     notes = [
         *calibration_report.finding_rows(calibration),
@@ -87,6 +84,6 @@ def calibrate(
         if as_json
         else None,
         files=files,
-        elapsed=elapsed,
+        elapsed=timed.elapsed,
         refusal=None if calibration.is_good else _NO_FIT,
     )

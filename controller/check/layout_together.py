@@ -1,7 +1,7 @@
 """Which regions of a layout can be felt apart at the same time: two and three fingers at once."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any, TypeAlias
@@ -23,6 +23,7 @@ from model.answer.plan import answer
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
+from model.progress import Progress, unseen
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
@@ -64,7 +65,7 @@ def check_together(
     layout: SurfaceLayout,
     table: LocalizationTable,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[Together]:
     """Answer fingers in every two and every three regions at their worst places.
 

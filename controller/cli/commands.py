@@ -13,6 +13,7 @@ from controller.cli.daemon import (
     arm,
     daemon,
     of_method,
+    reload,
     status,
     touch,
     watch,
@@ -130,5 +131,5 @@ for _command in (demo, gateway, report, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))
-for _more in (arm, status):
+for _more in (arm, reload, status):
     app.command(help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}")(_more)

@@ -229,7 +229,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
 ) -> None:
     """A region's effect plays at its own level; a request needs a finger and at most that level."""
     (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
         view = bench.daemon._publisher.view
 
         async def level_of(effect: str) -> float | None:

@@ -88,9 +88,7 @@ class DaemonSection(Section):
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     learn: File | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    layouts: Annotated[
-        dict[Identifier, File], Field(max_length=MAX_LAYOUTS, default_factory=dict)
-    ]
+    layouts: Annotated[dict[Identifier, File], Field(max_length=MAX_LAYOUTS, default_factory=dict)]
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
     socket: File | None = None

@@ -31,7 +31,7 @@ def show_status(status: StatusResult) -> str:
         headline(status.state, status.cause),
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
         *_given(("  slow: {}", status.slow_reason)),
-        *_given(("  armed by {}", armed), ("  layout {}", status.layout)),
+        *_given(("  armed by {}", armed), ("  layout {}", status.layout if len(status.layouts) > 1 else None)),
         *map(_contact, status.contacts),
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),

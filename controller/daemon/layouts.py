@@ -72,7 +72,7 @@ class LayoutChoice:
     def _play(self, name: str | None) -> None:
         self.name = name
         self.player.replace(self._layouts[name])
-        _logger.info("layout: %s in use", name or "none", extra={"topic": "layout"})
+        _logger.info("layout: %s in use", name or "none")
         self._changed()
 
     def _warn_of_bands(self) -> None:

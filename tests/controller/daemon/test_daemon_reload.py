@@ -95,9 +95,11 @@ def test_reload_is_refused_when_rig_file_was_edited(folder: Path) -> None:
     assert problem(old, config(folder), is_armed=False)
 
 
-@pytest.mark.parametrize("change", [{"level_db_sl": "21"}, {"layouts": "{a: neighbours.yaml}"}])
+@pytest.mark.parametrize(
+    "change", [{"level_db_sl": "21"}, {"layouts": "{a: 10.yaml, b: neighbours.yaml}"}]
+)
 def test_reload_raises_no_level_while_armed(folder: Path, change: dict[str, str]) -> None:
-    """From 20 dB SL to 21, or to whatever the neighbours allow, only once disarmed."""
+    """From 20 dB SL to 21, or to whatever the neighbours allow, in use or not, once disarmed."""
     old, new = config(folder), config(folder, **change)
     assert problem(old, new, is_armed=True)
     assert not problem(old, new, is_armed=False)

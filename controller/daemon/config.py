@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -58,7 +57,7 @@ class DaemonConfig:
 
     rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
     it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
-    layouts: by name, in the order of the file; none for the same effect everywhere.
+    layouts: by name, in their order; without any one that buzzes at every touch, by None.
     """
 
     source: Path
@@ -68,17 +67,11 @@ class DaemonConfig:
     urls: Mapping[str, str]
     table: Path | None
     learn: Path | None
-    layouts: Mapping[str, SurfaceLayout]
+    layouts: Mapping[str | None, SurfaceLayout]
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
-
-    @cached_property
-    def effective_layouts(self) -> Mapping[str | None, SurfaceLayout]:
-        """The layouts by name; if none is configured one that buzzes at every touch, for None."""
-        buzz = SurfaceLayout(effects=default_effects(self.section.level_db_sl))
-        return {**self.layouts} or {None: buzz}
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:
@@ -175,23 +168,21 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
 
 def _layouts(
     validation: Validation[DaemonSection], document: Document, rig: Rig | None
-) -> dict[str, SurfaceLayout]:
+) -> dict[str | None, SurfaceLayout]:
     """Load the surface layouts; problems are reported at the keys that name them."""
     level = validation.field(("level_db_sl",), DaemonSection)
-    layouts = {}
+    level = STRONG_DB_SL if level is None else level
+    layouts: dict[str | None, SurfaceLayout] = {}
     for name in islice(validation.mapping(("layouts",)), MAX_LAYOUTS):
         file = file_of(document, "layouts", name)
         try:
             if file is not None:
-                layouts[name] = load_layout(
-                    file,
-                    None if rig is None else rig.plate,
-                    level_db_sl=STRONG_DB_SL if level is None else level,
-                )
+                plate = None if rig is None else rig.plate
+                layouts[name] = load_layout(file, plate, level_db_sl=level)
         except InputError as error:
             indented = str(error).replace("\n", "\n  ")
             validation.add(("layouts", name), f"invalid layout:\n    {indented}")
-    return layouts
+    return layouts or {None: SurfaceLayout(effects=default_effects(level))}
 
 
 def _urls(

@@ -24,7 +24,7 @@ class LayoutChoice:
     def __init__(
         self, config: DaemonConfig, frequencies: FloatArray, *, changed: Callable[[], None]
     ) -> None:
-        self._layouts = config.effective_layouts
+        self._layouts = config.layouts
         self._frequencies = frequencies
         self._changed = changed
         self.name = next(iter(self._layouts))
@@ -56,7 +56,7 @@ class LayoutChoice:
 
         If it was removed it is the first, of which it returns a note.
         """
-        before, self._layouts = self.name, change.config.effective_layouts
+        before, self._layouts = self.name, change.config.layouts
         name = before if before in self._layouts else next(iter(self._layouts))
         if change.layouts:
             self._warn_of_bands()

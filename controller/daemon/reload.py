@@ -51,7 +51,7 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     restart = [key for key in before if before[key] != after[key] and key not in _APPLIED]
     if old.rig_text != new.rig_text and "rig" not in restart:
         restart.append("rig")
-    was, now = old.effective_layouts, new.effective_layouts
+    was, now = old.layouts, new.layouts
     differ = [name for name in {**was, **now} if was.get(name) != now.get(name)]
     changes = [
         f"layouts.{name}: {'added' if name not in was else 'changed' if name in now else 'removed'}"

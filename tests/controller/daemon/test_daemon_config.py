@@ -48,7 +48,7 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert [era.name for era in config.rig.eras] == ["SW", "SE", "NE", "NW"]
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
     assert config.touch == ()
-    assert (config.table, config.dump_folder, config.log_file, config.layouts) == (*3 * [None], {})
+    assert (config.table, config.dump_folder, config.log_file, *config.layouts) == (None,) * 4
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
 
@@ -148,7 +148,7 @@ def test_example_with_several_simulated_amplifiers_is_accepted(name: str) -> Non
     rig = EXAMPLES.resolve() / f"{name}.yaml"
     assert len(config.urls) > 2
     assert config.urls == {each: f"sim://{rig}?amplifier={each}" for each in config.urls}
-    assert config.layouts
+    assert None not in config.layouts
 
 
 @pytest.mark.parametrize("of_main", ["sim://", "serial:///dev/x?baud=9600", "serial:///dev/x"])

@@ -178,10 +178,12 @@ docs: .venv/installed-docs
 dist: .venv/installed-release
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
 
 # A wheel with the compiled engine of `era soft-amp`, for machines like this one without a compiler.
 dist-platform: .venv/installed-release
 	ERA_HAPTICS_ENGINE=1 $(BIN)/python -m build --wheel --outdir dist .
+	$(BIN)/twine check --strict dist/*.whl
 
 # The wheel alone, in a clean environment for each of python3.11 to python3.14 that is found.
 # Others: make smoke SMOKE='--python /path/to/python3.13'

@@ -1,1 +1,1 @@
-"""From touches to drive commands: touch sources, contacts, selection, routing, control loop."""
+"""From touches to drive commands, of era-haptics: touch sources, contacts, control loop."""

@@ -1,1 +1,1 @@
-"""Amplifiers: drive commands, the guard, the protocol, its codecs and backends."""
+"""Amplifiers, of era-haptics: drive commands, the guard, the protocol, its codecs and backends."""

@@ -12,26 +12,12 @@ linear algebra; `__init__.pyi` says from where, also to type checkers.
 
 import re
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from era_haptics.packages import check_packages
 
-def _check_packages() -> None:
-    """Raise ImportError where a file beside a program hides a package behind these names."""
-    folder = Path(__file__).resolve().parents[1]
-    for package in ("controller", "drivers", "model", "registry", "sim"):
-        found = find_spec(package)
-        origin = Path((found and found.origin) or __file__).resolve()
-        if not origin.is_relative_to(folder):
-            raise ImportError(
-                f"{origin} hides the package {package} of era-haptics; rename it, or keep it in "
-                "another folder than your program",
-                name=package,
-            )
-
-
-_check_packages()
+check_packages()
 
 _IMPORT = re.compile(r"^from (\S+) import (\w+) as", re.MULTILINE)
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
@@ -43,9 +29,16 @@ __all__ = sorted(_HOMES)
 
 def __getattr__(name: str) -> Any:
     """Load a name at its first use."""
+    from registry.posix import posix_needed
+
     if name not in _HOMES:
         raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
-    found = getattr(import_module(_HOMES[name]), name)
+    try:
+        found = getattr(import_module(_HOMES[name]), name)
+    except ModuleNotFoundError as error:
+        if needed := posix_needed(error):
+            raise ImportError(needed, name=error.name) from error
+        raise
     globals()[name] = found
     return found
 

@@ -1,1 +1,1 @@
-"""The plate in physics: finite elements, actuators, response, localization. No I/O but files."""
+"""The plate in physics, of era-haptics: elements, actuators, localization; no I/O but files."""

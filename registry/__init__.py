@@ -1,1 +1,1 @@
-"""Shared by drivers and model: plug-ins by name, suggestions for mistyped names, and limits."""
+"""Shared by the packages of era-haptics: plug-ins by name, suggestions for mistyped names."""

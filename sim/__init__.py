@@ -1,1 +1,1 @@
-"""The far end: simulated amplifiers on real wires over a plate that vibrates in time."""
+"""The far end, of era-haptics: simulated amplifiers on real wires over a plate that vibrates."""

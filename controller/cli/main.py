@@ -22,6 +22,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from registry.plugins import failed_plugin, failure_text
+from registry.posix import posix_needed
 from registry.wording import reworded
 
 COMMANDS = ("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli")
@@ -206,6 +207,9 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
         return BAD_INPUT
     if failed_plugin(error) is not None:
         _print_error(f"error: {failure_text(error)}")
+        return BAD_INPUT
+    if needed := posix_needed(error):
+        _print_error(f"error: {needed}")
         return BAD_INPUT
     _print_error(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from controller.api.place import default_socket
 from controller.daemon.config_sections import (
     MAX_LAYOUTS,
     CalibrationSection,
@@ -81,6 +80,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 
 def daemon_config_of(document: Document) -> DaemonConfig:
     """Load what a daemon's file names; raises as `load_daemon_config`."""
+    from controller.api.place import default_socket  # not on Windows, where rigs are checked
+
     _check_kind(document)
     validation = Validation(document, DaemonSection)
     rig_file = file_of(document, "rig")

@@ -210,28 +210,31 @@ class Daemon:
             self._reload_requested.clear()
             verdict, self._next_reload = self._next_reload, loop.create_future()
             self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-            refused, done = await self._reload_now()
-            if refused:
-                _logger.error("config: reload rejected, keeping previous: %s", "; ".join(refused))
+            result = await self._reload_now()
+            reasons = "; ".join(result.reasons)
+            if result.reloaded:
+                _logger.info("config: reloaded: %s", reasons)
             else:
-                _logger.info("config: reloaded: %s", "; ".join(done))
+                _logger.error("config: reload rejected, keeping previous: %s", reasons)
             self._manager.ready(self._status_line())
-            verdict.set_result(ReloadResult(reloaded=not refused, reasons=refused or done))
+            verdict.set_result(result)
 
-    async def _reload_now(self) -> tuple[list[str], list[str]]:
-        """Return why nothing is applied, empty if it is; and what was."""
+    async def _reload_now(self) -> ReloadResult:
+        is_done = False
         try:
             change = await in_thread(partial(read_again, self._config), name="reload")
             is_armed = self._supervisor.operation.state in ENERGISED
-            if refusals := change.refusals(is_armed=is_armed):
-                return [*refusals, *(f"{each}, but not applied" for each in change.changes)], []
-            self._config = change.config
-            return [], [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
+            if reasons := change.refusals(is_armed=is_armed):
+                reasons += [f"{each}, but not applied" for each in change.changes]
+            else:
+                reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
+                self._config, is_done = change.config, True
         except (InputError, OSError) as error:
-            return [line.strip() for line in str(error).splitlines()], []
+            reasons = [line.strip() for line in str(error).splitlines()]
         except Exception as error:  # systemd and clients wait for the end of the reload
             _logger.exception("config: reload failed")
-            return [f"a bug in the daemon ({type(error).__name__}); its log has the details"], []
+            reasons = [f"a bug in the daemon ({type(error).__name__}); its log has the details"]
+        return ReloadResult(reloaded=is_done, reasons=reasons)
 
     def _layout_changed(self) -> None:
         self._publisher.hub.publish("layout", self._layouts.event)

@@ -1,6 +1,5 @@
 """The Unix socket at which clients reach the daemon, reserved for one daemon."""
 
-import fcntl
 import os
 import socket
 import stat
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import IO
 
 from model.errors import InputError
+from registry import posix
 
 _STAGED = "~"  # appended to the socket's name until it listens
 _MAX_PATH = 107 - len(_STAGED)  # bytes in sockaddr_un
@@ -43,7 +43,7 @@ class SocketLock:
         except OSError as error:
             raise InputError(f"{error.filename}: {error.strerror}; {_REMEDY}") from error
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            posix.lock(self._lock)
         except BlockingIOError:
             self._lock.seek(0)
             owner = self._lock.read(20).strip()
@@ -72,7 +72,7 @@ class SocketLock:
         InputError.
         """
         staged = self.path.with_name(self.path.name + _STAGED)
-        bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         # systemd's RuntimeDirectoryMode=0750 shares the folder with the service's group.
         folder = self.path.parent.stat().st_mode
         is_shared = folder & stat.S_IXGRP and not folder & stat.S_IRWXO

@@ -27,6 +27,7 @@ from metrics_page import metrics
 from protocol_bytes import BYTES
 from protocol_tables import TABLES
 from python_page import with_entries
+from script_types import messages, with_version
 
 ROOT = Path(__file__).parents[2]
 END = "<!-- end -->"
@@ -68,6 +69,8 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "controller/api/summaries.py": [whole(summaries)],
     "controller/api/calls.pyi": [whole(stub)],  # before python-api.md, which shows it
     "controller/api/amplifier_status.pyi": [whole(status_stub)],
+    "examples/javascript/api.d.ts": [whole(messages)],
+    "examples/javascript/package.json": [with_version],
     "firmware/core/protocol.h": [whole(header)],
     "firmware/core/records.h": [whole(records_header)],
     "docs/reference/amplifier.dbc": [whole(dbc_text)],

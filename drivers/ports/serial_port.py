@@ -9,7 +9,6 @@ import contextlib
 import errno
 import os
 import select
-import termios
 from collections.abc import Callable
 from typing import final
 
@@ -23,7 +22,6 @@ from drivers.urls import Place
 from registry.threads import in_thread
 
 _READ_MAX = 4096
-_OPENING_FAILURES = (OSError, ValueError, termios.error)  # of pyserial
 
 _NO_PERMISSION = (
     "no permission; add the user to the group that owns the port "
@@ -53,11 +51,13 @@ async def open_port(
     opener = PORT_OPENER.get()
     if opener is not None:
         return await opener(name, on_data, on_loss)
+    import termios  # not on Windows
+
     try:
         port = await in_thread(
             lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
         )
-    except _OPENING_FAILURES as error:
+    except (OSError, ValueError, termios.error) as error:  # of pyserial
         raise LinkError(
             f"serial port {name} cannot be opened: {remedy_of(error)} (the system says: "
             f"{system_message(error)})"
@@ -66,6 +66,8 @@ async def open_port(
 
 
 def _open_device(place: Place) -> serial.Serial:
+    import termios
+
     # A pseudo-terminal has no parity and may refuse all settings if one is given.
     is_pseudo = os.path.realpath(place.device).startswith("/dev/pts/")
     port = serial.Serial(

@@ -2,6 +2,7 @@
 
 import ctypes
 import logging
+import os
 import platform
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
@@ -53,8 +54,12 @@ _OF_X86 = (Version("avx512", 16, _AVX512), Version("avx2", 8, _AVX2), _PLAIN)
 
 
 def versions() -> tuple[Version, ...]:
-    """Those for processors of this architecture, the fastest first."""
-    return _OF_X86 if platform.machine().lower() in ("x86_64", "amd64") else (_PLAIN,)
+    """Those for processors of this architecture, the fastest first.
+
+    On Windows without AVX: gcc does not align its registers on the stack there (GCC bug 54412).
+    """
+    is_x86 = platform.machine().lower() in ("x86_64", "amd64")
+    return _OF_X86 if is_x86 and os.name == "posix" else (_PLAIN,)
 
 
 def processor_features() -> AbstractSet[str]:

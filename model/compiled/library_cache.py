@@ -41,7 +41,7 @@ def compile_library(
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         made = Path(folder) / path.name
         _compile(made, compiler.split(), sources, flags=flags, what=what)
-        with made.open("rb") as file:
+        with made.open("r+b") as file:  # Windows writes what is open for writing alone to the disk
             os.fsync(file.fileno())  # a name must not outlive a power failure without its content
         made.replace(path)
 
@@ -58,7 +58,12 @@ def _compile(
     command = [*compiler, *flags, "-fPIC", "-shared", "-o", *files, "-lm"]
     try:
         done = subprocess.run(  # noqa: S603  the user's compiler
-            command, capture_output=True, text=True, timeout=_TIMEOUT, check=False
+            command,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=_TIMEOUT,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         raise InputError(
@@ -105,7 +110,7 @@ def kept_library(
         with suppress(OSError):  # no space
             _compile_with_sum(path, sources, flags=flags, what=what)
             return _load(path)
-    with tempfile.TemporaryDirectory(prefix="era-haptics-") as own:
+    with tempfile.TemporaryDirectory(prefix="era-haptics-", ignore_cleanup_errors=True) as own:
         try:
             path = _own_folder(Path(own)) / file
             _compile_with_sum(path, sources, flags=flags, what=what)
@@ -120,7 +125,7 @@ def check_own(path: Path, *, sticky: bool = False) -> None:
     sticky: whether others may write to a folder with the sticky bit, where they cannot rename what
     is not theirs.
     """
-    if sys.platform == "win32":  # its cache folders are the user's own
+    if not hasattr(os, "geteuid"):  # Windows: its cache folders are the user's own
         return
     status, owners = path.stat(), {path.stat().st_uid, path.lstat().st_uid}
     remedy = f"chown it to {os.geteuid()}, chmod go-w it, or set XDG_CACHE_HOME"
@@ -154,7 +159,7 @@ def _load(path: Path) -> ctypes.CDLL:
     checksum = _checksum_file(path)
     for each in (path, checksum):
         check_own(each)
-    if hashlib.sha256(path.read_bytes()).hexdigest() != checksum.read_text().strip():
+    if hashlib.sha256(path.read_bytes()).hexdigest() != checksum.read_bytes().decode().strip():
         raise OSError(f"{path} must have the SHA-256 in {checksum.name}")
     found = ctypes.CDLL(str(path))
     os.utime(path)
@@ -165,8 +170,8 @@ def _compile_with_sum(
     path: Path, sources: Sequence[Path], *, flags: Sequence[str], what: str
 ) -> None:
     compile_library(path, sources, flags=flags, what=what)
-    with tempfile.NamedTemporaryFile("w", prefix=".", dir=path.parent, delete=False) as file:
-        file.write(hashlib.sha256(path.read_bytes()).hexdigest())
+    with tempfile.NamedTemporaryFile("wb", prefix=".", dir=path.parent, delete=False) as file:
+        file.write(hashlib.sha256(path.read_bytes()).hexdigest().encode())
         file.flush()
         os.fsync(file.fileno())
     Path(file.name).replace(_checksum_file(path))

@@ -1,10 +1,8 @@
 """Pseudo-terminals: the host opens one side, the far end the other; symbolic links name them."""
 
 import asyncio
-import fcntl
 import os
 import tempfile
-import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
@@ -13,6 +11,7 @@ from urllib.parse import urlsplit
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from registry import posix
 
 TERMINAL_SCHEMES = ("serial", "modbus+rtu", "can+slcan")
 
@@ -85,7 +84,7 @@ def _lock(link: Path) -> Iterator[None]:
         raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            posix.lock(file)
         except BlockingIOError:
             raise InputError(
                 f"--link {link}: in use by another amplifier; choose another path"
@@ -140,6 +139,8 @@ class PseudoTerminal:
         if self._master >= 0:
             return
         try:
+            import tty  # not on Windows
+
             self._master, self._slave = os.openpty()
         except OSError as error:
             raise LinkError(

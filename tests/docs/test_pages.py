@@ -49,9 +49,13 @@ def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
     )
     found = {
         path.relative_to(pages.ROOT).as_posix()
-        for folder in (".", "docs/reference", "docs/how-to", "controller/api", "firmware/core")
+        for folder in (
+            *(".", "docs/reference", "docs/how-to", "controller/api", "firmware/core"),
+            "examples/javascript",
+        )
         for path in (pages.ROOT / folder).glob("*.*")
-        if path.suffix in (".md", ".py", ".pyi", ".h") and claimed.search(path.read_text("utf-8"))
+        if path.suffix in (".md", ".py", ".pyi", ".h", ".ts")
+        and claimed.search(path.read_text("utf-8"))
     }
     assert len(found) > 6
     assert found <= set(pages.WRITTEN)

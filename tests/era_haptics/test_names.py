@@ -41,20 +41,6 @@ def test_every_name_is_loaded_from_where_type_checkers_find_it() -> None:
         assert getattr(era, name).__name__ == name
 
 
-@pytest.mark.parametrize(("name", "hidden"), [("model.py", "model"), ("sim/__init__.py", "sim")])
-def test_file_that_hides_a_package_is_named(tmp_path: Path, name: str, hidden: str) -> None:
-    """Beside a program, which Python looks in first."""
-    hiding = tmp_path / name
-    hiding.parent.mkdir(exist_ok=True)
-    hiding.touch()
-    (tmp_path / "mine.py").write_text("import era_haptics", encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, tmp_path / "mine.py"], capture_output=True, text=True, check=False
-    )
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"ImportError: {hiding} hides the package {hidden} ")
-
-
 def test_unknown_name_lists_the_known_ones() -> None:
     """As an AttributeError."""
     with pytest.raises(AttributeError, match=r"laod_rig; .*load_rig"):

@@ -1,9 +1,11 @@
-"""The example client in JavaScript, under Node.js against a daemon on a serial line."""
+"""The clients in JavaScript: under Node.js against a daemon on a serial line, and their package."""
 
 import asyncio
 import json
 import os
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -22,7 +24,19 @@ from installed_program import installed_program
 BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 
+ROOT = BUTTON.parents[2]
+PAGE = "controller/gateway/page/connection.js"
+
 pytestmark = pytest.mark.real_time
+
+MEMBERS = """
+    const [name] = process.argv.slice(1);
+    const found = await import(name);
+    const of = (made) => Object.getOwnPropertyNames(made ?? {});
+    const members = Object.entries(found).map(([name, made]) =>
+        [name, [...of(made), ...of(made.prototype)]]);
+    console.log(JSON.stringify(Object.fromEntries(members)));
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -132,3 +146,47 @@ async def test_without_a_daemon_it_says_so() -> None:
     assert status == 1
     assert "nosuch.sock" in err
     assert len(err.splitlines()) == 1
+
+
+def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
+    """By npm without a network, else as npm does; every declared function and method is there."""
+    node = installed_program("node", "nodejs", package="nodejs")
+    source, user = tmp_path / "examples" / "javascript", tmp_path / "user"
+    shutil.copytree(BUTTON.parent, source)
+    (tmp_path / PAGE).parent.mkdir(parents=True)
+    shutil.copy(ROOT / PAGE, tmp_path / PAGE)
+    user.mkdir()
+    package = json.loads((source / "package.json").read_text("utf-8"))
+    installed = user / "node_modules" / "era-haptics"
+    npm = shutil.which("npm")
+    if npm is not None:
+        for command in (
+            "pack --silent",
+            f"install --offline --prefix {user} ./era-haptics-0.2.0.tgz",
+        ):
+            subprocess.run([npm, *command.split()], cwd=source, check=True, capture_output=True)
+    else:
+        subprocess.run(package["scripts"]["prepack"], cwd=source, check=True, shell=True)
+        installed.mkdir(parents=True)
+        for path in [
+            path for kept in (*package["files"], "package.json") for path in source.glob(kept)
+        ]:
+            shutil.copy(path, installed)
+    api = (installed / "api.d.ts").read_text("utf-8")
+    for name, export in package["exports"].items():
+        done = subprocess.run(
+            [node, "--input-type=module", "-e", MEMBERS, f"era-haptics{name[1:]}"],
+            cwd=user,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        has = json.loads(done.stdout)
+        types = (installed / export["types"]).read_text("utf-8")
+        assert set(re.findall(r"^export (?:class|function) (\w+)", types, re.M)) == has.keys()
+        for made, body in re.findall(r"^export class (\w+).*?\{\n(.*?)^\}", types, re.M | re.S):
+            methods = set(re.findall(r"^  (?:static )?(\w+)[<(]", body, re.M))
+            assert methods - {"constructor", "on"} <= set(has[made])
+        known = re.findall(r"^export (?:type|interface) (\w+)", api, re.M)
+        for used in re.findall(r"import type \{(.*?)\} from \"./api.js\"", types):
+            assert set(re.findall(r"\w+", used)) <= set(known)

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import socket
-import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -120,6 +119,8 @@ class Place:
 @contextmanager
 def terminal_place(link: Path | None) -> Iterator[Place]:
     """A pseudo-terminal, and a symbolic link to it while this lasts; raises InputError."""
+    import tty  # not on Windows
+
     from sim.transport.pseudo_terminal import linked  # loads asyncio, which the help does without
 
     with ExitStack() as stack:

@@ -113,9 +113,7 @@ class Supervisor:
         inherited = [self._file.fileno(), self._place.terminal, self._place.listening, life]
         self._process = subprocess.Popen(  # noqa: S603  this program
             [
-                sys.executable,
-                "-m",
-                "sim.desk.soft_amp",
+                *(sys.executable, "-P", "-m", "sim.desk.soft_amp"),
                 self._settings.to_json(),
                 *map(str, inherited),
                 str(int(is_recovering)),

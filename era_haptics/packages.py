@@ -1,0 +1,61 @@
+"""Where the packages behind these names come from, looked at before any of them is loaded.
+
+Their names are common, and Python takes the first one on its path: a file beside a program, or the
+package of another distribution.
+"""
+
+import sys
+from importlib.metadata import distributions
+from importlib.util import find_spec
+from pathlib import Path
+
+PACKAGES = ("controller", "drivers", "model", "registry", "sim")
+_OWN = "of era-haptics"  # in the docstring of each
+
+
+class HiddenPackage(ImportError):
+    """A package of era-haptics that a file, a folder or another distribution hides or replaced."""
+
+
+def check_packages() -> None:
+    """Raise HiddenPackage for the first package that is not found beside `era_haptics`.
+
+    In the command `era`, end with the sentence and its exit status of invalid input instead.
+    """
+    for package in PACKAGES:
+        try:
+            _check(package)
+        except HiddenPackage as error:
+            if Path(sys.argv[0]).name in ("era", "era.exe"):
+                sys.stderr.write(f"era: error: {error}\n")
+                sys.exit(2)
+            raise
+
+
+def _check(package: str) -> None:
+    own = Path(__file__).resolve().parents[1] / package / "__init__.py"
+    found = find_spec(package)
+    origin = Path((found and found.origin) or own)
+    if not own.exists():
+        why = f"{own.parent} is missing"
+    elif origin.resolve() != own:
+        why = f"{origin.parent if origin.name == own.name else origin} hides {own.parent}"
+    elif _OWN not in own.read_text(encoding="utf-8"):
+        why = f"{own} is another program's"
+    else:
+        return
+    other = _distribution(origin)
+    raise HiddenPackage(
+        f"{why}{f', by the distribution {other}' * bool(other)}, the package {package} of "
+        "era-haptics; rename the other, or install era-haptics in an environment of its own",
+        name=package,
+    )
+
+
+def _distribution(file: Path) -> str | None:
+    """The name of another installed distribution that has a file, None without one."""
+    for each in distributions():
+        files = map(str, map(each.locate_file, each.files or ()))
+        if each.name != "era-haptics" and str(file) in files:
+            return each.name
+    return None

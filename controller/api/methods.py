@@ -35,6 +35,7 @@ from controller.api.schema import (
 )
 
 DEFAULT_LEASE = 10.0  # s
+MAX_SENDER = 2048  # characters of a sender's name, escaped
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -218,7 +219,9 @@ class PlayParams(Message):
 class StrengthParams(Message):
     """A touch source or client and its gain; without a gain nothing is set."""
 
-    name: Name = Field(description="of an input, a source or a client")
+    name: Annotated[str, Field(min_length=1, max_length=MAX_SENDER)] = Field(
+        description="of an input, a sender there, a source or a client"
+    )
     gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )

@@ -82,14 +82,15 @@ class Content:
 
     key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
     predictions; targets: that finger, then those that share it; placement: where they are, and all
-    others; predictions: one per target; gain_db: that the layer has, its fingers' strength.
+    others; predictions: one per target, which also depend on others; gain_db: that the layer has,
+    its fingers' strength.
     """
 
     key: tuple[ContactKey, int]
     targets: Targets
     placement: Placement
     layer: Layer
-    predictions: tuple[Prediction, ...] = ()
+    predictions: tuple[Prediction, ...] = field(default=(), compare=False)
     gain_db: float = 0.0
 
     @property

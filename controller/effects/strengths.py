@@ -24,8 +24,8 @@ class Strengths:
     """Gains [dB] by name, 0 at most, which is what holds where none is set.
 
     A name is that of a touch input of the configuration, of a sender there
-    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, or of a client. At a finger the gains of its names and
-    of the client that plays its effect add up, each once.
+    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, or of a client. At a
+    finger the gains of its names and of the client that plays its effect add up, each once.
     """
 
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
@@ -54,8 +54,8 @@ class Strengths:
         gains = {name: gain for name, gain in {**self.gains_db, name: gain_db}.items() if gain}
         if len(gains) > MAX_NAMES:
             raise InputError(
-                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of another "
-                "to 0 dB first"
+                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
+                "another to 0 dB first"
             )
         self.gains_db = gains
 

@@ -283,7 +283,7 @@ def test_fingers_feel_their_effects(name: str) -> None:
 
 
 def test_a_press_outlasts_its_layout_beside_an_older_finger() -> None:
-    """The newest finger outside of all regions stays the newest though the older one starts anew."""
+    """The newest finger outside of all regions stays it, though the older one starts anew."""
     effects: dict[str, Effect] = {"press": Buzz(duration=1.0), "buzz": Buzz()}
     player = EffectPlayer(SurfaceLayout((), effects, "press"))
     fingers = [ONE, finger(2, since=0.5)]

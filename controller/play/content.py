@@ -144,12 +144,20 @@ class Selection:
         return bool(self.contents) and is_each_alone and not self.not_served
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return it with the strengths of fingers; what several share has the lowest."""
+        """Return it with the strengths of fingers; what several share has the lowest.
+
+        Also that of one whose short pulse is felt above it meanwhile.
+        """
         if not (self.contents and any(gains_db.values())):
             return self
+        every = {key: gain for (key, _), gain in gains_db.items()}
         gains = {
             each.targets: min(
-                0.0, *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets]
+                0.0,
+                *[
+                    gains_db.get((at.key, to.is_short), every.get(at.key, 0.0))
+                    for at, to in each.targets
+                ],
             )
             for each in self.contents
         }

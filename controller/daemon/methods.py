@@ -123,6 +123,8 @@ class ApiService:
         """Introduce the client; returns what the daemon drives."""
         client.name = params.client
         self._clients.add(client)
+        if self._strengths.gains_db:  # its fingers may rest
+            self._controller.cycle.request_update()
         return hello_result(
             self._config,
             self._table,

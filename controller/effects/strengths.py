@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
+from registry.regular_file import regular_file
 
 MAX_NAMES = 64
 """How many touch sources are remembered, and how many names may have a gain."""
@@ -73,10 +74,13 @@ class Strengths:
 
 def read_strengths(file: Path | None) -> Mapping[str, float]:
     """Read the gains [dB] of a file, none where there is no file; raises InputError."""
+    if file is None:
+        return {}
     try:
-        return (
-            _GAINS.validate_json(file.read_bytes(), strict=True) if file and file.exists() else {}
-        )
+        with open(file, "rb", opener=regular_file) as stream:
+            return _GAINS.validate_json(stream.read(), strict=True)
+    except FileNotFoundError:
+        return {}
     except (ValidationError, OSError) as error:
         raise InputError(
             f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "

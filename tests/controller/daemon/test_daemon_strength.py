@@ -156,6 +156,9 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         one, other = await bench.client("seat"), await bench.client("another")
         held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
         assert await levels(era) == [11, 20]
+        await other.hello("seat")  # another name by now, while its finger rests
+        assert await levels(era) == [11, 14]
+        await other.hello("another")
         await era.strength(name="pen", gain_db=-40)
         assert await levels(era) == [-26, 20]
         weak, felt = (await era.status()).contacts

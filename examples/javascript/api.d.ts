@@ -256,7 +256,7 @@ export interface PlayParams {
 
 /** A touch source or client and its gain; without a gain nothing is set. */
 export interface StrengthParams {
-  /** of an input, a source or a client */
+  /** of an input, a sender there, a source or a client */
   name: string;
   /** of all that it brings, 0 for what layout and limits allow */
   gain_db?: number | null;

@@ -213,7 +213,9 @@ class PlayParams(Message):
     effect: Name
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
-    level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
+    level_db_sl: float | None = Field(
+        None, description="from -20; at most, and by default, the effect's own"
+    )
 
 
 class StrengthParams(Message):

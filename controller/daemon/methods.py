@@ -42,6 +42,7 @@ from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import effects_result, hello_result, playing_of
 from controller.daemon.publisher import EventPublisher
+from controller.effects.effect import MIN_DB_SL
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER
@@ -323,13 +324,14 @@ class ApiService:
                 remedy=f"choose one of {', '.join(sorted(effects))}",
             )
         level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
-        if params.level_db_sl is not None and params.level_db_sl > level_max:
+        level = params.level_db_sl
+        if level is not None and not MIN_DB_SL <= level <= level_max:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"level of effect {params.effect!a} must be at most {level_max:g} dB SL, got "
-                f"{params.level_db_sl:g}",
+                f"level of effect {params.effect!a} must be from {MIN_DB_SL:g} to {level_max:g} "
+                f"dB SL, got {level:g}",
                 where="level_db_sl",
-                remedy="raise its level in the surface layout",
+                remedy="choose one of these, or another level in the surface layout",
             )
 
         def distance(contact: Contact) -> float:
@@ -347,7 +349,7 @@ class ApiService:
             params.effect,
             nearest,
             clock.now(),
-            level_db_sl=params.level_db_sl,
+            level_db_sl=level,
             player=client.name,
         )
         self._controller.cycle.request_update()

@@ -186,8 +186,8 @@ class Rounding:
         return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
-        most = self._limits.level / _LEVEL.per_unit
-        return refused(channel, f"{name} must be 0 to {most:g}, got {level!r}")
+        highest = self._limits.level / _LEVEL.per_unit
+        return refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
 
     def _check_envelopes(self, tones: Sequence[Tone]) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""

@@ -1,7 +1,6 @@
 """A modulated content beside a steady one, over the wire at the fingertips."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from controller.play.content import Content, Targets
 from controller.play.intent import Pulse, Target
 from controller.play.layers import LayerContent, Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
-from drivers.errors import CommandRefused
 from model.answer.answer import Layer
 from model.answer.fingers import Placement
 from model.answer.timing import Timing
@@ -135,20 +133,13 @@ async def test_voices_of_one_finger_end_together() -> None:
 async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
     """A carrier without one side band would be another content: the finger feels none."""
     async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
-        layers_of_all = fingers.controller._planner.layers
-        check, refusals = layers_of_all.check, []
-
-        def refusing(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            (played,) = layers.values()
-            if sum(any(tone.level for tone in each.tones) for each in played) >= 3:
-                refusals.append(layers)
-                return CommandRefused("no more")
-            return check(layers)
-
-        layers_of_all.check = refusing
+        refused = fingers.refuse(
+            "no more",
+            lambda layers: sum(any(t.level for t in each.tones) for each in layers) >= 3,
+        )
         fingers.at[1] = LEFT
         await fingers.hold(0.5)
-        assert refusals
+        assert refused
         targets = {each.contact.key.id: each for each in fingers.applied[-1].targets}
         assert targets[1].held_back == "no more"
         assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1

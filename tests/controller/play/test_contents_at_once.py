@@ -146,27 +146,6 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
 
 
 @in_virtual_time
-async def test_a_refused_content_is_left_out_and_the_other_plays_on() -> None:
-    """Two contents are refused together: the newer finger is told why, the other is not silent.
-
-    The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
-    """
-    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
-        count, (own,) = len(fingers.committed), fingers.applied[-1].contents
-        refused = fingers.refuse(
-            "too much power",
-            lambda layers: any(t.level for one in layers if one.number != own for t in one.tones),
-        )
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.3)
-        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
-        assert felt == {1: None, 2: "too much power"}
-        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
-        assert [_id(one) for one in fingers.applied[-1].contents.values()] == [1]
-        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
-
-
-@in_virtual_time
 async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
     """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
 
@@ -189,30 +168,6 @@ async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that(
         assert raised[-1].time - begin <= 0.15
         await fingers.hold(0.3)
         assert fingers.levels_db_sl()[1] >= 43
-
-
-@in_virtual_time
-async def test_what_is_refused_beside_a_click_is_felt_after_it() -> None:
-    """The refusal does not say until when; 20 ms after its end the click has faded."""
-    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
-    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
-    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
-        loop = asyncio.get_running_loop()
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.012)
-        clicked = fingers.applied[-1].time
-        refused = fingers.refuse(
-            "too much power",
-            lambda layers: (
-                loop.time() < clicked + 0.06
-                and any(tone.level for one in layers if one.number == 0 for tone in one.tones)
-            ),
-        )
-        fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
-        await fingers.hold(0.3)
-        assert refused
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
-        assert fingers.applied[-1].time - clicked <= 0.15
 
 
 @in_virtual_time
@@ -253,23 +208,6 @@ async def test_a_finger_that_rests_feels_again_what_an_amplifier_refused_once(
         (applied,) = fingers.applied
         assert applied.is_touch
         assert applied.latency == pytest.approx(1.0, abs=0.1)
-
-
-@in_virtual_time
-async def test_a_ramp_replaces_an_ending_that_is_refused() -> None:
-    """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        count = len(fingers.committed)
-        fingers.refuse(
-            "an ending is too loud",
-            lambda layers: any(not each.tones and not each.renew for each in layers),
-        )
-        del fingers.at[1]
-        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
-        await fingers.hold(0.3)
-        (_, _, sent), *_ = fingers.committed[count:]
-        assert sorted(any(c.level for c in one.commands) for one in sent) == [False, True]
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
 
 
 @in_virtual_time

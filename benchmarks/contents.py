@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.setting import random_contacts, use_one_thread
 from model.answer.plan import prepare_answers
-from model.table.raster_kernel import read_fingertips
+from model.table.table import read_fingertips
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,6 +17,7 @@ from era_haptics.designs import RankedLayout as RankedLayout
 from era_haptics.designs import design as design
 from era_haptics.drive import Drive as Drive
 from era_haptics.pictures import draw_answer as draw_answer
+from era_haptics.pictures import draw_contents as draw_contents
 from era_haptics.pictures import draw_contrast_map as draw_contrast_map
 from era_haptics.pictures import draw_map as draw_map
 from era_haptics.pictures import draw_playback as draw_playback
@@ -48,6 +49,7 @@ from model.table.table import LocalizationTable as LocalizationTable
 from model.vibration.excitation import Tone as Tone
 from model.vibration.maps import PlateMap as PlateMap
 from registry.limits import GuardLimits as GuardLimits
+from sim.plant.excited_plate import FeltFinger as FeltFinger
 from sim.plant.excited_plate import Playback as Playback
 
 _HOMES: dict[str, str]

@@ -2,9 +2,9 @@
 
 from controller.play.routing import route
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.playing.contents import Tone
+from drivers.playing.contents import Layer as AmplifierLayer
 from era_haptics.arguments import expect_rig
-from era_haptics.drive import Played, excitation_of
+from era_haptics.drive import Played, layers_of
 from model.arguments import shown
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -30,12 +30,23 @@ def open_amplifier(
     return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
 
 
-def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[Tone, ...]]:
-    """Convert to commands by name of the amplifier, for its `play` and `apply`.
+def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...]]:
+    """Convert to layers by name of the amplifier, for its `play` and `apply`.
 
-    Channels by the rig's wiring, levels 0..1 of full stroke, phases in degrees; without the
-    envelopes of a layer. Raises InputError for an unknown ERA.
+    One for each layer of an answer, and for each of its side bands, with its ramp, onset and
+    ending; channels by the rig's wiring. Raises InputError for an unknown ERA.
     """
     expect_rig(rig)
-    layers = route(excitation_of(drive, rig), rig, ramp=0.0)
-    return {name: layer.tones for name, layer in layers.items()}
+    voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]
+    routed = [
+        route(
+            each.excitation,
+            rig,
+            ramp=each.ramp,
+            number=number,
+            onset=each.onset,
+            ending=each.ending,
+        )
+        for number, each in enumerate(voices)
+    ]
+    return {name: tuple([each[name] for each in routed]) for name in rig.amplifiers}

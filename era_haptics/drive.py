@@ -1,7 +1,7 @@
-"""Drives in hertz, fractions of full stroke and degrees, and their conversion to excitations."""
+"""Drives in hertz, fractions of full stroke and degrees, and their conversion to layers."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import TypeAlias
@@ -10,7 +10,7 @@ from model.answer.answer import Answer, Layer
 from model.arguments import expect_number, shown
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.vibration.excitation import Excitation, Tone
+from model.vibration.excitation import Tone
 
 
 @dataclass(frozen=True)
@@ -46,44 +46,48 @@ class Drive:
 
 _UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
 
-Drives: TypeAlias = Mapping[str, "float | Drive | Tone"]
-"""By ERA name: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
+Driven: TypeAlias = float | Drive | Tone
+"""A frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
+
+Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
+"""By ERA name: what it plays, or several of them at once."""
 
 Played: TypeAlias = Answer | Layer | Drives
-"""What ERAs are to play: an answer of one layer, a layer, or drives."""
+"""What ERAs are to play: an answer with all its layers, one layer, or drives."""
 
 
-def layer_of(drive: Answer | Layer) -> Layer:
-    """The layer, the only one of an answer; raises InputError for an answer with several."""
-    if isinstance(drive, Layer):
-        return drive
-    if len(drive.layers) != 1:
-        raise InputError(
-            f"an answer must have one layer to be a drive, got {len(drive.layers)}; give one of "
-            "its layers"
-        )
-    return drive.layers[0]
-
-
-def excitation_of(drive: Played, rig: Rig) -> Excitation:
-    """A tone for each ERA; raises InputError for an unknown ERA."""
+def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
+    """The layers of an answer, or one; raises InputError for an unknown ERA, and for silence."""
     if isinstance(drive, Answer | Layer):
-        return layer_of(drive).excitation
+        layers = drive.layers if isinstance(drive, Answer) else (drive,)
+        if not layers:
+            raise InputError("an answer must have a layer to be played, got one of quiet fingers")
+        return layers
     if not isinstance(drive, Mapping):
         raise InputError(
             "drive must be an answer, a layer or a mapping of names of ERAs, such as "
             f'{{"SW": 110}}, got {shown(drive)}'
         )
-    tones = {}
+    tones: dict[str, list[Tone]] = {}
     for name, given in drive.items():
         if name not in rig.wiring:
             raise InputError(f"unknown ERA {name!r}; known are {', '.join(rig.wiring)}")
-        if isinstance(given, Tone):
-            for key, unit in _UNITS_OF_A_TONE.items():
-                expect_number(getattr(given, key), what=f"{key} of the tone of {name}", unit=unit)
-            tones[name] = given
-            continue
-        one = given if isinstance(given, Drive) else Drive(given)
-        amplitude = float(one.level) * rig.era(name).stroke
-        tones[name] = Tone(float(one.frequency), amplitude, math.radians(one.phase_deg))
-    return tones
+        several = given if isinstance(given, list | tuple) else (given,)
+        tones[name] = [_tone_of(one, name, rig) for one in several]
+    count = max([1, *map(len, tones.values())])
+    excitation, *others = (
+        {name: each[number] for name, each in tones.items() if number < len(each)}
+        for number in range(count)
+    )
+    return (Layer(excitation, side_bands=tuple(others)),)
+
+
+def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
+    """The tone of an ERA; raises InputError for what is none."""
+    if isinstance(given, Tone):
+        for key, unit in _UNITS_OF_A_TONE.items():
+            expect_number(getattr(given, key), what=f"{key} of the tone of {name}", unit=unit)
+        return given
+    one = given if isinstance(given, Drive) else Drive(given)
+    amplitude = float(one.level) * rig.era(name).stroke
+    return Tone(float(one.frequency), amplitude, math.radians(one.phase_deg))

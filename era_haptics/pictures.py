@@ -1,23 +1,21 @@
 """Pictures as matplotlib figures, without pyplot."""
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
-from era_haptics.drive import Played, excitation_of
+from era_haptics.drive import Played, layers_of
 from era_haptics.solved_plate import SolvedPlate
 from model.answer.answer import Answer
 from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.figures.contents_picture import contents_figure
 from model.figures.drawing import map_figure
-from model.figures.table_pictures import (
-    contrast_map_figure,
-    draw_fingertip,
-    draw_level_scale,
-    draw_levels,
-)
+from model.figures.table_pictures import contrast_map_figure, layer_figure
 from model.study.contrast_map import ContrastMap
 from model.table.table import LocalizationTable
 from sim.plant.excited_plate import Playback
@@ -30,7 +28,8 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
     The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
     """
     expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
-    active = excitation_of(drive, plate.rig).keys()
+    layers = layers_of(drive, plate.rig)
+    active = {name for layer in layers for each in layer.excitations for name in each}
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
 
@@ -46,21 +45,29 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
             f"layer must be the number of one of the answer's {len(answer.layers)}, from 0, got "
             f"{shown(layer)}"
         )
-    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
-    axes = figure.subplots()
-    axes.set_axis_off()
-    played = answer.layers[layer]
-    draw_levels(axes, table, played.excitation)
-    for number, each in enumerate(answer.fingers):
-        is_felt = number in played.fingers
-        level = each.level_db_sl if is_felt else None
-        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
-    promised = answer.fingers[played.fingers[0]].promised_contrast_db
-    if promised is not None:
-        title = f"contrast at least {promised:.0f} dB on nine of ten plates"
-        axes.set_title(title, fontsize=11, pad=20)
-    draw_level_scale(figure, [axes], shrink=0.8)
-    return figure
+    return layer_figure(table, answer, layer)
+
+
+def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
+    """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
+
+    Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
+    picture of `era demo`. Raises InputError for an answer without layers.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
+    if not answer.layers:
+        raise InputError("an answer must have a layer to be drawn, got one of quiet fingers")
+    return contents_figure(
+        table,
+        answer.layers,
+        [
+            replace(
+                each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db
+            )
+            for each in answer.fingers
+        ],
+    )
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
@@ -98,11 +105,10 @@ def draw_playback(playback: Playback) -> Figure:
     axes.grid(True, which="both", alpha=0.2)
     axes.legend(loc="lower right")
     if playback.contrast_db is not None:
-        axes.set_title(
-            f"contrast {playback.contrast_db:.1f} dB steady, "
-            f"{playback.transient_contrast_db:.1f} dB over the first 100 ms",
-            fontsize=11,
-        )
+        transient, title = playback.transient_contrast_db, f"contrast {playback.contrast_db:.1f} dB"
+        if transient is not None:
+            title += f" steady, {transient:.1f} dB over the first 100 ms"
+        axes.set_title(title, fontsize=11)
     return figure
 
 

@@ -1,14 +1,28 @@
 """The plate of a rig, solved once: modes, maps, and playback in time."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
+from typing import cast
 
-from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
-from era_haptics.drive import Played, excitation_of, layer_of
+import numpy as np
+
+from era_haptics.arguments import (
+    Fingers,
+    Positions,
+    as_fingers,
+    as_frequencies,
+    as_loads,
+    as_pair,
+    as_points,
+    as_signals,
+    expect_rig,
+)
+from era_haptics.drive import Played, layers_of
 from model.answer.answer import Answer, Layer
-from model.answer.fingers import Placement
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.fingers import Placement, Stimulus, check_on_plate, together
 from model.arguments import expect_number, is_whole, shown
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import (
@@ -18,18 +32,19 @@ from model.reduction.reduced_plate import (
     supported_modes,
 )
 from model.rig.rig import Rig
-from model.structure.attachments import footprints_of
-from model.vibration.excitation import Excitation, Tone
+from model.structure.attachments import check_loads, footprints_of
+from model.table.table import default_drive_frequencies
+from model.vibration.excitation import Tone
 from model.vibration.maps import PlateMap, plate_map
-from sim.plant.excited_plate import Playback, play
-from sim.plant.imperfections import Imperfections, draw_imperfections
+from sim.plant.excited_plate import Playback, play, play_signals
+from sim.plant.imperfections import Imperfections, draw_of_ensemble
 
 
 class SolvedPlate:
     """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
 
-    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era sim`
-    draws them; None for the rig's own. Solved once, at the first use, in some tenths of a second.
+    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era table
+    verify` draws them, on another mesh; None for the rig's own. Solved once, at the first use.
     """
 
     def __init__(self, rig: Rig, *, seed: int | None = None) -> None:
@@ -39,7 +54,7 @@ class SolvedPlate:
         if seed is not None:
             if not is_whole(seed) or seed < 0:
                 raise InputError(f"seed must be a whole number of at least 0, got {shown(seed)}")
-            self._drawn = draw_imperfections(rig, seed=int(seed))
+            self._drawn = draw_of_ensemble(rig, seed=int(seed))
         self._real = self._drawn.plate.realised(rig)
 
     def __repr__(self) -> str:
@@ -59,69 +74,129 @@ class SolvedPlate:
             self._reduced, rig.eras, loads=rig.masses, frequency_max=rig.limits.frequency_max
         )
 
+    def responses(
+        self,
+        points: Positions,
+        frequencies: Sequence[float] | FloatArray | None = None,
+        *,
+        fingers: Fingers = (),
+        seed: int | None = None,
+    ) -> ComplexArray:
+        """Compute the acceleration [m/s²] at points by each ERA alone at full stroke.
+
+        points (p, 2) [m]; frequencies (f,) [Hz]: those of a table by default; fingers: that rest on
+        the plate, as positions [m] or with their loads; seed: of another plate, as
+        `SolvedPlate(rig, seed=seed)`. Complex amplitudes (f, ERAs, p) of exp(+i omega t), ERAs as
+        in `rig.eras`: times weights in full strokes they are the field of `map`. Raises InputError
+        for points and fingers off the plate, and frequencies for which it is not solved.
+        """
+        if seed is not None:
+            drawn = SolvedPlate(self.rig, seed=seed)
+            return drawn.responses(points, frequencies, fingers=fingers)
+        resting, places = as_fingers(fingers, what="fingers"), as_points(points, what="points")
+        check_on_plate("point", places, self._real.plate)
+        check_on_plate("finger", [each.at for each in resting], self._real.plate)
+        check_loads([each.load for each in resting])
+        found = self._free.acceleration(
+            self._real.eras,
+            default_drive_frequencies(self.rig.limits)
+            if frequencies is None
+            else as_frequencies(frequencies),
+            np.reshape(places, (-1, 2)),
+            loads=[*self._real.masses, *self._drawn.resting(self.rig, resting)],
+        )
+        return found * self._drawn.factors(self.rig)[:, None]
+
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
+        All layers of an answer play. ERAs at one frequency add as complex amplitudes, magnitudes of
+        several frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot
+        play.
         """
         points = (
             None
             if raster is None
             else as_pair(raster, what="raster", such_as="points along x and y such as (61, 46)")
         )
-        excitation = {}
-        for name, tone in self._excitation(drive).items():
-            factor = self._drawn.errors_of(name, self.rig).factor
-            excitation[name] = Tone.from_phasor(tone.frequency, factor * tone.phasor)
-        return plate_map(self._real, excitation, raster=points, free=self._free)
+        names = [era.name for era in self.rig.eras]
+        factors = dict(zip(names, self._drawn.factors(self.rig).tolist(), strict=True))
+        excitations = [
+            {
+                name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
+                for name, tone in each.items()
+            }
+            for layer in self._layers(drive)
+            for each in layer.excitations
+        ]
+        return plate_map(self._real, *excitations, raster=points, free=self._free)
 
     def play(
         self,
-        drive: Played,
-        target: Positions,
+        drive: Played | FloatArray,
+        target: Positions | None = None,
         *,
         quiet: Positions = (),
         loads: Sequence[float] = (),
         duration: float = 1.0,
+        sample_rate: float | None = None,
     ) -> Playback:
-        """Compute what fingers at positions [m] feel during a duration [s], from rest.
+        """Compute what fingers feel during a duration [s], from rest.
 
-        A layer starts with its onset or its ramp, other drives with a ramp of 40 ms. Fingers
-        load the plate as the rig's fingertip; loads: of each relative to it, targets first, 1
-        without. The plate in time is solved exactly, without steps
-        (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a duration too
-        short for a steady state.
+        target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
+        each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
+        without. A layer starts with its onset or its ramp, drives with a ramp of 40 ms. With a
+        sample_rate [Hz] drive is an array (ERAs, samples) of band-limited signals in full strokes,
+        which say the duration and where records are sampled. The plate in time is solved exactly,
+        without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
+        duration too short for a steady state, and signals that no ERA can play.
         """
         expect_number(duration, what="duration", unit="seconds")
-        fingers = Placement(
-            as_points(target, what="target"),
-            as_points(quiet, what="quiet"),
-            loads=as_loads(loads),
-        )
-        layer = layer_of(drive) if isinstance(drive, Answer | Layer) else None
+        others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
+        placed = None if target is None else as_points(target, what="target")
+        if placed is not None:
+            fingers = together(Placement(placed, others, weighed), Stimulus())
+        elif isinstance(drive, Answer) and not others and not weighed:
+            fingers = [*drive.asked]
+        else:
+            raise InputError(
+                "target must be positions of fingers such as (0.08, 0.06), got None; only the "
+                "fingers of an answer, with their loads, are known without"
+            )
+        if isinstance(drive, np.ndarray) or sample_rate is not None:
+            return play_signals(
+                self.rig,
+                self._reduced,
+                as_signals(drive, self.rig, sample_rate),
+                fingers,
+                sample_rate=cast(float, sample_rate),
+                imperfections=self._drawn,
+            )
+        layers = self._layers(drive)
+        if placed is not None:
+            own = tuple(range(len(placed)))
+            layers = tuple([replace(each, fingers=own) for each in layers])
         return play(
             self.rig,
             self._reduced,
-            self._excitation(drive),
+            layers,
             fingers,
             duration=duration,
-            ramp=layer.ramp if layer else ONSET_RAMP,
-            onset=layer.onset if layer else None,
             imperfections=self._drawn,
         )
 
-    def _excitation(self, drive: Played) -> Excitation:
-        """The excitation; raises InputError beyond the frequencies that the plate is solved for."""
-        excitation, highest = excitation_of(drive, self.rig), self.rig.limits.frequency_max
-        for name, tone in excitation.items():
+    def _layers(self, drive: Played) -> tuple[Layer, ...]:
+        """The layers; raises InputError beyond the frequencies that the plate is solved for."""
+        layers, highest = layers_of(drive, self.rig), self.rig.limits.frequency_max
+        tones = [item for one in layers for each in one.excitations for item in each.items()]
+        for name, tone in tones:
             if tone.frequency > highest:
                 raise InputError(
                     f"frequency of {name} must be at most {highest:g} Hz, got {tone.frequency:g}; "
                     "raise limits.frequency of the rig"
                 )
-        return excitation
+        return layers
 
     @cached_property
     def _free(self) -> FreePlate:

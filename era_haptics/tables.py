@@ -2,9 +2,15 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TypeAlias, cast
 
-from era_haptics.arguments import Positions, as_frequencies, as_points, expect_rig
+from era_haptics.arguments import (
+    Fingers,
+    Positions,
+    as_fingers,
+    as_frequencies,
+    as_points,
+    expect_rig,
+)
 from model.answer.answer import Answer
 from model.answer.fingers import MUST, Finger, Stimulus
 from model.answer.measures import Measures
@@ -19,11 +25,8 @@ from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
+from model.table.build import cached_table
 from model.table.table import PAPER_GRID, LocalizationTable
-from model.table.table_cache import cached_table
-
-Fingers: TypeAlias = Positions | Sequence[Finger]
-"""Positions [m] of fingers, or fingers with their loads and bounds."""
 
 
 def table(
@@ -97,11 +100,10 @@ def answer(
     expect_number(apart_hz, what="apart_hz", unit="hertz")
     if drive_mode is not None:
         _expect_mode(drive_mode)
-    others = quiet if _are_fingers(quiet) else as_points(cast(Positions, quiet), what="quiet")
     found = _answer(
         table,
         fingers,
-        quiet=cast(Sequence[Finger], others),
+        quiet=as_fingers(quiet, what="quiet"),
         drive_mode=drive_mode,
         shaped=shaped,
         apart_hz=apart_hz,
@@ -148,11 +150,6 @@ def contrast_map(
         level_db_sl=float(level_db_sl),
         grid=grid,
     )
-
-
-def _are_fingers(given: object) -> bool:
-    """Whether these are fingers instead of positions."""
-    return isinstance(given, Sequence) and any(isinstance(each, Finger) for each in given)
 
 
 def _expect_mode(given: object) -> None:

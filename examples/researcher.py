@@ -84,13 +84,18 @@ show(era.draw_answer(table, only), "answer")
 """
 ## Each finger its own
 Both fingers shall feel something now, each its own vibration. What is promised is its level above
-the power of all others where that finger is.
+the power of all others where that finger is; played in time, it is what the finger feels of both.
 """
 
 # %%
 both = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (target, *quiet)])
-for felt in both.fingers:
-    print(f"{felt.finger.at}: {felt.verdict}, {felt.promised_contrast_db:.1f} dB promised")
+for said, felt in zip(both.fingers, plate.play(both).fingers, strict=True):
+    print(
+        f"{said.finger.at}: {said.verdict}, {said.promised_contrast_db:.1f} dB promised, "
+        f"{felt.contrast_db:.1f} dB felt; of the others at most "
+        f"{felt.foreign_levels_db_sl.max():.1f} dB SL while it starts"
+    )
+show(era.draw_contents(table, both), "contents")
 
 # %% [markdown]
 """
@@ -101,10 +106,7 @@ time, along a ramp and with shaped onsets, which keep the quiet finger quiet fro
 
 # %%
 shaped = era.query(table, target, quiet=quiet, shaped=True)
-played = {
-    name: (each, plate.play(each, target, quiet=quiet))
-    for name, each in (("ramp", only), ("shaped", shaped))
-}
+played = {name: (each, plate.play(each)) for name, each in (("ramp", only), ("shaped", shaped))}
 print("              steady / dB      first 100 ms / dB    target / dB SL")
 print("         predicted   felt    predicted   felt     predicted   felt")
 for name, (answer, felt) in played.items():
@@ -115,10 +117,7 @@ for name, (answer, felt) in played.items():
         f"{predicted.level_db_sl:11.1f} {felt.level_db_sl:8.1f}"
     )
 promised = only.fingers[0].promised_contrast_db
-drawn = [
-    era.SolvedPlate(rig, seed=seed).play(only, target, quiet=quiet).contrast_db
-    for seed in range(10)
-]
+drawn = [era.SolvedPlate(rig, seed=seed).play(only).contrast_db for seed in range(10)]
 print(
     f"on ten drawn plates {min(drawn):.1f} to {max(drawn):.1f} dB felt, "
     f"{sum(felt >= promised for felt in drawn)} of them at least the {promised:.1f} dB promised"

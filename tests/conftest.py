@@ -23,7 +23,7 @@ from hypothesis import HealthCheck, settings  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
-from model.table.table_cache import cached_table  # noqa: E402
+from model.table.build import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 from registry import garbage_collection  # noqa: E402
 from slowest_files import SLOWEST  # noqa: E402

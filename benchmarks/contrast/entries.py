@@ -8,10 +8,11 @@ nominal plate:
 
 - random: any frequency, levels and phases
 - time-reversal: each ERA by the conjugate of its field at the target
-- inverse-filter: least squares for 1 at the target and 0 at the others, Tikhonov's 1e-3
 - paper: one or two ERAs at full stroke, each at any frequency, the best nominally
 - era-haptics: `era.query`, mode phased
 - hindsight: climbed on the very plates that judge, at the four frequencies of best promise
+
+Those of acoustic contrast control and pressure matching are by `examples/sound_zones.py`.
 """
 
 import argparse
@@ -34,12 +35,8 @@ from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.build import build_table
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 from model.vibration.excitation import Excitation, Tone
-
-TIKHONOV = 1e-3
-"""Share of the largest eigenvalue that is added to all."""
 
 FREQUENCIES_IN_HINDSIGHT = 4
 
@@ -107,16 +104,6 @@ def _random(case: _Case) -> Excitation:
 def _time_reversal(case: _Case) -> Excitation:
     conjugate: ComplexArray = case.fields.conj()
     return case.best(case.weights @ conjugate)
-
-
-def _inverse_filter(case: _Case) -> Excitation:
-    fields, wanted = case.fields, case.is_target.astype(float)
-    adjoint = fields.conj().swapaxes(1, 2)
-    forms = adjoint @ fields
-    largest = np.linalg.eigvalsh(forms)[:, -1]
-    forms += TIKHONOV * largest[:, None, None] * np.eye(forms.shape[-1])
-    weights = np.linalg.solve(forms, adjoint @ wanted[:, None])[:, :, 0]
-    return case.best(weights.astype(np.complex128))
 
 
 def _paper(case: _Case) -> Excitation:
@@ -189,7 +176,6 @@ def _hindsight(case: _Case) -> Excitation:
 METHODS: Mapping[str, Callable[[_Case], Excitation]] = {
     "random": _random,
     "time-reversal": _time_reversal,
-    "inverse-filter": _inverse_filter,
     "paper": _paper,
     "era-haptics": _ours,
     "hindsight": _hindsight,

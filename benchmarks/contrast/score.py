@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.answer import Layer
+from model.answer.fingers import Stimulus, together
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
@@ -158,10 +159,8 @@ class _InTime:
         return play(
             self._rig,
             self._reduced,
-            excitation,
-            contacts.placement,
+            [Layer(excitation)],
+            together(contacts.placement, Stimulus()),
             duration=DURATION,
-            ramp=ONSET_RAMP,
-            onset=None,
             imperfections=self._drawn,
         ).contrast_db

@@ -25,7 +25,7 @@ from drivers.wires.serial_line.host import SerialWire
 from model.answer.timing import Timing
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.table.table_cache import cached_table
+from model.table.build import cached_table
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -89,7 +89,7 @@ def given(
     """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
     import numpy as np
 
-    from model.answer.ringing_under_fingers import RingingUnderFingers
+    from model.answer.over_duration import RingingUnderFingers
     from model.finger.fingertip import fingertip_points, fingertip_weights
     from model.study.exact_plates import draw_plates
     from model.table.following import table_following

@@ -58,7 +58,7 @@ class Case:
         }
 
 
-def robust_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, ComplexArray]:
+def loaded_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, ComplexArray]:
     """Score and weights (eras,) at one frequency from fields (eras, p): R w = conj(h).
 
     The loudest quiet points are given more weight in a few rounds.
@@ -95,7 +95,7 @@ def find_cases(rig: Rig, *, others: int, count: int, rng: np.random.Generator) -
             for each in contacts
         ]
         target, quiet = fields[0], np.concatenate(fields[1:], axis=-1)
-        found = [robust_weights(target[f], quiet[f]) for f in range(len(FREQUENCIES))]
+        found = [loaded_weights(target[f], quiet[f]) for f in range(len(FREQUENCIES))]
         order = np.argsort([-score for score, _ in found])
         cases.append(
             [

@@ -59,7 +59,17 @@ class HelloResult(Message):
     )
 
 
-class StatusResult(PatternFields, CauseAndRemedy):
+class StrengthResult(Message):
+    """The strengths of touch sources and clients that are known."""
+
+    strengths: dict[str, float] = Field(
+        default={},
+        description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
+        "sources that had fingers, clients that are connected, and what else is set",
+    )
+
+
+class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
@@ -181,6 +191,15 @@ class PlayParams(Message):
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
     level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
+
+
+class StrengthParams(Message):
+    """A touch source or client and its gain; without a gain nothing is set."""
+
+    name: Name = Field(description="of an input, a source or a client")
+    gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
+        None, description="of all that it brings, 0 for what layout and limits allow"
+    )
 
 
 class UnsubscribeParams(Message):

@@ -16,6 +16,8 @@ from controller.api.methods import (
     RequestedBy,
     StatusResult,
     StopResult,
+    StrengthParams,
+    StrengthResult,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
@@ -34,6 +36,7 @@ METHODS: dict[str, Method] = {
     "touch": Method(TouchParams, Empty, is_limited=False),
     "effects": Method(Empty, EffectsResult),
     "play": Method(PlayParams, Empty, is_repeated=False),
+    "strength": Method(StrengthParams, StrengthResult),
     "subscribe": Method(SubscribeParams, Empty, over_http=False),
     "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
 }

@@ -65,6 +65,7 @@ Topic: TypeAlias = Literal[
     "layout",
     "plate",
     "inputs",
+    "strength",
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
@@ -354,7 +355,7 @@ class PlateEvent(CauseAndRemedy):
     """What is known of the plate has changed, or whether it is followed."""
 
     state: LearningState
-    robust: bool = Field(
+    cautious: bool = Field(
         description="whether answers are those of a plate that is not known: it has changed in an "
         "unknown way, or there was no estimator for a minute"
     )

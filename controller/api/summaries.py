@@ -17,6 +17,7 @@ SUMMARIES = {
     "touch": "Report all fingers of a touch source of this client.",
     "effects": "List the effects.",
     "play": "Play an effect at a finger; only while armed.",
+    "strength": "Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms.",
     "subscribe": "Receive notifications of topics.",
     "unsubscribe": "Receive no more notifications of topics.",
 }

@@ -14,6 +14,7 @@ from pydantic import Field
 from controller.api.amplifier_status import AmplifierStatus
 from controller.api.connection import Connection
 from controller.api.jsonrpc import event_line
+from controller.api.methods import StrengthResult
 from controller.api.schema import (
     MAX_RATE,
     STATE_WORDS,
@@ -139,6 +140,9 @@ TOPICS: dict[Topic, TopicData] = {
     "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
     "inputs": TopicData(
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
+    ),
+    "strength": TopicData(
+        StrengthResult, "strengths of touch sources and clients, at rate_hz", "periodically"
     ),
 }
 """Every topic, by name."""

@@ -17,13 +17,13 @@ from model.choice import NEARLY
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, detection_threshold
+from model.finger.perception import decibels, over_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation
+from model.vibration.excitation import base_amplitudes
 
 Position = tuple[float, float]
 
@@ -96,13 +96,9 @@ class TouchSimulator:
         is_whole = pulse is not None and pulse.is_raised
         since = 0.0 if is_whole else STEADY_AFTER
         duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
-        bases = [
-            (frequency, ramped_pulse(part, self.table.eras, ramp=layer.ramp, duration=end))
-            for end in (since + duration,)
-            for frequency, part in _by_frequency(layer.excitation)
-        ]
+        end, eras = since + duration, self.table.eras
+        bases = ramped_pulse(layer.excitation, eras, ramp=layer.ramp, duration=end)
         transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
-        end = since + duration
         felt = self._levels_at(transients, at, bases, length=duration, until=end)
         level = float(felt[round(since * SAMPLE_RATE)])
         resting_level = promised = None
@@ -113,7 +109,7 @@ class TouchSimulator:
         return SimulatedTouch(
             at,
             resting,
-            tuple(frequency for frequency, _ in bases),
+            tuple(base_amplitudes(layer.excitation, eras)[0].tolist()),
             level,
             resting_level,
             promised,
@@ -132,7 +128,7 @@ class TouchSimulator:
         self,
         transients: Transients,
         at: Position,
-        bases: Sequence[tuple[float, Bases]],
+        bases: Bases,
         *,
         length: float,
         until: float,
@@ -143,27 +139,9 @@ class TouchSimulator:
         """
         plate = self.table.plate
         points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
-        power = np.zeros((round(until * SAMPLE_RATE), len(points)))
-        for frequency, motion in bases:
-            acceleration = transients.acceleration(motion, points, duration=until)
-            power = (
-                power
-                + (acceleration / detection_threshold(np.array(frequency), self.table.threshold))
-                ** 2
-            )
-        total = np.vstack([np.zeros(len(points)), np.cumsum(power, axis=0)])
+        acceleration = transients.acceleration(bases, points, duration=until)
+        felt = over_threshold(acceleration, SAMPLE_RATE, self.table.threshold)
+        total = np.vstack([np.zeros(len(points)), np.cumsum(felt**2, axis=0)])
         count = min(round(length * SAMPLE_RATE), len(total) - 1)
         mean = np.maximum((total[count:] - total[:-count]) / count, 0.0)
         return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
-
-
-def _by_frequency(excitation: Excitation) -> list[tuple[float, Excitation]]:
-    """Return the tones of each frequency [Hz], ascending."""
-    frequencies = sorted({tone.frequency for tone in excitation.values()})
-    return [
-        (
-            frequency,
-            {name: tone for name, tone in excitation.items() if tone.frequency == frequency},
-        )
-        for frequency in frequencies
-    ]

@@ -14,6 +14,7 @@ from controller.cli.daemon import (
     daemon,
     of_method,
     status,
+    strength,
     touch,
     watch,
 )
@@ -130,5 +131,8 @@ for _command in (demo, gateway, report, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))
-for _more in (arm, status):
-    app.command(help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}")(_more)
+for _more in (arm, status, strength):
+    app.command(
+        help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}",
+        context_settings={"ignore_unknown_options": _more is strength},  # -6 is a number
+    )(_more)

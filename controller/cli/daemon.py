@@ -1,5 +1,5 @@
 """`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`,
-`touch`, `watch`.
+`strength`, `touch`, `watch`.
 """
 
 import json
@@ -132,6 +132,26 @@ def of_method(method: str) -> Callable[..., None]:
             _print_state(era, as_json=as_json)
 
     return call
+
+
+def strength(
+    name: Annotated[
+        str, typer.Argument(metavar="SOURCE|CLIENT", help="As the JSON of era status has it.")
+    ],
+    gain_db: Annotated[
+        float | None, typer.Argument(metavar="[DB]", help="-40 to 0; default: show what is set.")
+    ] = None,
+    socket: Socket = None,
+    as_json: JsonOption = False,
+) -> None:
+    """It is kept by this name; what layout and limits allow is 0."""
+    with _client(socket) as era:
+        found = era.strength(name, gain_db=gain_db)
+    print_report(
+        [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()],
+        found.model_dump(),
+        as_json=as_json,
+    )
 
 
 def touch(

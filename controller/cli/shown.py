@@ -33,6 +33,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
         *map(_contact, status.contacts),
+        *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),
     ]
@@ -110,8 +111,8 @@ def _learning(learning: LearningSummary) -> list[str]:
         f"{counted(learning.corrections, 'correction')} of answers{within}"
     )
     return [
-        f"  plate {state.upper() if learning.robust else state}: {learning.cause}",
-        *_given(("    answers promise what a plate that is not known gives", learning.robust)),
+        f"  plate {state.upper() if learning.cautious else state}: {learning.cause}",
+        *_given(("    answers promise what a plate that is not known gives", learning.cautious)),
         *_given(("    remedy: {}", learning.remedy)),
         *_given(("    {}", measured if learning.readings else None)),
     ]

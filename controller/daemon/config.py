@@ -8,6 +8,7 @@ from pathlib import Path
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
+from controller.effects.strengths import read_strengths
 from controller.process.socket_lock import check_socket_path
 from controller.sources.touch import (
     TouchCalibration,
@@ -53,7 +54,8 @@ class DaemonConfig:
 
     rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
     it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
-    layout: None for the same effect everywhere.
+    layout: None for the same effect everywhere; strengths: file in which they are kept, None for as
+    long as the daemon runs.
     """
 
     source: Path
@@ -64,6 +66,7 @@ class DaemonConfig:
     table: Path | None
     learn: Path | None
     layout: SurfaceLayout | None
+    strengths: Path | None
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
@@ -98,7 +101,12 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     log_file = file_of(document, "log", "file")
     dump_folder = file_of(document, "dumps", "folder")
     learn = file_of(document, "learn")
+    strengths = file_of(document, "strengths")
     _check_folders(validation, log_file, dump_folder)
+    try:
+        read_strengths(strengths)
+    except InputError as error:
+        validation.add(("strengths",), str(error))
     _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:
@@ -116,6 +124,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         table=table,
         learn=learn,
         layout=layout,
+        strengths=strengths,
         touch=touch,
         socket=socket,
         log_file=log_file,

@@ -87,6 +87,7 @@ class DaemonSection(Section):
     learn: File | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
     layout: File | None = None
+    strengths: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
     socket: File | None = None

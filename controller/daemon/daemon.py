@@ -16,6 +16,7 @@ from controller.daemon.messages import amplifier_statuses
 from controller.daemon.methods import ApiService
 from controller.daemon.publisher import EventPublisher
 from controller.effects.player import EffectPlayer
+from controller.effects.strengths import Strengths, read_strengths
 from controller.learning.learning import Learning
 from controller.operation.dumps import FaultDumps
 from controller.operation.links import Supervisor
@@ -79,7 +80,9 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        self._layout = EffectPlayer(config.effective_layout)
+        self._layout = EffectPlayer(
+            config.effective_layout, Strengths(read_strengths(config.strengths))
+        )
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
         self._publisher = EventPublisher(

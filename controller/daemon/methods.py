@@ -7,6 +7,7 @@ import math
 import secrets
 import time
 from collections.abc import Awaitable, Mapping
+from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -24,6 +25,8 @@ from controller.api.methods import (
     RequestedBy,
     StatusResult,
     StopResult,
+    StrengthParams,
+    StrengthResult,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
@@ -55,6 +58,7 @@ from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 from registry import clock
+from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
 
@@ -87,6 +91,9 @@ class ApiService:
         self._learning = learning
         self._next_number = itertools.count(1)
         self._started = clock.now()
+        self._clients = set[Connection]()  # that are connected and have said or done something
+        layout.strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
+        self._saving = asyncio.Lock()
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
@@ -97,6 +104,7 @@ class ApiService:
         self._publisher.hub.forget(client)
         if client.number is not None:
             self._controller.lift(f"{_origin(client)}:")
+        self._clients.discard(client)
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -107,6 +115,7 @@ class ApiService:
     def hello(self, client: Connection, params: HelloParams) -> HelloResult:
         """Introduce the client; returns what the daemon drives."""
         client.name = params.client
+        self._clients.add(client)
         return hello_result(
             self._config,
             self._table,
@@ -144,6 +153,7 @@ class ApiService:
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.clicks_too_late,
             learning=self._publisher.learning_summary(),
+            strengths=self._publisher.strengths().strengths,
             slow_reason=why_slow(),
             uptime_s=now - self._started,
         )
@@ -255,6 +265,7 @@ class ApiService:
         """Report all fingers of a touch source of this client."""
         if client.number is None:
             client.number = next(self._next_number)
+            self._clients.add(client)
         plate, origin = self._config.rig.plate, _origin(client)
         touches = tuple(
             Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width)
@@ -307,9 +318,42 @@ class ApiService:
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
-        self._layout.play(params.effect, nearest, clock.now(), level_db_sl=params.level_db_sl)
+        self._layout.play(
+            params.effect,
+            nearest,
+            clock.now(),
+            level_db_sl=params.level_db_sl,
+            player=client.name,
+        )
         self._controller.request_update()
         return Empty()
+
+    @api_method()
+    async def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
+        """Set the strength of a touch source or client, or show it; the status shows all.
+
+        What plays is led there within 100 ms.
+        """
+        known, name = self._publisher.strengths().strengths, params.name
+        if name not in known:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"name must be a touch source or client, got {name!a}",
+                where="name",
+                remedy=f"choose one of {', '.join(known)}",
+            )
+        if params.gain_db is not None:
+            self._layout.strengths.set(name, params.gain_db)
+            self._controller.request_update()
+            if (file := self._config.strengths) is not None:
+                async with self._saving:  # the newest last
+                    try:
+                        await in_thread(
+                            partial(self._layout.strengths.save, file), name="strengths"
+                        )
+                    except OSError as error:
+                        _logger.error("strengths: not kept: %s", error)
+        return StrengthResult(strengths={name: self._layout.strengths.gains_db.get(name, 0.0)})
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

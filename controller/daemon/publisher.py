@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from controller.api.amplifier_status import AmplifierStatus
+from controller.api.methods import StrengthResult
 from controller.api.schema import (
     STATE_WORDS,
     LatencySummary,
@@ -88,6 +89,7 @@ class EventPublisher:
                 "layout": self.layout_event,
                 "plate": self._plate_event,
                 "inputs": inputs,
+                "strength": self.strengths,
             },
             clock=clock.now,
         )
@@ -168,6 +170,12 @@ class EventPublisher:
     def layout_event(self) -> LayoutEvent:
         """The surface layout as an event."""
         return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
+
+    def strengths(self) -> StrengthResult:
+        """The strengths of all touch sources and clients that are known."""
+        known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
+        names = sorted({*inputs, *known.sources, *[name for _, name in known.clients()]})
+        return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
 
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""

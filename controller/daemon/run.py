@@ -24,9 +24,9 @@ from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
 from model.counting import counted
 from model.errors import InputError
+from model.table.build import cached_table
 from model.table.file import load_table
 from model.table.table import LocalizationTable
-from model.table.table_cache import cached_table
 from registry.threads import leave_work
 
 _IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)

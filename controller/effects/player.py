@@ -8,6 +8,7 @@ from controller.effects.band import Band
 from controller.effects.effect import EffectRun, EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
+from controller.effects.strengths import Strengths
 from controller.play.intent import NO_CONTACTS, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
@@ -28,7 +29,7 @@ _MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 @dataclass
 class _Play:
-    """A run of an effect at one finger, numbered in order of start."""
+    """A run of an effect at one finger, numbered in order of start; player: who requested it."""
 
     name: str
     run: EffectRun
@@ -36,6 +37,7 @@ class _Play:
     priority: int
     band: Band | None
     region: Region | None
+    player: str | None = None
 
     @property
     def is_elsewhere(self) -> bool:
@@ -63,11 +65,12 @@ class EffectPlayer:
     Every finger feels its newest play; when that is over, the one before continues. Of the fingers
     that feel the effect outside of all regions only the newest does. Short pulses of two fingers
     are 60 ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
-    stimulus at the moment (no detent passed, no movement) does not count.
+    stimulus at the moment (no detent passed, no movement) does not count. strengths: of sources and
+    clients.
     """
 
-    def __init__(self, layout: SurfaceLayout) -> None:
-        self.layout = layout
+    def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
+        self.layout, self.strengths = layout, strengths or Strengths()
         self._already_pressed: dict[ContactKey, float] = {}  # since when [s], under another layout
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
@@ -89,7 +92,11 @@ class EffectPlayer:
         felt.sort()
         elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
         waiting, self._waiting = self._waiting, {}
-        sensing, targets = set[ContactKey](), list[Target]()
+        sensing, targets, gains_db = (
+            set[ContactKey](),
+            list[Target](),
+            dict[tuple[ContactKey, bool], float](),
+        )
         for number, play, contact, stimulus in felt:
             sensing.add(contact.key)
             if number in elsewhere[:-1]:
@@ -98,6 +105,9 @@ class EffectPlayer:
                 contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
             targets.append(target)
+            gains_db[target.key, target.is_short] = self.strengths.gain_db(
+                contact.key.source, play.player
+            )
             if target.key in waiting and target.is_short:
                 self._waiting[target.key] = waiting[target.key]
         now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
@@ -113,6 +123,7 @@ class EffectPlayer:
             "" if now_felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
             until=min(ends, default=None),
             protected=frozenset(protected),
+            gains_db=gains_db,
         )
 
     def why_not(self, key: ContactKey) -> str:
@@ -149,10 +160,19 @@ class EffectPlayer:
         finger = self._fingers.get(key)
         return finger.plays[-1].name if finger and finger.plays else None
 
-    def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
+    def play(
+        self,
+        name: str,
+        contact: Contact,
+        now: float,
+        *,
+        level_db_sl: float | None,
+        player: str | None = None,
+    ) -> None:
         """Start a named effect at a finger, again if it was requested there before.
 
-        level_db_sl: replaces its own unless None. Raises KeyError for an unknown effect.
+        level_db_sl: replaces its own unless None. player: the client whose strength it has. Raises
+        KeyError for an unknown effect.
         """
         effect = self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
@@ -167,6 +187,7 @@ class EffectPlayer:
         ]
         requested = REQUESTED_PRIORITY
         self._start(finger, finger.region, name, contact, now, level=level, priority=requested)
+        finger.plays[-1].player = player
 
     def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
         """Whether a short pulse must wait at a time [s] for its turn after those of others."""
@@ -233,6 +254,7 @@ class EffectPlayer:
         position = (contact.x, contact.y)
         finger = _Finger(contact.since, self.layout.region_at(*position), position)
         self._fingers[contact.key] = finger
+        self.strengths.note(contact.key.source)
         self._enter(finger, contact, now)
         if self._already_pressed.pop(contact.key, None) is not None:
             effects = self.layout.effects

@@ -139,9 +139,9 @@ def _gauges(status: StatusResult) -> list[_Row]:
             ("state",),
         ),
         (
-            "robust_answers",
+            "cautious_answers",
             "Whether answers are those of a plate that is not known.",
-            {(): getattr(learning, "robust", None)},
+            {(): getattr(learning, "cautious", None)},
             (),
         ),
         (

@@ -82,7 +82,7 @@ class Estimator:
             self.note,
             self.only_alarms,
             self._prepared(learned.current, whole=True) if is_resumed else None,
-            self._robust(),
+            self._cautious(),
             learned.change,
         )
 
@@ -115,7 +115,7 @@ class Estimator:
         if not self._is_refreshed and now >= self._refreshed_at + _REFRESH_INTERVAL:
             self._refreshed_at, self._is_refreshed = now, True
             whole = self._prepared(self._learned.current, whole=True)
-            done.append(RefreshedAnswers(whole, self._robust()))
+            done.append(RefreshedAnswers(whole, self._cautious()))
         return done
 
     def save(self) -> Note | None:
@@ -138,7 +138,7 @@ class Estimator:
         _ = table.in_time
         return Answers(self._base, table, whole)
 
-    def _robust(self) -> Answers:
+    def _cautious(self) -> Answers:
         wide = table_following(self._start.table, self._learned.cautious_rig)
         return self._prepared(wide, whole=False)
 

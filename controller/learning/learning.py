@@ -34,7 +34,7 @@ from model.table.table import LocalizationTable
 from registry import clock
 from registry.plugins import failure_text
 
-ROBUST_AFTER = 60.0
+CAUTIOUS_AFTER = 60.0
 """Time [s] without an estimator after which answers no longer trust what was learned."""
 
 _PAUSE = 10.0  # s; before the sensors are asked, or read, again after a failure
@@ -73,7 +73,7 @@ class Learning:
             state="off",
             cause="amplifiers not asked for their sensors yet",
             remedy=None,
-            robust=False,
+            cautious=False,
             alarms=0,
             readings=0,
             estimates=0,
@@ -87,7 +87,7 @@ class Learning:
         self._controller = controller
         self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
         self._answers = AnswersInUse(controller, table, timing)
-        self._robust: Answers | None = None
+        self._cautious: Answers | None = None
         self._only_alarms, self._is_held = "", False
         self._sensors: Sequence[PlateSensor] | None = None  # until they were read
         self._readings: SettledReadings | None = None
@@ -136,7 +136,7 @@ class Learning:
         if self.status.state == "off":
             raise CommandError(f"nothing is learned of the plate: {self.status.cause}")
         await self._end("opening", "estimator", "readings", "shaping")
-        self._estimator, self._readings, self._robust = None, None, None
+        self._estimator, self._readings, self._cautious = None, None, None
         self._note_lost(waiting=0)
         self._reset()
         try:
@@ -200,8 +200,8 @@ class Learning:
             case Estimate():
                 self._take(reply)
             case RefreshedAnswers():
-                self._robust = reply.robust
-                if not self.status.robust and not self._is_held:
+                self._cautious = reply.cautious
+                if not self.status.cautious and not self._is_held:
                     self._correct(reply.answers)
             case Note():
                 _logger.warning("plate: %s", reply.text)
@@ -210,11 +210,11 @@ class Learning:
         self._end_outage()
         if ready.note:
             _logger.warning("plate: learning anew: %s", ready.note)
-        self._robust, self._is_held = ready.robust, False
+        self._cautious, self._is_held = ready.cautious, False
         self._only_alarms = ready.only_alarms
         if ready.answers is not None:
-            self._correct(ready.answers, are_robust=bool(ready.change))
-        elif self.status.robust:
+            self._correct(ready.answers, is_cautious=bool(ready.change))
+        elif self.status.cautious:
             self._reset()
         if "readings" not in self._tasks:
             self._spawn("readings", self._read(ready.settling))
@@ -248,7 +248,7 @@ class Learning:
         if estimate.alarm:
             self._count(alarms=1)
         if estimate.answers is not None:
-            self._correct(estimate.answers, are_robust=bool(estimate.change))
+            self._correct(estimate.answers, is_cautious=bool(estimate.change))
             self._estimated(clock.now() - estimate.time)
         if estimate.change:
             if estimate.explanation or self.status.state != "changed":
@@ -267,11 +267,11 @@ class Learning:
 
     def _reset(self) -> None:
         self._answers.reset()
-        self.status = self.status.model_copy(update={"robust": False})
+        self.status = self.status.model_copy(update={"cautious": False})
 
-    def _correct(self, answers: Answers, *, are_robust: bool = False) -> None:
+    def _correct(self, answers: Answers, *, is_cautious: bool = False) -> None:
         self._answers.replace(answers)
-        self.status = self.status.model_copy(update={"robust": are_robust})
+        self.status = self.status.model_copy(update={"cautious": is_cautious})
         self._count(corrections=1)
         if answers.is_complete:
             self._spawn("shaping", self._answers.shape_anew())
@@ -293,24 +293,24 @@ class Learning:
             self._say("restarting", f"estimator: {reason}; retrying")
 
     def _await_outage(self) -> None:
-        """Answer robustly after a while, unless the plate is watched again by then."""
+        """Answer cautiously after a while, unless the plate is watched again by then."""
         if self._outage is None:
             loop = asyncio.get_running_loop()
-            self._outage = loop.call_later(ROBUST_AFTER, self._answer_robustly)
+            self._outage = loop.call_later(CAUTIOUS_AFTER, self._answer_cautiously)
 
     def _end_outage(self) -> None:
         if self._outage is not None:
             self._outage.cancel()
             self._outage = None
 
-    def _answer_robustly(self) -> None:
+    def _answer_cautiously(self) -> None:
         """Trust what was learned no longer, since nobody watches the plate."""
-        if self._robust is None or self.status.robust:
+        if self._cautious is None or self.status.cautious:
             return
-        self._correct(self._robust, are_robust=True)
+        self._correct(self._cautious, is_cautious=True)
         _logger.warning(
             "plate: not watched for %g s, answers are those of a plate that is not known",
-            ROBUST_AFTER,
+            CAUTIOUS_AFTER,
         )
         self._changed(self.status)
 

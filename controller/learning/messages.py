@@ -53,15 +53,15 @@ class Ready:
 
     settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
     nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
-    as learned before, None for the table as built; robust: for when the plate is not known; change:
-    how it had changed in a way that nothing known explains, as found then, or nothing.
+    as learned before, None for the table as built; cautious: for a plate that is not known;
+    change: how it had changed in a way that nothing known explains, as found then, or nothing.
     """
 
     settling: float
     note: str
     only_alarms: str
     answers: Answers | None
-    robust: Answers
+    cautious: Answers
     change: str
 
 
@@ -85,10 +85,10 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class RefreshedAnswers:
-    """Answers prepared whole while nothing else was to be done, and robust ones of that plate."""
+    """Answers prepared whole while nothing else was to be done, and cautious ones of that plate."""
 
     answers: Answers
-    robust: Answers
+    cautious: Answers
 
 
 @dataclass(frozen=True)

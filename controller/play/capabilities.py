@@ -14,7 +14,7 @@ from typing import Self
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
-from model.answer.strength import Limits
+from model.answer.answer import Limits
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig

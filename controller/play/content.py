@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from controller.play.intent import Pulse, Target
+from controller.play.intent import Gains, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import HELD_BACK, OWN, Layer
+from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, verdict_of
 from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
@@ -45,6 +45,36 @@ class Prediction:
     content: str | None = None
     nominal_db_sl: float | None = None
 
+    def weakened(self, gain_db: float, others_db: float) -> "Prediction":
+        """Return it with a gain [dB]; others_db: at most on others' contents.
+
+        Of its contrasts what is left at least.
+        """
+        gains = {
+            **dict.fromkeys(("level_db_sl", "nominal_db_sl"), gain_db),
+            **dict.fromkeys(("contrast_db", "promised_contrast_db"), min(gain_db - others_db, 0.0)),
+            "foreign_level_db_sl": others_db,
+        }
+        found: Prediction = replace(
+            self,
+            **{
+                key: level + gains[key]
+                for key in gains
+                if (level := getattr(self, key)) is not None
+            },
+        )
+        if (found.level_db_sl or 0.0) < 0 <= (self.level_db_sl or 0.0):
+            return replace(
+                found,
+                verdict=HELD_BACK,
+                held_back=f"a strength of {gain_db:g} dB leaves it below the threshold; raise it",
+            )
+        return (
+            replace(found, verdict=verdict_of(found.promised_contrast_db))
+            if self.verdict in (OWN, MIXED)
+            else found
+        )
+
 
 @dataclass(frozen=True)
 class Content:
@@ -52,7 +82,7 @@ class Content:
 
     targets: the finger whose content it is, then those that share it; placement: where they are,
     and all others; predictions: one per target; voice: 0, or the number of a side band of the
-    finger's content, which has no predictions.
+    finger's content, which has no predictions; gain_db: that the layer has, its fingers' strength.
     """
 
     targets: Targets
@@ -60,6 +90,7 @@ class Content:
     layer: Layer
     predictions: tuple[Prediction, ...] = ()
     voice: int = 0
+    gain_db: float = 0.0
 
     @property
     def key(self) -> tuple[ContactKey, int]:
@@ -115,6 +146,32 @@ class Selection:
         """Whether every target feels its own, so that who leaves changes nothing for others."""
         is_each_alone = all(len(content.targets) == 1 for content in self.contents)
         return bool(self.contents) and is_each_alone and not self.not_served
+
+    def weakened(self, gains_db: Gains) -> "Selection":
+        """Return it with the strengths of fingers; what several share has the lowest."""
+        if not (self.contents and any(gains_db.values())):
+            return self
+        gains = {
+            each.targets: min(
+                0.0, *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets]
+            )
+            for each in self.contents
+        }
+        contents = []
+        for each in self.contents:
+            gain = gains[each.targets]
+            others = [other for targets, other in gains.items() if targets != each.targets]
+            loudest = max(others, default=gain)
+            contents.append(
+                replace(
+                    each,
+                    layer=each.layer.scaled(gain),
+                    predictions=tuple([one.weakened(gain, loudest) for one in each.predictions]),
+                    gain_db=gain,
+                )
+            )
+        levels = {key: level + max(gains.values()) for key, level in self.quiet_levels.items()}
+        return replace(self, contents=tuple(contents), quiet_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
         """Return it without some contents, whose targets feel nothing for a reason."""

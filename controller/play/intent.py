@@ -4,7 +4,7 @@ The interface between the meaning of touches and their playback. All other conta
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -25,6 +25,9 @@ FADED_AFTER = 0.05
 """After the end of a pulse, or of a layer, by so long [s] none of it is left on any amplifier."""
 
 NO_CONTACTS = "no contact on the plate"
+
+Gains = Mapping[tuple[ContactKey, bool], float]
+"""Strengths [dB], 0 at most, of what is felt by a contact, and whether that is a short pulse."""
 
 
 @dataclass(slots=True, unsafe_hash=True)
@@ -100,13 +103,15 @@ class HapticIntent:
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
     none. until: when [s] the intent may change though no contact has; None for never. protected:
-    contacts that must not notice the contents of others.
+    contacts that must not notice the contents of others. gains_db: by which what is chosen for
+    targets is played weaker.
     """
 
     targets: tuple[Target, ...]
     reason: str = "no target"
     until: float | None = None
     protected: frozenset[ContactKey] = frozenset()
+    gains_db: Gains = field(default_factory=dict)
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""

@@ -133,11 +133,7 @@ def selection_of(
         if not served:
             continue
         contact, placed = served[0][0], found.placement(layer)
-        voices, own = [layer], tuple([(finger, target) for finger, target, _ in served])
-        if layer.side_bands:
-            voices = [
-                replace(layer, excitation=tones, side_bands=()) for tones in layer.excitations
-            ]
+        voices, own = layer.voices, tuple([(finger, target) for finger, target, _ in served])
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None

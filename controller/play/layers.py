@@ -36,6 +36,9 @@ from model.rig.rig import Rig
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
+STRENGTH_FADE = 0.100
+"""Time [s] within which what plays is led to another strength, along a raised cosine."""
+
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
@@ -245,7 +248,10 @@ class Layers:
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return those of the contents that are still wanted that have ended by themselves."""
         if self._over:
-            self._over = tuple(each for each in self._over if each in contents)
+            over = [(each.targets, each.placement, each.voice) for each in self._over]
+            self._over = tuple(
+                [one for one in contents if (one.targets, one.placement, one.voice) in over]
+            )
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
@@ -306,14 +312,15 @@ class Layers:
         settled = [0.0]
         for number in starting:
             content = numbers[number]
-            left = _all_left(content, now)
+            left, is_led = _all_left(content, now), self._is_led(number, content)
             layers[number], played = self.builder.build_pattern(
                 number,
-                content.layer,
+                replace(content.layer, ramp=STRENGTH_FADE) if is_led else content.layer,
                 content.placement,
                 playing=self._drive_of(number),
                 valid_for=self._lasts(content, left, now),
                 restarts=number in restarting,
+                is_led=is_led,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
                 lasts=min(left, default=math.inf),
                 among=len(starting),
@@ -325,6 +332,12 @@ class Layers:
             layers[number] = self.builder.build_end(number, has_endings=has_endings)
             settled.append(self.builder.end_ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+
+    def _is_led(self, number: int, content: Content) -> bool:
+        """Whether a content goes on in its layer at another strength."""
+        before = self.contents[number].content if number in self.contents else content
+        same = [(one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content)]
+        return same[0] == same[1] and before.gain_db != content.gain_db
 
     def _fades(self, sets: Sets) -> bool:
         """Whether anything that plays is ended or replaced."""

@@ -231,7 +231,8 @@ class Planner:
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)
             self._intent_due = intent.due(now)
-            selected = self._selector.select(contacts, intent, self.capabilities, now=now)
+            chosen = self._selector.select(contacts, intent, self.capabilities, now=now)
+            selected = chosen.weakened(intent.gains_db)
             if before is not None and selected == self._selected and now < self._retry_at:
                 self._answered(())
                 return self._go_on(before, now)

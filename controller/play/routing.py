@@ -84,6 +84,7 @@ class SetBuilder:
         playing: Drive,
         valid_for: float,
         restarts: bool = False,
+        is_led: bool = False,
         is_shaped: bool = True,
         lasts: float = math.inf,
         among: int = 1,
@@ -91,7 +92,7 @@ class SetBuilder:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
         playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
-        it restarts.
+        it restarts; nor does one that is led along its ramp, though an ERA joins it.
         valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
         onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
         among: layers that change at once, which share the time on the wires.
@@ -100,7 +101,9 @@ class SetBuilder:
         onset = ending = None
         restarted = restarted_by(tones, {} if restarts else playing)
         if is_shaped:
-            is_continued = not restarted.issuperset([tone.frequency for tone in tones.values()])
+            is_continued = is_led or not restarted.issuperset(
+                [tone.frequency for tone in tones.values()]
+            )
             is_ended = lasts > KNOT_STEP * ONSET_KNOTS
             layer = self.shape(placement, layer, is_continued, is_ended=is_ended)
             onset, ending = layer.onset, layer.ending

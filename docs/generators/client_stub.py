@@ -15,6 +15,7 @@ from controller.daemon.methods import ApiService
 from drivers.protocol.table import READINGS
 
 _HEAD = "# Written by docs/generators/client_stub.py."
+_WIDTH = 100  # of a line, as ruff has it
 
 
 def registered() -> dict[str, tuple[Method, str]]:
@@ -108,7 +109,10 @@ def stub() -> str:
         for name, method in made.items():
             signature = signature_of(method)
             result = "None" if method.result is Empty else method.result.__name__
-            lines.append(f"    {keyword} {name}({_parameters(signature)}) -> {result}: ...")
+            line = f"    {keyword} {name}({_parameters(signature)}) -> {result}: ..."
+            if len(line) > _WIDTH:
+                line = line.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
+            lines.append(line)
     return "\n".join(lines) + "\n"
 
 

@@ -2,7 +2,8 @@
 
     with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
         amplifier.arm()
-        amplifier.play([Tone(channel=0, frequency=110, level=0.2)], duration=0.5)
+        tone = Tone(channel=0, frequency=110, level=0.2)
+        amplifier.play([AmplifierLayer(0, (tone,))], duration=0.5)
 
 Only `play` and `measure`, while they wait, and `heartbeat` feed the watchdog: a script that hangs
 falls silent.
@@ -11,6 +12,7 @@ falls silent.
 import asyncio
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from types import TracebackType
 from typing import Any
 
@@ -28,14 +30,12 @@ from drivers.host.dialogue import Staged
 from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
-from drivers.playing.contents import Layer, Tone
+from drivers.playing.contents import Layer as AmplifierLayer
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED
 from drivers.protocol.timing import HEARTBEAT
 from registry.limits import GuardLimits
 from registry.threads import LoopThread
-
-_RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
 
 
 class BlockingAmplifier:
@@ -126,26 +126,26 @@ class BlockingAmplifier:
         """
         return self._wait(self._measured(frequencies, window))
 
-    def apply(
-        self, tones: Sequence[Tone], *, ramp: float = _RAMP, valid_for: float = 0.0
-    ) -> Staged:
-        """Play these tones from now on, all other channels silent; returns them as on the wire."""
-        return self._wait(self._applied(tones, ramp, valid_for))
+    def apply(self, layers: Sequence[AmplifierLayer]) -> Staged:
+        """Play these layers from now on, all else silent; returns them as on the wire."""
+        return self._wait(self._applied(layers))
 
-    def play(self, tones: Sequence[Tone], *, duration: float, ramp: float = _RAMP) -> Staged:
-        """Play these tones for a time [s], feed the watchdog and wait for the end.
+    def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> Staged:
+        """Play these layers for a time [s], feed the watchdog and wait for the end.
 
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
-        played = self.apply(tones, ramp=ramp, valid_for=duration)
+        _require_layers(layers)
+        played = self.apply([replace(each, valid_for=duration) for each in layers])
         self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
         return played
 
-    async def _applied(self, tones: Sequence[Tone], ramp: float, valid_for: float) -> Staged:
-        _require_tones(tones)
+    async def _applied(self, layers: Sequence[AmplifierLayer]) -> Staged:
+        _require_layers(layers)
         self._token = token_after(self._token)
-        layer = Layer(0, tuple(tones), ramp, valid_for)
-        return await self._amplifier.stage(self._token, [layer], now=True)
+        every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
+        ended = [AmplifierLayer(number) for number in every if number not in given]
+        return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
 
     async def _stopped(self) -> Stopped:
         return await self._amplifier.stop()
@@ -168,7 +168,7 @@ class BlockingAmplifier:
             self._loop.close()
 
 
-def _require_tones(tones: object) -> None:
-    """Raise CommandError for anything but a sequence of tones."""
-    if not (isinstance(tones, Sequence) and all(isinstance(one, Tone) for one in tones)):
-        raise CommandError(f"tones must be a list of Tone, got {type(tones).__name__}")
+def _require_layers(layers: object) -> None:
+    """Raise CommandError for anything but a sequence of layers."""
+    if not (isinstance(layers, Sequence) and all(isinstance(n, AmplifierLayer) for n in layers)):
+        raise CommandError(f"layers must be a list of AmplifierLayer, got {type(layers).__name__}")

@@ -24,6 +24,8 @@ export interface Methods {
   effects: { params: Empty; result: EffectsResult };
   /** Play an effect at a finger; only while armed. */
   play: { params: PlayParams; result: Empty };
+  /** Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms. */
+  strength: { params: StrengthParams; result: StrengthResult };
   /** Receive notifications of topics. */
   subscribe: { params: SubscribeParams; result: Empty };
   /** Receive no more notifications of topics. */
@@ -55,6 +57,8 @@ export interface Topics {
   plate: PlateEvent;
   /** touch inputs that are missing, mute or back; rejected touches, each second */
   inputs: InputsEvent;
+  /** strengths of touch sources and clients, at rate_hz */
+  strength: StrengthResult;
 }
 export type Topic = keyof Topics;
 
@@ -109,6 +113,8 @@ export interface StatusResult {
   /** the same, nominal */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
+  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, and what else is set */
+  strengths?: Record<string, number>;
   /** time of this response on CLOCK_MONOTONIC */
   time_s: number;
   /** the same time on the wall clock */
@@ -220,16 +226,30 @@ export interface PlayParams {
   level_db_sl?: number | null;
 }
 
+/** A touch source or client and its gain; without a gain nothing is set. */
+export interface StrengthParams {
+  /** of an input, a source or a client */
+  name: string;
+  /** of all that it brings, 0 for what layout and limits allow */
+  gain_db?: number | null;
+}
+
+/** The strengths of touch sources and clients that are known. */
+export interface StrengthResult {
+  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, and what else is set */
+  strengths?: Record<string, number>;
+}
+
 /** Topics to receive, and the rate of the periodic ones. */
 export interface SubscribeParams {
-  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs">;
+  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs" | "strength">;
   /** of amplifiers and latency; default 10 */
   rate_hz?: number | null;
 }
 
 /** Topics to receive no longer. */
 export interface UnsubscribeParams {
-  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs">;
+  topics: Array<"state" | "contacts" | "pattern" | "silence" | "amplifiers" | "latency" | "log" | "link" | "layout" | "plate" | "inputs" | "strength">;
 }
 
 /** The daemon changed its state. */
@@ -317,7 +337,7 @@ export interface PlateEvent {
   remedy: string | null;
   state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
-  robust: boolean;
+  cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
 }
@@ -452,7 +472,7 @@ export interface LearningSummary {
   remedy: string | null;
   state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
-  robust: boolean;
+  cautious: boolean;
   /** patterns so far that show another plate than the known one */
   alarms: number;
   /** settled patterns that were measured */

@@ -21,7 +21,7 @@ export interface Handlers {
 
 /** The plate over the gateway's WebSocket, connected again after every loss. */
 export class Connection {
-  constructor(token: string, topics: Topic[], handlers: Handlers, gateway?: string | URL);
+  constructor(token: string, topics: Topic[], handlers: Handlers, gateway?: string | URL, source?: string | null);
   readonly isOpen: boolean;
   readonly lease: ArmResult["lease"] | null;
   call<M extends Method>(method: M, ...params: Arguments<M>): Promise<Methods[M]["result"]>;
@@ -29,6 +29,7 @@ export class Connection {
   disarm(): Promise<unknown>;
   touch(touches: TouchPoint[]): void;
   lift(): void;
+  strength(name: string, gain_db?: number | null): Promise<number>;
   stop(): Promise<StopResult>;
   close(): void;
 }

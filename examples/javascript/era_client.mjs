@@ -111,6 +111,11 @@ export class EraClient extends EventEmitter {
     return this.call("stop", { client: this.#name });
   }
 
+  /** Set the strength of a touch source or client, by its name: -40 to 0 dB. */
+  strength(name, gain_db) {
+    return this.call("strength", { name, gain_db });
+  }
+
   /** Report all fingers, [[x, y], ...] in metres, the newest last; repeated until the next call. */
   touch(places, source = this.#name) {
     clearInterval(this.#repeat);

@@ -2,19 +2,18 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from model.answer.fingers import Finger, Placement
+from model.answer.fingers import ANY_BAND, Finger, Placement
 from model.answer.over_duration import ONSET_RAMP, pulse_ramp
 from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
-from model.drive_modes.tones import excitation_of
 from model.files.csv_file import as_frame
 from model.finger.perception import decibels
 from model.structure.attachments import Era
@@ -97,14 +96,59 @@ class Layer:
         """The excitation and its side bands."""
         return (self.excitation, *self.side_bands)
 
+    @property
+    def voices(self) -> tuple["Layer", ...]:
+        """It without side bands, and each of them as a layer, along its ramp."""
+        beside = [
+            Layer(each, self.fingers, ramp=self.ramp, drive_mode=self.drive_mode)
+            for each in self.side_bands
+        ]
+        return (replace(self, side_bands=()), *beside)
+
     def scaled(self, gain_db: float) -> "Layer":
-        """The layer louder by so much [dB]: contrasts stay."""
+        """The layer louder by so much [dB], its envelopes too: contrasts stay."""
         factor = 10 ** (gain_db / 20)
         louder = [
             {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
             for each in self.excitations
         ]
-        return replace(self, excitation=louder[0], side_bands=tuple(louder[1:]))
+        onset, ending = [
+            each and {name: one.scaled(factor) for name, one in each.items()}
+            for each in (self.onset, self.ending)
+        ]
+        return replace(
+            self,
+            excitation=louder[0],
+            side_bands=tuple(louder[1:]),
+            onset=onset,
+            ending=ending,
+        )
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the amplifiers.
+
+    frequencies: lowest and highest [Hz]; amplitudes: largest ones [m], by ERA, None for the
+    strokes; power: sum of squared levels of all ERAs; slew [1/s]: highest rise of one.
+    """
+
+    frequencies: tuple[float, float] = ANY_BAND
+    amplitudes: Mapping[str, float] | None = None
+    power: float = math.inf
+    slew: float = math.inf
+
+    def factor_within(self, total: Mapping[str, float], strokes: Mapping[str, float]) -> float:
+        """Return the factor, 1 at most, by which amplitudes [m] are within; strokes [m]: by ERA."""
+        share, power = 1.0, 0.0
+        highest = self.amplitudes or strokes
+        for name, amplitude in total.items():
+            share = max(share, amplitude / highest[name])
+            power += (amplitude / strokes[name]) ** 2
+        return 1.0 / max(share, math.sqrt(power / self.power))
+
+
+NO_LIMITS = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +179,14 @@ class Answer:
     def fingers(self) -> tuple[Sensation, ...]:
         """What each finger gets, in the order in which they were given."""
         found, tones = dict[int, Sensation](), self.tones
+        known = [  # None for what there is not
+            [None if each != each else each for each in (*contrasts, of_others)]
+            for contrasts, of_others in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
+        ]
         for number, stream in enumerate(self.contents.streams):
             lowered = self.lowered_db(number)
             for finger in stream.targets:
-                contrast, median, promised, of_others = self._known_of(finger)
+                contrast, median, promised, of_others = known[finger]
                 level, promised_level = tones.level_db_sl[finger]
                 found[finger] = Sensation(
                     self.asked[finger],
@@ -157,12 +205,12 @@ class Answer:
                 self.asked[finger],
                 HELD_BACK,
                 promised_contrast_db=had,
-                foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                foreign_level_db_sl=known[finger][-1],
                 is_disturbing=is_disturbing,
             )
         for finger, each in enumerate(self.asked):
             if each.stimulus is None:
-                contrast, median, promised, of_others = self._known_of(finger)
+                contrast, median, promised, of_others = known[finger]
                 found[finger] = Sensation(
                     each,
                     QUIET,
@@ -173,18 +221,16 @@ class Answer:
                 )
         return tuple([found[number] for number in range(len(self.asked))])
 
-    def _known_of(self, finger: int) -> list[float | None]:
-        """Contrasts at a finger, and the level of others' vibrations; None for one there is not."""
-        tones = self.tones
-        figures = (*tones.contrast_db[finger], tones.foreign_db_sl[finger])
-        return [None if each != each else each for each in figures]
-
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """What is played, a layer for each vibration."""
         layers, least = [], self.contents.least_ramp
         for number, stream in enumerate(self.contents.streams):
-            excitation, *sides = self._excitations(number)
+            excitation, *sides = self.tones.excitations(number, self.eras, self.frequencies)
+            if self.contents.drive_mode != UNRESTRICTED:  # all tones are one excitation
+                every = (excitation, *sides)
+                excitation = {name: tone for each in every for name, tone in each.items()}
+                sides = []
             duration = None if self.contents.is_shaped else stream.duration
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
@@ -236,12 +282,14 @@ class Answer:
     @property
     def amplitudes(self) -> dict[str, float]:
         """Amplitude of each ERA [m], of all that plays together."""
-        return amplitudes_of([each for layer in self.layers for each in layer.excitations])
+        every = [each for layer in self.layers for each in (layer.excitation, *layer.side_bands)]
+        return amplitudes_of(every)
 
     @property
     def promised_worst_db(self) -> float | None:
         """The least contrast of all fingers, on nine of ten plates; None for one finger alone."""
-        return _known(self.tones.worst_db)
+        worst = self.tones.worst_db
+        return None if math.isnan(worst) else worst
 
     @property
     def lacks_contrast(self) -> bool:
@@ -260,22 +308,6 @@ class Answer:
     def stroke_factor(self) -> float:
         """Of the requested levels what the ERAs' stroke allows, 1 for all."""
         return self.tones.stroke_factor
-
-    def _excitations(self, content: int) -> list[Excitation]:
-        """The tones of a content, its carrier first; in other modes than `phased` they are one."""
-        tones, on = self.tones, (self.eras, self.frequencies)
-        if self.contents.drive_mode != UNRESTRICTED:
-            return [
-                excitation_of(
-                    [*zip(tones.rows, tones.weights, strict=True)], *on, gain=tones.gains[0]
-                )
-            ]
-        every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
-        return [
-            excitation_of([(row, weights)], *on, gain=gain)
-            for row, weights, gain, owner in every
-            if owner == content
-        ]
 
     @property
     def _contrast_to_plate_db(self) -> float | None:
@@ -311,11 +343,6 @@ class Answer:
                 "foreign_level_db_sl": [each.foreign_level_db_sl for each in found],
             }
         )
-
-
-def _known(figure: float) -> float | None:
-    """A figure, None for one that there is not."""
-    return None if math.isnan(figure) else figure
 
 
 def verdict_of(promised_contrast_db: float | None) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from model.arguments import expect_number, shown
 from model.arrays import Point
 from model.config.points import in_metres
-from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -208,13 +207,6 @@ def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
         Finger(at, stimulus if n < count else None, load, sharing=MUST)
         for n, (at, load) in enumerate(zip(placed.contacts, loads, strict=True))
     ]
-
-
-def checked_mode(name: str) -> str:
-    """Return the name of a drive mode; raises InputError for any other."""
-    if name not in DRIVE_MODES:
-        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {shown(name)}")
-    return name
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:

@@ -7,13 +7,11 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
 from model.drive_modes.forms import Forms
-from model.ensemble.draws import Drawing
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate, outer
 from model.table.raster import FingertipShapes
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 
 MAX_FINGERS_BY_POINT = 4
 """Quiet fingers up to which the points of each are looked at one by one in a search."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from model.answer.answer import MIN_CONTRAST_DB, SAME_LEVEL, Answer
+from model.answer.answer import MIN_CONTRAST_DB, NO_LIMITS, SAME_LEVEL, Answer, Limits
 from model.answer.fingers import (
     ANY,
     MIN_LEVEL_DB_SL,
@@ -24,25 +24,21 @@ from model.answer.fingers import (
     Placement,
     Stimulus,
     check_fingers,
-    checked_mode,
     together,
 )
 from model.answer.modulation import is_served, with_modulation
 from model.answer.search import APART_HZ, Contents, Stream, Tones
 from model.answer.search_in_c import choose_tones
 from model.answer.strength import (
-    NO_LIMITS,
-    Limits,
     as_quiet_fingers_allow,
     as_ramps_allow,
     gains_within,
     scaled,
     with_gains,
 )
-from model.arguments import expect_between
 from model.arrays import Point
 from model.choice import NEARLY, best_by, best_of
-from model.drive_modes import UNRESTRICTED
+from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
 from model.table.table import EFFECT_DURATIONS, LocalizationTable
@@ -81,7 +77,8 @@ def answer(
     do not allow all: of the lower priorities first, of one priority the louder ones first.
     Raises InputError for fingers that contradict each other, and a band without frequencies.
     """
-    expect_between(apart_hz, 0.0, what="apart_hz")
+    if not 0 <= apart_hz < math.inf:  # False for NaN
+        raise InputError(f"apart_hz must be a distance of frequencies in Hz, got {apart_hz}")
     every = (*fingers, *[each if isinstance(each, Finger) else Finger(each) for each in quiet])
     check_fingers(every, table.plate)
     mode = checked_mode(drive_mode or table.drive_mode)

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer
 from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.over_duration import on_drawn_plates, shaped_gain
-from model.answer.ringing_under_fingers import RingingUnderFingers
+from model.answer.over_duration import RingingUnderFingers, on_drawn_plates, shaped_gain
 from model.answer.search import PROMISED_PERCENTILE, Contents, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import NEARLY
-from model.ensemble.draws import PROMISED_DRAWS
-from model.ensemble.measures import percentile
+from model.ensemble.draws import PROMISED_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import LocalizationTable
 

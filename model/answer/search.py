@@ -13,14 +13,18 @@ of the highest contrast at its level.
 `model.answer.search_in_c` finds them in C, `model.answer.search_in_numpy` in numpy.
 """
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray, Point
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, Point
+from model.choice import NEARLY
 from model.drive_modes import UNRESTRICTED
+from model.structure.attachments import Era
+from model.vibration.excitation import Excitation, Tone
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.
@@ -50,6 +54,8 @@ APART_HZ = 30.0
 
 REACHED = 1 - 1e-5
 """Of a level, what counts as reached."""
+
+_ROUNDING = 1e-6  # of single precision
 
 
 @dataclass(frozen=True)
@@ -156,6 +162,34 @@ class Tones:
     loudest_db_sl: float
     stroke_factor: float
     is_apart: bool
+
+    def excitations(
+        self, content: int, eras: Sequence[Era], frequencies: FloatArray
+    ) -> list[Excitation]:
+        """What plays a content, a tone of each ERA for each of its tones, its carrier first.
+
+        frequencies: of the table [Hz]. The strongest ERA, the first of those nearly as strong, has
+        phase zero.
+        """
+        found = list[Excitation]()
+        every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
+        for row, values, gain, owner in every:
+            if owner != content:
+                continue
+            frequency, tones = float(frequencies[row]), dict[str, Tone]()
+            # Python's numbers: numpy's take ten times as long, one by one.
+            enough = (1 - NEARLY) * max(map(abs, values))
+            (strongest, *_) = [value for value in values if abs(value) >= enough]
+            factor = strongest.conjugate() / abs(strongest)
+            for era, value in zip(eras, values, strict=True):
+                if value != 0:
+                    w = value * factor
+                    if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
+                        w = w.real
+                    amplitude = gain * min(abs(w), 1.0) * era.stroke
+                    tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
+            found.append(tones)
+        return found
 
     @classmethod
     def none(cls, fingers: int) -> "Tones":

@@ -30,12 +30,10 @@ from model.compiled.structures import (
 )
 from model.drive_modes import UNRESTRICTED, coherent
 from model.drive_modes.forms import LEVEL_MARGIN
-from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
-from model.ensemble.measures import PERCENTILE
+from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS
 from model.ensemble.touched_by_kernel import draws_structure, plates_structure
 from model.ensemble.touched_plate import RIDGE
-from model.table.raster_kernel import given_raster
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, given_raster
 
 
 def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:

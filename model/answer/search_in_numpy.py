@@ -11,9 +11,8 @@ from model.answer.fingers_on_plate import (
     FingerForms,
     FingersOnPlate,
 )
-from model.answer.over_duration import forms_of, forms_over, on_drawn_plates
+from model.answer.over_duration import RingingUnderFingers, forms_of, forms_over, on_drawn_plates
 from model.answer.promised import promised
-from model.answer.ringing_under_fingers import RingingUnderFingers
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_few, best_first, best_of
@@ -27,8 +26,7 @@ from model.drive_modes.coherent import (
 )
 from model.drive_modes.forms import Drive, Forms
 from model.drive_modes.switched import find_switched, max_sensation_switched
-from model.ensemble.draws import JUDGING_DRAWS
-from model.ensemble.measures import percentile
+from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 

@@ -2,44 +2,17 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer, amplitudes_of
-from model.answer.fingers import ANY_BAND
+from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer, Limits, amplitudes_of
 from model.answer.promised import share_stroke, with_tones
 from model.arrays import FloatArray
 from model.finger.perception import decibels
 from model.table.table import LocalizationTable
 
 _SILENT_DB = -60.0  # a gain by which a content is not felt
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of the amplifiers.
-
-    frequencies: lowest and highest [Hz]; amplitudes: largest ones [m], by ERA, None for the
-    strokes; power: sum of squared levels of all ERAs; slew [1/s]: highest rise of one.
-    """
-
-    frequencies: tuple[float, float] = ANY_BAND
-    amplitudes: Mapping[str, float] | None = None
-    power: float = math.inf
-    slew: float = math.inf
-
-    def factor_within(self, total: Mapping[str, float], strokes: Mapping[str, float]) -> float:
-        """Return the factor, 1 at most, by which amplitudes [m] are within; strokes [m]: by ERA."""
-        share, power = 1.0, 0.0
-        highest = self.amplitudes or strokes
-        for name, amplitude in total.items():
-            share = max(share, amplitude / highest[name])
-            power += (amplitude / strokes[name]) ** 2
-        return 1.0 / max(share, math.sqrt(power / self.power))
-
-
-NO_LIMITS = Limits()
 
 
 def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:

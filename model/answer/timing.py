@@ -7,8 +7,7 @@ from functools import partial
 from model.answer.answer import Answer, Layer
 from model.answer.fingers import Placement
 from model.arrays import FloatArray, Point
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper

@@ -1,9 +1,11 @@
 """Results of a calibration."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.sensed_plate import Parameter
+from model.files.csv_file import as_frame
 from model.rig.rig import Rig
 
 MAX_FIT_ERROR = 0.25
@@ -94,6 +96,21 @@ class Calibration:
     measured: ComplexArray
     before: ComplexArray
     after: ComplexArray
+
+    def to_frame(self) -> Any:
+        """Parameters before and after, their units and errors, as a pandas DataFrame.
+
+        A row a parameter; needs pandas.
+        """
+        return as_frame(
+            {
+                "parameter": [each.parameter.name for each in self.parameters],
+                "unit": [each.parameter.unit for each in self.parameters],
+                "before": [each.before for each in self.parameters],
+                "after": [each.value for each in self.parameters],
+                "standard_error": [each.standard_error for each in self.parameters],
+            }
+        )
 
     @property
     def is_good(self) -> bool:

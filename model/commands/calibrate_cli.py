@@ -1,13 +1,12 @@
 """`era calibrate`: fit a rig to responses measured on it."""
 
-import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from model.commands.fitted_rig_cli import check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument, Stopwatch
 from model.counting import counted
 from model.files.replacing import check_picture
 
@@ -53,10 +52,9 @@ def calibrate(
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_measured(measured_file), rig)
-    started = time.perf_counter()
-    screened = check_consistency(rig, responses)
-    calibration = fit(rig, responses, screened, all_scales=all_scales)
-    elapsed = time.perf_counter() - started
+    with Stopwatch() as timed:
+        screened = check_consistency(rig, responses)
+        calibration = fit(rig, responses, screened, all_scales=all_scales)
     rows = calibration_report.change_rows(calibration)
     notes = [
         *calibration_report.finding_rows(calibration),
@@ -86,6 +84,6 @@ def calibrate(
         if as_json
         else None,
         files=files,
-        elapsed=elapsed,
+        elapsed=timed.elapsed,
         refusal=None if calibration.is_good else _NO_FIT,
     )

@@ -1,6 +1,5 @@
 """`era figure`: the founding paper's figures."""
 
-import time
 from typing import Annotated
 
 import typer
@@ -10,6 +9,7 @@ from model.commands.options import (
     JsonOption,
     MeshOption,
     RigArgument,
+    Stopwatch,
     next_line,
     print_report,
 )
@@ -38,21 +38,20 @@ def figure(
 
     rig = load_rig(rig_file, mesh=mesh)
     output.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
     names, files = [], []
-    for made in paper_figures(rig, number):
-        picture = output / f"{made.name}.png"
-        save_figure(made.figure, picture)
-        tables = [output / f"{made.name}{suffix}.csv" for suffix in made.tables]
-        for table, columns in zip(tables, made.tables.values(), strict=True):
-            write_columns(table, columns)
-        names.append(made.name)
-        files += [str(path) for path in (picture, *tables)]
-    elapsed = time.perf_counter() - started
+    with Stopwatch() as timed:
+        for made in paper_figures(rig, number):
+            picture = output / f"{made.name}.png"
+            save_figure(made.figure, picture)
+            tables = [output / f"{made.name}{suffix}.csv" for suffix in made.tables]
+            for table, columns in zip(tables, made.tables.values(), strict=True):
+                write_columns(table, columns)
+            names.append(made.name)
+            files += [str(path) for path in (picture, *tables)]
     rows = [
-        f"{elapsed:.1f} s, mesh {rig.mesh}; wrote",
+        f"{timed.elapsed:.1f} s, mesh {rig.mesh}; wrote",
         *(f"  {name}" for name in files),
         next_line("era", "design", rig_file, "-o", "design"),
     ]
     answer = {"figures": names, "mesh": [rig.mesh.nx, rig.mesh.ny]}
-    print_report(rows, answer | {"time_s": elapsed, "files": files}, as_json=as_json)
+    print_report(rows, answer | {"time_s": timed.elapsed, "files": files}, as_json=as_json)

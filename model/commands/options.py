@@ -97,6 +97,19 @@ def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_js
     sys.stdout.write(f"{text}\n")
 
 
+class Stopwatch:
+    """The time that a block takes: `elapsed` [s] after it."""
+
+    elapsed = 0.0
+
+    def __enter__(self) -> "Stopwatch":
+        self._started = time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.elapsed = time.perf_counter() - self._started
+
+
 _LINE_INTERVAL = 2.0  # s
 
 

@@ -2,7 +2,6 @@
 
 import math
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -15,6 +14,7 @@ from model.commands.options import (
     MeshOption,
     RigArgument,
     SizeOption,
+    Stopwatch,
     figure_size,
     next_line,
     print_report,
@@ -53,9 +53,8 @@ def modes(
     from model.vibration.natural_modes import natural_modes
 
     rig = load_rig(rig_file, mesh=mesh)
-    started = time.perf_counter()
-    solved = natural_modes(rig, count, support=support.value)
-    elapsed = time.perf_counter() - started
+    with Stopwatch() as timed:
+        solved = natural_modes(rig, count, support=support.value)
     carried = solved.mesh.highest_frequency(rig.plate)
     name = solved.mesh.element_name
     element = "" if name in str(solved.mesh) else f" {name}"
@@ -70,7 +69,7 @@ def modes(
         "--mesh for those frequencies"
         if solved.frequencies[-1] > carried
         else None,
-        f"solved in {elapsed:.2f} s",
+        f"solved in {timed.elapsed:.2f} s",
     ]
     answer = {
         "frequencies_hz": solved.frequencies.tolist(),
@@ -79,7 +78,7 @@ def modes(
         "mesh": [solved.mesh.nx, solved.mesh.ny],
         "dof": solved.mesh.dof,
         "element": solved.mesh.element_name,
-        "solve_time_s": elapsed,
+        "solve_time_s": timed.elapsed,
     }
     print_report(rows, answer, as_json=as_json)
 
@@ -115,9 +114,9 @@ def plate_map(
         check_picture(output)
     rig = load_rig(rig_file, mesh=mesh)
     excitation = parse_drives(drive, rig)
-    started = time.perf_counter()
-    solved = solve(rig, excitation, raster=parse_pair(points, what="--points") if points else None)
-    elapsed = time.perf_counter() - started
+    raster = parse_pair(points, what="--points") if points else None
+    with Stopwatch() as timed:
+        solved = solve(rig, excitation, raster=raster)
     unsupported = support_problem(rig.plate, rig.eras, loads=rig.masses)
     for warning in (beyond_limits(excitation, rig), unsupported):
         if warning:
@@ -132,7 +131,7 @@ def plate_map(
 
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
     rows = [
-        f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {elapsed:.2f} s",
+        f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {timed.elapsed:.2f} s",
         f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
         f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m",
         f"median   {float(np.median(solved.peak)) / G:8.2f} g",
@@ -150,7 +149,7 @@ def plate_map(
         "nulls_m": solved.nulls.tolist(),
         "is_supported": unsupported is None,
         "mesh": [rig.mesh.nx, rig.mesh.ny],
-        "solve_time_s": elapsed,
+        "solve_time_s": timed.elapsed,
         "files": [str(output)] if output else [],
     }
     print_report(rows, answer, as_json=as_json)
@@ -181,12 +180,10 @@ def convergence(
 
     rig = load_rig(rig_file, mesh=mesh)
     chosen = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
-    started = time.perf_counter()
-    with progress_bar("meshes") as progress:
+    with Stopwatch() as timed, progress_bar("meshes") as progress:
         study = study_convergence(
             rig, meshes_to_compare(rig), frequencies=chosen, progress=progress
         )
-    elapsed = time.perf_counter() - started
     meshes = [
         {
             "mesh": [error.mesh.nx, error.mesh.ny],
@@ -213,11 +210,11 @@ def convergence(
         "meshes": meshes,
         "moved_era_change_percent": (100 * study.by_place).tolist(),
         "wider_foot_change_percent": (100 * study.by_foot).tolist(),
-        "solve_time_s": elapsed,
+        "solve_time_s": timed.elapsed,
     }
     heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in chosen)
     rows = [
-        f"{rig_file}: errors against {study.reference}, solved in {elapsed:.1f} s",
+        f"{rig_file}: errors against {study.reference}, solved in {timed.elapsed:.1f} s",
         "natural frequencies: maximum of the lowest twelve, on the ERAs; response: relative L2",
         "error of the acceleration over the plate, maximum over the ERAs driven alone",
         "",

@@ -1,6 +1,5 @@
 """`era table build`, `plot`, `map` and `export`: files of a table."""
 
-import time
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +13,7 @@ from model.commands.options import (
     MeshOption,
     RigArgument,
     SizeOption,
+    Stopwatch,
     TableArgument,
     figure_size,
     next_line,
@@ -74,16 +74,16 @@ def plot(
     inches = figure_size(size)
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
     files = []
-    with progress_bar("questions") as progress:
-        overview = find_overview(table, progress=progress)
-    for name, figure in table_figures(table, overview):
-        path = output / f"{name}.{to.value}"
-        save_figure(figure, path, inches=inches)
-        files.append(str(path))
+    with Stopwatch() as timed:
+        with progress_bar("questions") as progress:
+            overview = find_overview(table, progress=progress)
+        for name, figure in table_figures(table, overview):
+            path = output / f"{name}.{to.value}"
+            save_figure(figure, path, inches=inches)
+            files.append(str(path))
     rows = [
-        f"{time.perf_counter() - started:.1f} s; wrote",
+        f"{timed.elapsed:.1f} s; wrote",
         *(f"  {file}" for file in files),
         next_line("era", "table", "show", table_file, "--weak"),
     ]
@@ -168,8 +168,7 @@ def contrast_map(
     fingers = [parse_point(text, what="--quiet") for text in quiet]
     places = Grid(*parse_pair(grid, what="--grid")) if grid else None
     table = load_table(table_file)
-    started = time.perf_counter()
-    with progress_bar("places") as progress:
+    with Stopwatch() as timed, progress_bar("places") as progress:
         found = map_contrast(
             table,
             fingers,
@@ -178,7 +177,6 @@ def contrast_map(
             grid=places,
             progress=progress,
         )
-    elapsed = time.perf_counter() - started
     if output is not None and is_csv:
         from model.files.csv_file import write_columns
 
@@ -192,11 +190,11 @@ def contrast_map(
     target = f"{found.x[0]:.3g},{found.y[0]:.3g}"
     rows = [
         *_map_rows(found),
-        f"computed in {elapsed:.1f} s{'' if output is None else f'; wrote {output}'}",
+        f"computed in {timed.elapsed:.1f} s{'' if output is None else f'; wrote {output}'}",
         next_line("era", "table", "query", table_file, "--target", target, *words),
     ]
     files = [] if output is None else [str(output)]
-    answer = found.as_json() | {"solve_time_s": elapsed, "files": files}
+    answer = found.as_json() | {"solve_time_s": timed.elapsed, "files": files}
     print_report(rows, answer, as_json=as_json)
 
 
@@ -241,33 +239,30 @@ def build(
 ) -> None:
     """Solve the plate and write its table."""
     from model.compiled.kernels import why_slow
-    from model.drive_modes import DRIVE_MODES
+    from model.drive_modes import checked_mode
     from model.finger.grid import Grid
     from model.rig.file import load_rig
     from model.table.build import TableProblem, solve_table
     from model.table.file import ZIP, save_table
     from model.table.table import default_drive_frequencies
 
-    if drive_mode not in DRIVE_MODES:
-        raise InputError(f"--mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
+    checked_mode(drive_mode, "--mode")
     check_place(output, example="table.npz")
     check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
-    started = time.perf_counter()
     chosen = (
         parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
     )
     problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
-    with progress_bar("parts") as progress:
+    with Stopwatch() as timed, progress_bar("parts") as progress:
         table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
     save_table(table, output)
-    elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
     rows = [
         f"{counted(table.pattern_count, 'pattern')} of "
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
-        f"{counted(table.grid.cell_count, 'cell')}, built in {elapsed:.2f} s",
+        f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
         f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
         f"{table.reference_mesh}",
         rig.uncertainty.note,
@@ -285,7 +280,7 @@ def build(
         "fingerprint": table.fingerprint,
         "code_version": table.code_version,
         "exactly_known": [*rig.uncertainty.exactly_known],
-        "build_time_s": elapsed,
+        "build_time_s": timed.elapsed,
         "files": [str(output)],
     }
     print_report(rows, answer, as_json=as_json)

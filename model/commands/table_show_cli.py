@@ -1,6 +1,5 @@
 """`era table show` and `era table verify`, by other methods or by measuring."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +8,7 @@ import typer
 
 from model.commands.options import (
     JsonOption,
+    Stopwatch,
     TableArgument,
     next_line,
     print_report,
@@ -35,16 +35,14 @@ def show(
     from model.table.file import load_table
 
     table = load_table(table_file)
-    started = time.perf_counter()
-    with progress_bar("questions") as progress:
+    with Stopwatch() as timed, progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
     summary, cells = summarize(table, overview), overview.cells
-    elapsed = time.perf_counter() - started
     rows = [
         *_summary_rows(summary, mapped=str(cells.grid)),
         "",
         *_map_rows(cells, listed=weak),
-        f"computed in {elapsed:.1f} s",
+        f"computed in {timed.elapsed:.1f} s",
         _example_query(table_file, summary["plate_m"]),
     ]
     print_report(rows, summary | {"map": cells.as_json()}, as_json=as_json)
@@ -130,19 +128,17 @@ def _verify_by_solving(
 
     rig = load_rig(rig_file)
     table = load_table(table_file, rig=rig)
-    started = time.perf_counter()
-    with progress_bar("answers") as progress:
+    with Stopwatch() as timed, progress_bar("answers") as progress:
         found = verify_table(table, rig, samples=samples, seed=seed, progress=progress)
-    elapsed = time.perf_counter() - started
     count = len(found.checks)
     rows = [
         *_verification_rows(found),
-        f"{count - found.failed_count} of {count} passed (seed {seed}) in {elapsed:.1f} s",
+        f"{count - found.failed_count} of {count} passed (seed {seed}) in {timed.elapsed:.1f} s",
         next_line("era", "table", "build", rig_file, "-o", table_file)
         if found.failed_count
         else None,
     ]
-    answer = found.as_json() | {"seed": seed, "verify_time_s": elapsed}
+    answer = found.as_json() | {"seed": seed, "verify_time_s": timed.elapsed}
     print_report(rows, answer, as_json=as_json)
     if found.failed_count:
         raise typer.Exit(1)
@@ -289,10 +285,8 @@ def _verify_by_measuring(
     else:
         rig = load_rig(rig_file)
         table = load_table(table_file, rig=rig)
-    started = time.perf_counter()
-    with progress_bar("patterns") as progress:
+    with Stopwatch() as timed, progress_bar("patterns") as progress:
         found = check_by_measuring(table, rig, settings, progress=progress)
-    elapsed = time.perf_counter() - started
     files = []
     if picture is not None:
         from model.figures import save_figure
@@ -302,11 +296,11 @@ def _verify_by_measuring(
         files.append(str(picture))
     rows = [
         *_measured_rows(found),
-        f"{counted(len(found.measured), 'pattern')} measured in {elapsed:.1f} s "
+        f"{counted(len(found.measured), 'pattern')} measured in {timed.elapsed:.1f} s "
         f"(seed {settings.seed})",
         f"wrote {', '.join(files)}" if files else None,
     ]
-    answer = {"seed": settings.seed, "verify_time_s": elapsed, "files": files}
+    answer = {"seed": settings.seed, "verify_time_s": timed.elapsed, "files": files}
     print_report(rows, found.as_json() | answer, as_json=as_json)
     if not found.is_passed:
         raise typer.Exit(1)

@@ -5,8 +5,7 @@ from typing import Any
 from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.causes import Explanation
-from model.diagnosis.plate_difference import NOTICEABLE_DB
-from model.diagnosis.plate_match import MAX_FIT_ERROR
+from model.diagnosis.plate_match import MAX_FIT_ERROR, NOTICEABLE_DB
 from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent

@@ -25,8 +25,14 @@ from model.diagnosis.diagnosis_screening import (
     off_scale,
     usable_sensors,
 )
-from model.diagnosis.plate_difference import PlateDifference, plate_difference
-from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
+from model.diagnosis.plate_match import (
+    MAX_FIT_ERROR,
+    MODEL_ERROR,
+    Match,
+    PlateDifference,
+    match_plate,
+    plate_difference,
+)
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 

@@ -9,6 +9,9 @@ the quiet fingertips, c right-hand side from the targets, w complex weights of t
 `model.transients`, q are the modal coordinates and z those of the eigenvectors in time.
 """
 
+from model.arguments import shown
+from model.errors import InputError
+
 MAX_PHASE_STEP = 10.0
 """Largest phase step [degrees] for `phased`: its rms error of 3 degrees is within the allowance."""
 
@@ -17,6 +20,13 @@ DRIVE_MODES = ("switched", "phased")
 
 UNRESTRICTED = "phased"
 """The mode of any weights."""
+
+
+def checked_mode(name: str, what: str = "drive mode") -> str:
+    """Return the name of a drive mode; raises InputError for any other; what: its name there."""
+    if name not in DRIVE_MODES:
+        raise InputError(f"{what} must be one of {', '.join(DRIVE_MODES)}, got {shown(name)}")
+    return name
 
 
 def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 Drawn once for each number of ERAs and fingers: standard normal numbers whose mean and variance are
 made exact, so that a few draws give the percentiles of many. Those by which candidates are judged
-differ from those of the promise, which would else be flattered.
+differ from those of the promise, which would else be flattered. Nine of ten give what is promised.
 """
 
 import math
@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -96,3 +96,29 @@ def _exact(rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
     numbers = rng.standard_normal((rows, count))
     numbers -= numbers.mean(axis=1, keepdims=True)
     return np.asarray(numbers / np.sqrt((numbers**2).mean(axis=1, keepdims=True)))
+
+
+PERCENTILE = 10
+"""Percentile of the drawn plates that is promised: nine of ten have more."""
+
+
+def over_fingertips(
+    power: Float32Array | FloatArray, weights: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Mean amplitude, and squared one at the loudest point, of squared ones (c, k p, d): (c, k, d).
+
+    weights (k, p): of the points in the mean.
+    """
+    by_finger = power.reshape(len(power), *weights.shape, -1)
+    means = np.asarray((weights[:, None] @ np.sqrt(by_finger))[:, :, 0])
+    loudest = np.maximum.reduce(by_finger, axis=2)
+    return means, np.asarray(loudest)
+
+
+def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
+    """Percentile over the last axis, linear between values (...,)."""
+    ordered = np.sort(values, axis=-1)
+    place = percent / 100 * (ordered.shape[-1] - 1)
+    low = int(place)
+    high = min(low + 1, ordered.shape[-1] - 1)
+    return np.asarray(ordered[..., low] + (place - low) * (ordered[..., high] - ordered[..., low]))

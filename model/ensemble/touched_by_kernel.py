@@ -10,8 +10,8 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.compiled.kernels import Kernels, kernels, run
 from model.compiled.structures import PlateDraws, PointGroups, Sensors, TouchedPlates, as_given
+from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import Drawing, Draws
-from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_plate import (
     RIDGE,
     FingertipAmplitudes,

@@ -5,7 +5,7 @@ k fingers of dynamic stiffness D at centres c change fields X of a plate on its 
     X - G D P X_c,  P = (1 + G_cc D)^-1,
 
 where G is the displacement by a force at each finger without the others; with them -w² G P^T is the
-acceleration by it. Symbols are those of `plate_on_eras`; cases are those of a frequency and of a
+acceleration by it. Symbols are those of `attached_plate`; cases are those of a frequency and of a
 thickness each. The expected power of weights w at a fingertip is w^H R w to first order,
 
     R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
@@ -27,9 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.ensemble.draws import Drawing, Draws, draw
-from model.ensemble.measures import over_fingertips
-from model.ensemble.plate_on_eras import MODELLED, THICKER, THINNER, PlateOnEras
+from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
+from model.ensemble.draws import Drawing, Draws, draw, over_fingertips
 
 RIDGE = 1e-6
 """Share of a form's trace that is added to its diagonal: keeps it definite."""

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from model.answer.answer import Layer
+from model.answer.answer import Answer, Layer
 from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import FloatArray, Point, lattice
@@ -138,29 +138,40 @@ def answer_figure(table: LocalizationTable) -> Figure:
     """Draw sensation levels and fingers for an example query."""
     plate = table.plate
     target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
-    figure = Figure(figsize=(6.6, 5), layout="compressed")
-    axes = figure.subplots()
     answer = None
     with suppress(InputError):  # small plate
         answer = query(table, Placement((target,), tuple(quiet)))
     if answer is None or not answer.is_reached:  # weak rig
-        axes.set_title("The table has no answer to the three fingers of this picture")
-        axes.axis("off")
+        figure = Figure(figsize=(6.6, 5))
+        figure.suptitle("The table has no answer to the three fingers of this picture")
         return figure
-    felt, layer = answer.fingers[0], answer.layers[0]
-    axes.set_axis_off()
-    draw_levels(axes, table, layer.excitation)
-    draw_fingertip(axes, target, felt=True, level_db_sl=felt.level_db_sl)
-    for place in quiet:
-        draw_fingertip(axes, place, felt=False)
-    draw_level_scale(figure, [axes], shrink=0.8)
-    axes.set_title(
+    figure, felt = layer_figure(table, answer, 0), answer.fingers[0]
+    figure.axes[0].set_title(
         f"Felt contrast {felt.promised_contrast_db:.0f} dB promised, "
         f"{felt.contrast_db:.0f} dB nominal\n"
-        f"{_in_words(table, layer)}",
+        f"{_in_words(table, answer.layers[0])}",
         fontsize=10,
         pad=20,
     )
+    return figure
+
+
+def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figure:
+    """Draw the level of a layer of an answer over the plate, the fingers and what is promised."""
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    axes, layer = figure.subplots(), answer.layers[number]
+    axes.set_axis_off()
+    draw_levels(axes, table, layer.excitation)
+    for finger, each in enumerate(answer.fingers):
+        is_felt = finger in layer.fingers
+        level = each.level_db_sl if is_felt else None
+        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
+    promised = answer.fingers[layer.fingers[0]].promised_contrast_db
+    if promised is not None:
+        axes.set_title(
+            f"contrast at least {promised:.0f} dB on nine of ten plates", fontsize=11, pad=20
+        )
+    draw_level_scale(figure, [axes], shrink=0.8)
     return figure
 
 

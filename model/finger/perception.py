@@ -160,6 +160,21 @@ def mean_level_db_sl(
     return float(decibels(above @ weights))
 
 
+def over_threshold(
+    samples: FloatArray, sample_rate: float, threshold: str = DEFAULT_THRESHOLD
+) -> FloatArray:
+    """What is felt of samples (n, p) [m/s²] at a rate [Hz], each frequency over its threshold.
+
+    Beyond the data of a set its last threshold is taken.
+    """
+    count, known = len(samples), _tabulated(threshold)[0]
+    frequencies = np.clip(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0], known[-1])
+    spectrum = np.fft.rfft(felt_part(samples, sample_rate), 2 * count, axis=0)
+    return np.fft.irfft(spectrum / detection_threshold(frequencies, threshold)[:, None], axis=0)[
+        :count
+    ]
+
+
 _CUTOFF = 1250.0  # Hz; where half of a tone passes
 _HALF_LENGTH = 0.002  # s; of the filter: 0.5 % up to 850 Hz, 40 dB from 1.65 kHz on
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.forward import LEAST_LOSS, PlateAt
-from model.reduction.receptance import TERMS, combined
+from model.reduction.free_plate import TERMS, combined
 from model.structure.plate import LOSS_FREQUENCY
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]

@@ -14,8 +14,7 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate import element_slopes
 from model.finger.grid import Grid
-from model.reduction.free_plate import FreePlate
-from model.reduction.receptance import TERMS
+from model.reduction.free_plate import TERMS, FreePlate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.shape_stiffness import stiffness_slopes

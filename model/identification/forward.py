@@ -18,8 +18,7 @@ from model.identification.form_errors import ReducedModes
 from model.identification.parameters import Space
 from model.identification.places import AttachmentPoints, Modes, places_of
 from model.identification.values import Values
-from model.reduction.free_plate import FreePlate
-from model.reduction.receptance import TERMS, FreeReceptance, combined
+from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
 from model.rig.rig import Rig
 from model.structure.attachments import (
     Fingertip,

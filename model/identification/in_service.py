@@ -1,12 +1,11 @@
 """A plate that stays known while it plays: every settled pattern updates it.
 
 The parameters of an identification drift; an update moves them together with the fingers of its
-pattern, which are dropped afterwards. Where innovations are unlikely (`model.identification.alarm`)
-the state goes back to where they began, since an update smears a jump over all parameters, and is
-held until the patterns since then are explained together by one change
-(`model.identification.hypotheses`). Such a change is followed; after one that nothing explains, as
-by a crack or a hand that rests on it, the plate counts as changed, until patterns are those of the
-plate as it was.
+pattern, which are dropped afterwards. Where innovations are unlikely the state goes back to where
+they began, since an update smears a jump over all parameters, and is held until the patterns since
+then are explained together by one change (`model.identification.changes`). Such a change is
+followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
+counts as changed, until patterns are those of the plate as it was.
 """
 
 from collections.abc import Sequence
@@ -17,13 +16,11 @@ from typing import Self
 import numpy as np
 
 from model.arrays import FloatArray
-from model.identification.alarm import PLACES, Alarm, Observation
+from model.identification.changes import PLACES, Alarm, Observation, PlateChange, explain
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.hypotheses import PlateChange, explain
 from model.identification.identify import solved_for
 from model.identification.parameters import KINDS, MODE_SHIFTS, space_of
-from model.identification.settled import PatternModel, SettledPattern
-from model.identification.settled_update import NoiseLevel, State, update
+from model.identification.settled import NoiseLevel, PatternModel, SettledPattern, State, update
 from model.identification.values import Values, rig_with
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty

@@ -11,7 +11,7 @@ import numpy as np
 from model.errors import InputError
 from model.files.array_file import UNREADABLE, read_arrays, write_arrays
 from model.files.replacing import begins_with
-from model.identification.settled_update import State
+from model.identification.settled import State
 
 _VERSION = 2
 _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}

@@ -7,8 +7,8 @@ import numpy as np
 
 from model.arrays import FloatArray, IntArray
 from model.identification.form_errors import ReducedModes
+from model.reduction.free_modes import FreeModes
 from model.reduction.place_slopes import place_slopes
-from model.reduction.receptance import FreeModes
 
 Modes: TypeAlias = FreeModes | ReducedModes
 

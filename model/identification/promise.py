@@ -7,7 +7,7 @@ import numpy as np
 from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
 from model.answer.plan import query
 from model.arrays import FloatArray
-from model.ensemble.measures import PERCENTILE
+from model.ensemble.draws import PERCENTILE
 from model.identification.identify import Identification
 from model.study.exact_plates import draw_plates, felt_on
 from model.study.random_contacts import MIN_DISTANCE, random_contacts

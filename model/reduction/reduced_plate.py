@@ -30,6 +30,7 @@ dampers of the ERAs; that dampers also couple the modes is left out here, not in
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -37,6 +38,7 @@ from scipy import linalg
 from model.arguments import shown
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.files.csv_file import as_frame
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad, footprints_of
@@ -262,6 +264,12 @@ class SupportedModes:
     def __repr__(self) -> str:
         named = ", ".join(f"{frequency:.1f}" for frequency in self.natural_frequencies)
         return f"<SupportedModes at {named} Hz>"
+
+    def to_frame(self) -> Any:
+        """Frequency and damping ratio as a pandas DataFrame, a row a mode; needs pandas."""
+        return as_frame(
+            {"frequency_hz": self.natural_frequencies, "damping_ratio": self.damping_ratios}
+        )
 
     def at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.fingers import Placement, check_on_plate, checked_mode
+from model.answer.fingers import Placement, check_on_plate
 from model.arrays import FloatArray, Point, nullable
+from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.csv_file import Columns, as_frame
 from model.finger.fingertip import FINGERTIP_RADIUS

@@ -14,7 +14,7 @@ import numpy as np
 
 from model.answer.fingers import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
-from model.ensemble.measures import over_fingertips
+from model.ensemble.draws import over_fingertips
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     FingertipLoad,
@@ -23,8 +23,7 @@ from model.structure.attachments import (
     fingertip_loads,
 )
 from model.structure.modal_elasticity import check_scales, modal_receptance
-from model.table.raster_kernel import read_fingertips
-from model.table.table import LocalizationTable
+from model.table.table import LocalizationTable, read_fingertips
 from model.vibration.excitation import Excitation, base_amplitudes
 
 

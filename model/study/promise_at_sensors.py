@@ -16,7 +16,7 @@ from model.answer.answer import Layer
 from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import FloatArray, Point
-from model.ensemble.measures import percentile
+from model.ensemble.draws import percentile
 from model.errors import InputError
 from model.finger.perception import decibels, sensation_level
 from model.study.exact_plates import amplitudes_on, draw_plates

@@ -40,7 +40,7 @@ from model.table.table import LocalizationTable
 from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation, base_amplitudes, tone_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes, tone_fields
 
 CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""
@@ -301,7 +301,7 @@ class _AnswerChecker:
         count = len(weights)
         points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
         fingers = fingertip_loads(rig.fingertip, contacts, placed.loads)
-        frequencies, everywhere = tone_amplitudes(
+        frequencies, everywhere = tone_fields(
             layer.excitation,
             rig.eras,
             lambda f: self._respond(rig.eras, f, points, loads=[*rig.masses, *fingers]),

@@ -1,16 +1,24 @@
-"""Building a localization table: its numbers are the same to the bit by any number of processes."""
+"""Building a localization table, the same to the bit by any number of processes, or keeping it.
+
+Tables are kept between runs in the user's cache folder.
+"""
 
 import hashlib
+import logging
 import math
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.drive_modes import DRIVE_MODES
+from model.cache_folder import cache_folder
+from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.array_file import Arrays
 from model.finger.grid import Grid
@@ -23,7 +31,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales
 from model.structure.support import check_supported
-from model.table.file import FORMAT_VERSION, MAX_BYTES
+from model.table.file import FORMAT_VERSION, MAX_BYTES, load_table, save_table
 from model.table.raster import Raster
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
 from model.version import NUMERICS_VERSION, code_version
@@ -121,9 +129,7 @@ def solve_table(
 
     progress: called with the number of finished parts and the total. Raises InputError.
     """
-    if drive_mode not in DRIVE_MODES:
-        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
-    parts = dict(enumerate((_discretisation, _modes)))
+    mode, parts = checked_mode(drive_mode), dict(enumerate((_discretisation, _modes)))
     solved: dict[str, Any] = {name: getattr(problem.rig, name) for name in PHYSICS}
     # A copy without cached properties, which cannot all be sent to a process.
     found = on_processes(workers, _solve, replace(problem), parts)
@@ -134,7 +140,7 @@ def solve_table(
         mesh=problem.rig.mesh,
         raster=problem.raster,
         grid=problem.grid,
-        drive_mode=drive_mode,
+        drive_mode=mode,
         code_version=code_version(),
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,
@@ -189,3 +195,61 @@ def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
             f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
         )
     check_has_threshold(frequencies, rig.threshold)
+
+
+MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first
+
+_CURRENT = f"table-{FORMAT_VERSION}.{NUMERICS_VERSION}-"
+
+_logger = logging.getLogger(__name__)
+
+
+def cached_table(
+    rig: Rig,
+    *,
+    frequencies: FloatArray | None = None,
+    grid: Grid = PAPER_GRID,
+    drive_mode: str = "switched",
+) -> tuple[LocalizationTable, Path | None]:
+    """Return a rig's table from the user's cache folder, built if it is not there, and its file.
+
+    frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged file is built again. The
+    file is None where the folder cannot be written.
+    """
+    if frequencies is None:
+        frequencies = default_drive_frequencies(rig.limits)
+    problem = TableProblem(rig, frequencies, grid)
+    try:
+        folder = cache_folder()
+    except OSError as error:
+        _logger.warning("table cache: table not kept for the next run: %s", error)
+        return solve_table(problem, drive_mode=drive_mode), None
+    path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
+    try:
+        table = load_table(path, rig=rig)
+    except InputError as error:
+        reason, _, _ = str(error).partition("; ")  # without the remedy, which follows here
+        _logger.info("table cache: building a table: %s", reason)
+    else:
+        with suppress(OSError):
+            os.utime(path)
+        return table, path
+    table = solve_table(problem, drive_mode=drive_mode)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        save_table(table, path)
+    except OSError as error:
+        _logger.warning("table cache: table not kept for the next run: %s", error)
+        return table, None
+    with suppress(OSError):
+        _clean_up(folder)
+    return table, path
+
+
+def _clean_up(folder: Path) -> None:
+    """Remove tables of other versions, and all but the most recently used ones."""
+    tables = list(folder.glob("table-*.npz"))
+    current = [path for path in tables if path.name.startswith(_CURRENT)]
+    recent = sorted(current, key=lambda path: path.stat().st_mtime)[-MAX_CACHED_TABLES:]
+    for path in set(tables) - set(recent):
+        path.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from pydantic_core import to_jsonable_python
 
 from model.arguments import expect, expect_path
-from model.drive_modes import DRIVE_MODES
+from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.files.replacing import begins_with
@@ -198,8 +198,7 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
         code_version=header.code_version,
         **arrays,
     )
-    if table.drive_mode not in DRIVE_MODES:
-        raise InputError(f"unknown drive mode {table.drive_mode!r}")
+    checked_mode(table.drive_mode)
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
     nodes = len(table.dispersion_frequencies)
     expected = {

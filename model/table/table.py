@@ -6,20 +6,32 @@ that any fingertips can be queried in any drive mode.
 """
 
 import math
+from array import array
 from collections.abc import Sequence
+from ctypes import c_void_p
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
+from model.compiled.kernels import kernels, run
+from model.compiled.structures import GivenRaster
 from model.drive_modes.switched import highest_levels
-from model.ensemble.attached_plate import AttachedPlate, attach
+from model.ensemble.attached_plate import AttachedPlate, PlateOnEras, attach
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
-from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
+from model.finger.fingertip import (
+    FINE_POINTS,
+    FINGERTIP_RADIUS,
+    FIVE_AND_FINE,
+    FIVE_POINTS,
+    GAUSS_LEGENDRE,
+)
 from model.finger.grid import Grid
 from model.finger.perception import decibels, detection_threshold, is_background
 from model.reduction.reduced_plate import ReducedPlate
@@ -29,7 +41,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.raster import Raster
+from model.table.raster import FingertipShapes, Raster
 from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -322,3 +334,40 @@ class LocalizationTable:
 def _power(fields: Complex64Array) -> Complex64Array:
     """Power of fields (f, eras, p) summed over the points, (f, eras, eras)."""
     return np.asarray(fields.conj() @ fields.swapaxes(1, 2))
+
+
+_FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
+
+
+def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
+    """Shapes at fingertips centred at places [m], by a kernel in C where there is one."""
+    by = kernels()
+    if by is None:
+        return table.raster.fingertips(np.array(places), table.shapes)
+    on, k = given_raster(table), len(places)
+    at = array("d", chain.from_iterable(places))
+    sizes = (k, _FEW, on.r), (k, _FINE, on.r), (k, _FEW), (k, _FINE)
+    found = [np.empty(size, dtype=np.float32) for size in sizes]
+    to = [c_void_p(each.ctypes.data) for each in found]
+    run(by.library.fingertips_stage, on, c_void_p(at.buffer_info()[0]), k, *to)
+    return FingertipShapes(*found)
+
+
+def given_raster(table: LocalizationTable) -> GivenRaster:
+    """The raster of a table as kernels read it, kept with it."""
+    kept = _kept.get(table)
+    if kept is not None:
+        return kept
+    raster = table.raster
+    found = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], _FEW, _FINE)
+    found.length, found.width, found.radius = raster.length, raster.width, FINGERTIP_RADIUS
+    found.point(
+        points=FIVE_AND_FINE.points,
+        weights=FIVE_AND_FINE.weights,
+        nodes=GAUSS_LEGENDRE,
+        shapes=table.shapes,
+    )
+    return _kept.setdefault(table, found)
+
+
+_kept: WeakKeyDictionary[LocalizationTable, GivenRaster] = WeakKeyDictionary()

@@ -155,6 +155,15 @@ class BaseEnvelope:
         """The largest amplitude [m]."""
         return max(map(abs, (self.start, *self.knots)))
 
+    def scaled(self, factor: float) -> "BaseEnvelope":
+        """Return it with all amplitudes times a factor."""
+        return BaseEnvelope(
+            self.frequency,
+            factor * self.start,
+            tuple([factor * each for each in self.knots]),
+            self.step,
+        )
+
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""
         values = np.array([self.start, *self.knots])

@@ -20,7 +20,7 @@ knots: none exceeds the stroke. Single precision changes contrasts by some hundr
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -46,18 +46,6 @@ ENDING_KNOTS = 8
 # the target, the ramp is not traded for more. Between half and twice this contrast changes by
 # 0.5 dB.
 TARGET_WEIGHT = 2.0
-
-# Weight of a quiet finger's motion during an ending, relative to the target, against the plate's
-# residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
-# zero makes the ending as loud for the quiet finger as a plain ramp.
-_QUIET_WEIGHT = 0.03
-
-# Least combinations of ERAs in an onset; more for more than six quiet fingers. With all of sixteen
-# its contrast is lower, with six of eight 1 dB lower in one of ten cases.
-_COMBINATIONS = 8
-
-ALONE = 6
-"""Combinations of ERAs in the onset of fingers that are alone."""
 
 RISE = 0.040
 """How long [s] a target takes to full vibration along its raised cosine."""
@@ -96,35 +84,6 @@ class FingerResponses:
     hats: Complex64Array
     steady: ComplexArray
     combinations: int
-
-    @classmethod
-    def at(
-        cls,
-        carrier: Carrier,
-        target_rows: FloatArray,
-        quiet_rows: FloatArray,
-        *,
-        combinations: int = 0,
-    ) -> "FingerResponses":
-        """Read all ERAs at rows (t, r) and (d, r) of shapes.
-
-        target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
-        quiet fingers. combinations: 0 for as many as so many quiet fingers take.
-        """
-        rows = np.vstack([target_rows, quiet_rows])
-        samples, r, knots, eras = carrier.hats.shape
-        flat = carrier.hats.reshape(samples, r, -1).view(np.float32)
-        hats = (rows.astype(np.float32) @ flat).view(np.complex64)
-        hats = hats.reshape(samples, len(rows), knots, eras)
-        combinations = combinations or max(_COMBINATIONS, len(rows) // 4)
-        return cls(len(target_rows), hats, rows @ carrier.steady.T, combinations)
-
-    def of(self, active: IntArray) -> "FingerResponses":
-        """That of active ERAs only."""
-        if len(active) == self.steady.shape[1]:
-            return self
-        hats, steady = map(np.ascontiguousarray, (self.hats[..., active], self.steady[:, active]))
-        return replace(self, hats=hats, steady=steady)
 
 
 def solve_carrier(
@@ -199,15 +158,6 @@ def _rises() -> Float32Array:
     since = np.arange(STEPS)[::-1]  # steps since a hat began
     met = wanted[np.arange(STEPS)[:, None] + since]
     return np.asarray(met.transpose(0, 2, 1).reshape(STEPS, -1), dtype=np.float32)
-
-
-def quiet_weight(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses
-) -> float:
-    """Weight of the mean square at quiet fingers in an ending, as `ending_by_numpy` has it."""
-    vibration = np.linalg.norm(amplitudes @ carrier.steady)
-    target = np.linalg.norm(found.steady[: found.targets] @ amplitudes[active])
-    return float(_QUIET_WEIGHT * (vibration / target) ** 2)
 
 
 def ending_by_numpy(

@@ -22,9 +22,13 @@ from model.transients.knots import (
     FingerResponses,
     ending_by_numpy,
     onset_by_numpy,
-    quiet_weight,
     risen,
 )
+
+# Weight of a quiet finger's motion during an ending, relative to the target, against the plate's
+# residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
+# zero makes the ending as loud for the quiet finger as a plain ramp.
+_QUIET_WEIGHT = 0.03
 
 
 def onset_knots(
@@ -58,6 +62,15 @@ def ending_knots(
     if not _found_by_kernel(knots, given, knots[0], found, is_ending=True):
         knots[1:-1] = ending_by_numpy(carrier, amplitudes, active, found, weight)
     return knots
+
+
+def quiet_weight(
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses
+) -> float:
+    """Weight of the mean square at quiet fingers in an ending, as `ending_by_numpy` has it."""
+    vibration = np.linalg.norm(amplitudes @ carrier.steady)
+    target = np.linalg.norm(found.steady[: found.targets] @ amplitudes[active])
+    return float(_QUIET_WEIGHT * (vibration / target) ** 2)
 
 
 def _found_by_kernel(

@@ -15,6 +15,7 @@ stroke (`model.transients.knots`).
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TypeAlias
 
@@ -25,7 +26,7 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
-from model.transients.knots import ALONE, Carrier, FingerResponses, mean_square, solve_carrier
+from model.transients.knots import Carrier, FingerResponses, mean_square, solve_carrier
 from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
@@ -33,6 +34,12 @@ from model.vibration.excitation import Excitation, base_amplitudes
 
 _SURROUNDINGS = Grid(8, 6)  # twice as fine changes the contrast by 0.1 dB
 _KEPT = 16  # readings; of an onset and its ending, and of fingers that rest
+
+# Least combinations of ERAs in an onset; more for more than six quiet fingers. With all of sixteen
+# its contrast is lower, with six of eight 1 dB lower in one of ten cases.
+_COMBINATIONS = 8
+
+_COMBINATIONS_ALONE = 6  # in the onset of fingers that are alone
 
 Position = tuple[float, float]
 
@@ -93,7 +100,7 @@ class Shaper:
         """
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
-            found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
+            found = of_eras(self._felt(frequency, tuple(targets), tuple(quiet)), active)
             knots = onset_knots(amplitudes[active], found, self._gain_variance)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
@@ -114,7 +121,7 @@ class Shaper:
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
             found = None
             if targets and quiet:
-                found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
+                found = of_eras(self._felt(frequency, tuple(targets), tuple(quiet)), active)
             knots = ending_knots(self.prepare(frequency), amplitudes, active, found)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
@@ -148,10 +155,8 @@ class Shaper:
     ) -> FingerResponses:
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
-        carrier = self.prepare(frequency)
-        if quiet:
-            return FingerResponses.at(carrier, means, self._resting(quiet))
-        return FingerResponses.at(carrier, means, self._surroundings(targets), combinations=ALONE)
+        others = self._resting(quiet) if quiet else self._surroundings(targets)
+        return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
         """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed."""
@@ -176,6 +181,31 @@ class Shaper:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
         shapes = self._shapes[is_background(self._centres, targets)]
         return np.asarray(shapes / math.sqrt(len(shapes)))
+
+
+def responses_at(
+    carrier: Carrier, target_rows: FloatArray, quiet_rows: FloatArray, *, is_alone: bool = False
+) -> FingerResponses:
+    """Read all ERAs at rows (t, r) and (d, r) of shapes.
+
+    target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
+    quiet fingers, or over the plate where the targets are alone.
+    """
+    rows = np.vstack([target_rows, quiet_rows])
+    samples, r, knots, eras = carrier.hats.shape
+    flat = carrier.hats.reshape(samples, r, -1).view(np.float32)
+    hats = (rows.astype(np.float32) @ flat).view(np.complex64)
+    hats = hats.reshape(samples, len(rows), knots, eras)
+    combinations = _COMBINATIONS_ALONE if is_alone else max(_COMBINATIONS, len(rows) // 4)
+    return FingerResponses(len(target_rows), hats, rows @ carrier.steady.T, combinations)
+
+
+def of_eras(found: FingerResponses, active: IntArray) -> FingerResponses:
+    """Responses of active ERAs only."""
+    if len(active) == found.steady.shape[1]:
+        return found
+    hats, steady = map(np.ascontiguousarray, (found.hats[..., active], found.steady[:, active]))
+    return replace(found, hats=hats, steady=steady)
 
 
 def _fingertips_on(

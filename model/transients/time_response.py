@@ -179,13 +179,21 @@ class PlateInTime:
         measured gain is taken at the frequency of s; what it does between two frequencies while the
         base rises is not modelled.
         """
-        gains = np.stack([era.gain(s.imag / (2 * np.pi)) for era in self.eras], axis=1)
-        gains *= [era.stroke for era in self.eras]
-        forces = gains * (self.springs + s[:, None] * self.dampers)
+        bases = self._bases(s)
+        forces = bases * (self.springs + s[:, None] * self.dampers)
         away = s[:, None, None] - self.eigenvalues
         z = forces[..., None] * self.participation.T / away
-        by_velocity = (gains * self.dampers)[..., None] * self.participation.T
+        by_velocity = (bases * self.dampers)[..., None] * self.participation.T
         return z, (by_velocity - z) / away
+
+    def following_all(self, s: ComplexArray, weights: ComplexArray) -> ComplexArray:
+        """z (f, 2 r) of all ERAs together, of weights (f, eras) in full strokes; s (f,) [1/s]."""
+        forces = weights * self._bases(s) * (self.springs + s[:, None] * self.dampers)
+        return np.asarray(forces @ self.participation.T / (s[:, None] - self.eigenvalues))
+
+    def _bases(self, s: ComplexArray) -> ComplexArray:
+        """Motion of each ERA's base at full stroke [m], its own gain included, (f, eras)."""
+        return np.stack([era.base(s.imag) for era in self.eras], axis=1)
 
     @cached_property
     def acceleration(self) -> ComplexArray:

@@ -16,8 +16,8 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
 from model.fem.mesh import Mesh
+from model.reduction.free_modes import SpectralModes
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.spectral_modes import SpectralModes
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh

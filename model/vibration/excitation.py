@@ -46,44 +46,39 @@ NULL_SHARE = 0.1
 """A null is below this share of the map's maximum."""
 
 
-def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
+def base_amplitudes(
+    excitation: Excitation, eras: Sequence[Era], *others: Excitation
+) -> tuple[FloatArray, ComplexArray]:
     """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
 
-    Raises InputError where no ERA is driven, or an unknown one.
+    others: that play at the same time. Raises InputError where no ERA is driven, or an unknown one.
     """
-    if not excitation:
+    tones = [each for one in (excitation, *others) for each in one.items()]
+    if not tones:
         raise InputError("excitation: must drive at least one ERA")
     names = [era.name for era in eras]
-    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    frequencies = sorted({tone.frequency for _, tone in tones})
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
-    for name, tone in excitation.items():
+    for name, tone in tones:
         if name not in names:
             raise InputError(f"the rig has no ERA {name!r}; it has {', '.join(names)}")
         phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
-        amplitudes[frequencies.index(tone.frequency), names.index(name)] = phasor
+        amplitudes[frequencies.index(tone.frequency), names.index(name)] += phasor
     return np.array(frequencies), amplitudes
-
-
-def tone_amplitudes(
-    excitation: Excitation,
-    eras: Sequence[Era],
-    response: Callable[[FloatArray], ComplexArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Peak acceleration [m/s²] per distinct frequency: frequencies (f,) [Hz], amplitudes (f, p).
-
-    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
-    """
-    frequencies, field = tone_fields(excitation, eras, response)
-    return frequencies, np.abs(field)
 
 
 def tone_fields(
     excitation: Excitation,
     eras: Sequence[Era],
     response: Callable[[FloatArray], ComplexArray],
+    *others: Excitation,
 ) -> tuple[FloatArray, ComplexArray]:
-    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases."""
-    frequencies, amplitudes = base_amplitudes(excitation, eras)
+    """Complex acceleration [m/s²] at each distinct frequency: frequencies (f,) [Hz], field (f, p).
+
+    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p); others:
+    excitations that play at the same time.
+    """
+    frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
     weights = amplitudes / np.array([era.stroke for era in eras])
     return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
 

@@ -49,12 +49,11 @@ class PlateMap:
 
 def plate_map(
     rig: Rig,
-    excitation: Excitation,
-    *,
+    *excitations: Excitation,
     raster: tuple[int, int] | None = None,
     free: FreePlate | None = None,
 ) -> PlateMap:
-    """Solve the rig's plate for an excitation; the raster defaults to that of the mesh.
+    """Solve the rig's plate for excitations at once; the raster defaults to that of the mesh.
 
     free: the same plate where it has been solved before. Raises InputError for a raster below 2x2
     or of millions of points, or a frequency that the mesh cannot carry.
@@ -78,7 +77,7 @@ def plate_map(
         found = [solved.acceleration(rig.eras, driven, part, loads=rig.masses) for part in parts]
         return np.concatenate(found, axis=2)
 
-    frequencies, field = tone_fields(excitation, rig.eras, respond)
+    frequencies, field = tone_fields(excitations[0], rig.eras, respond, *excitations[1:])
     peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
     nulls = find_nulls(x, y, peak)
     return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))

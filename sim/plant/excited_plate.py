@@ -1,16 +1,20 @@
-"""Play an excitation on the plate in the time domain, without wires and amplifiers.
+"""Play layers on the plate in the time domain, without wires and amplifiers.
 
-From rest the bases move exactly as commanded, along shaped onsets or a ramp.
+From rest the bases move exactly as commanded, along shaped onsets or a ramp. The plate is linear:
+each layer is played alone, which keeps a finger's own apart from those of others.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from model.answer.fingers import Placement, Stimulus, check_fingers, together
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.answer import Layer
+from model.answer.fingers import Finger, check_fingers
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
@@ -19,46 +23,92 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
     contrast_db,
-    mean_level_db_sl,
+    decibels,
+    over_threshold,
     sensation_level,
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import fingertip_loads
-from model.transients.base_motion import Envelopes, ramped_onset, shaped
+from model.structure.attachments import Era
+from model.transients.base_motion import Bases, ramped_onset, shaped
+from model.transients.from_rest import from_rest
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import Excitation, base_amplitudes
-from sim.plant.fingers import Felt, Record, felt_peaks, measure_vibration
+from model.vibration.excitation import base_amplitudes
+from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
+from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
 """Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
 
+LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
+"""Hann window under which a level over time is a root mean square, and the steps of both [s]."""
+
+MIN_SIGNAL = 0.01
+"""Shortest signals [s]; shorter ones are followed by zeros."""
+
 MAX_DURATION = 10.0
-"""Longest playback [s]; ten fingers take 150 MB."""
+"""Longest playback [s]; ten fingers take 150 MB for each layer."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeltFinger:
+    """What one finger felt, steady as in a `Sensation`, and over time.
+
+    level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
+    its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
+    foreign_levels_db_sl (w,): root mean square under a Hann window of 30 ms.
+    """
+
+    level_db_sl: float
+    foreign_level_db_sl: float
+    contrast_db: float | None
+    times: FloatArray = field(repr=False)
+    levels_db_sl: FloatArray = field(repr=False)
+    foreign_levels_db_sl: FloatArray = field(repr=False)
+
+    def to_frame(self) -> Any:
+        """Time, its own level and that of the others as a pandas DataFrame; needs pandas."""
+        return as_frame(
+            {
+                "time_s": self.times,
+                "level_db_sl": self.levels_db_sl,
+                "foreign_level_db_sl": self.foreign_levels_db_sl,
+            }
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Vibration:
+    """What one layer, or signals of all ERAs, do alone at all fingers.
+
+    frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
+    all fingers.
+    """
+
+    frequencies: tuple[float, ...]
+    fingers: tuple[int, ...]
+    records: tuple[Record, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """Records of fingertips while an excitation played, from rest at time 0.
+    """Records of fingertips while layers played, from rest at time 0.
 
-    frequencies (f,) [Hz]: driven; targets, quiet: records of the fingers; settled [s]: end of the
-    onset; threshold: name of the set that levels are above. Measures are named as those of a
-    `Sensation`; steady ones are fitted to the last STEADY seconds, after the plate has settled
-    (50 ms to 1 s).
+    vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
+    onsets; threshold: of levels. Steady measures are fitted to the last STEADY seconds, after the
+    plate has settled (50 ms to 1 s); those of signals are of the power in these.
     """
 
-    frequencies: tuple[float, ...]
-    targets: tuple[Record, ...]
-    quiet: tuple[Record, ...]
+    vibrations: tuple[Vibration, ...]
     settled: float
     threshold: str = DEFAULT_THRESHOLD
 
     def __repr__(self) -> str:
-        driven = ", ".join(f"{frequency:g}" for frequency in self.frequencies)
+        driven = ", ".join(f"{frequency:g} Hz" for frequency in self.frequencies) or "signals"
         felt = f"{counted(len(self.targets), 'target')} and {len(self.quiet)} quiet"
-        return f"<Playback of {driven} Hz for {self.targets[0].times[-1]:g} s at {felt}>"
+        return f"<Playback of {driven} for {self.targets[0].times[-1]:g} s at {felt}>"
 
     def to_frame(self) -> Any:
         """Time and mean acceleration of each fingertip as a pandas DataFrame; needs pandas."""
@@ -68,114 +118,231 @@ class Playback:
             for name, records in fingers.items()
             for number, record in enumerate(records, start=1)
         }
-        return as_frame({"time_s": self.targets[0].times, **means})
+        return as_frame({"time_s": self.records[0].times, **means})
+
+    @property
+    def frequencies(self) -> tuple[float, ...]:
+        """Frequencies that are driven [Hz], ascending."""
+        return tuple(sorted({each for one in self.vibrations for each in one.frequencies}))
+
+    @cached_property
+    def records(self) -> tuple[Record, ...]:
+        """Of each finger, of all layers together, in the order in which they were given."""
+        return tuple(
+            replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
+            for alone in zip(*[each.records for each in self.vibrations], strict=True)
+        )
+
+    @property
+    def targets(self) -> tuple[Record, ...]:
+        """Records of the fingers that have a layer."""
+        return tuple([self.records[number] for number in self._own])
+
+    @property
+    def quiet(self) -> tuple[Record, ...]:
+        """Records of the fingers that have none."""
+        return tuple([each for number, each in enumerate(self.records) if number not in self._own])
+
+    @property
+    def _own(self) -> list[int]:
+        """Numbers of the fingers that have a layer, ascending."""
+        return sorted({number for each in self.vibrations for number in each.fingers})
+
+    @cached_property
+    def fingers(self) -> tuple[FeltFinger, ...]:
+        """What each finger felt, in the order in which they were given."""
+        numbers, (count, step), own = range(len(self.records)), self._window, self._own
+        levels = np.array([self._levels(number) for number in numbers])
+        mine, others = levels[:, :, 0].T
+        has_own = np.isin(numbers, own)
+        loudest = others[~has_own].max(initial=-np.inf)
+        above = np.where(has_own, mine, mine[own].min())
+        contrasts = above - np.where(others > -np.inf, others, loudest)
+        times = self.records[0].times[count // 2 :: step][: levels.shape[2] - 1]
+        return tuple(
+            FeltFinger(
+                float(each[0, 0]),
+                float(each[1, 0]),
+                float(contrast) if contrast < np.inf else None,
+                times,
+                *each[:, 1:],
+            )
+            for each, contrast in zip(levels, contrasts, strict=True)
+        )
 
     @property
     def level_db_sl(self) -> float:
-        """Steady level at the target [dB SL], mean over its fingertip; minimum over targets."""
-        return min(
-            mean_level_db_sl(*_tones(felt), felt.weights, self.threshold)
-            for felt in self._felt[: len(self.targets)]
-        )
+        """Steady level of a target's own [dB SL], mean over its fingertip; minimum over targets."""
+        return min([self.fingers[number].level_db_sl for number in self._own])
 
     @property
     def quiet_level_db_sl(self) -> float | None:
         """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
-        quiet = self._felt[len(self.targets) :]
-        loudest = [sensation_level(*_tones(felt), self.threshold).max() for felt in quiet]
-        return float(max(loudest)) if loudest else None
+        felt = [each for number, each in enumerate(self.fingers) if number not in self._own]
+        return max([each.foreign_level_db_sl for each in felt], default=None)
 
     @property
     def contrast_db(self) -> float | None:
-        """Steady level of the target above that of the loudest quiet point [dB]; None if alone."""
-        quiet = self.quiet_level_db_sl
-        return None if quiet is None else self.level_db_sl - quiet
+        """The least steady contrast of all fingers [dB]; None if alone."""
+        found = [each.contrast_db for each in self.fingers if each.contrast_db is not None]
+        return min(found, default=None)
 
     @property
     def transient_contrast_db(self) -> float | None:
-        """Contrast [dB] of the peaks over the first 100 ms; None where a finger is alone."""
-        inside = self.targets[0].times <= ONSET_WINDOW
+        """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without these."""
+        targets, quiet = self.targets, self.quiet
+        if not quiet:
+            return None
+        inside = targets[0].times <= ONSET_WINDOW
         first = [
             felt_peaks(record.times[inside], record.accelerations[inside])
-            for record in (*self.targets, *self.quiet)
+            for record in (*targets, *quiet)
         ]
-        return self._contrast(first)
+        count, weights = len(targets), [record.weights for record in targets]
+        return float(contrast_db(first[:count], np.concatenate(first[count:]), weights))
 
-    def _contrast(self, peaks: list[FloatArray]) -> float | None:
-        count = len(self.targets)
-        if len(peaks) == count:
-            return None
-        weights = [record.weights for record in self.targets]
-        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:]), weights))
+    @property
+    def _window(self) -> tuple[int, int]:
+        """Samples of a window over which a level over time is taken, and between two of these."""
+        times = self.records[0].times
+        rate = (len(times) - 1) / (times[-1] - times[0])
+        return min(round(LEVEL_WINDOW * rate), len(times)), round(LEVEL_STEP * rate)
 
-    @cached_property
-    def _felt(self) -> tuple[Felt, ...]:
-        """Steady vibration of each finger, targets first."""
-        return tuple(
-            measure_vibration(self._last(record), self.frequencies)
-            for record in (*self.targets, *self.quiet)
+    def _levels(self, number: int) -> tuple[FloatArray, FloatArray]:
+        """Levels (1 + w,) of a finger's own layers and of all others: steady, then over time."""
+        powers = np.array(
+            [self._powers(each.records[number], each.frequencies) for each in self.vibrations]
         )
+        is_own = np.array([number in each.fingers for each in self.vibrations])
+        own, others = (np.sqrt(powers[some].sum(axis=0)) for some in (is_own, ~is_own))
+        return decibels(own @ self.records[number].weights), decibels(others.max(axis=-1))
 
-    def _last(self, record: Record) -> Record:
-        since = max(self.settled, record.times[-1] - STEADY)
-        inside = record.times >= since
-        times, accelerations = record.times[inside], record.accelerations[inside]
-        return Record(record.points, record.weights, times, accelerations)
+    def _powers(self, record: Record, frequencies: Sequence[float]) -> FloatArray:
+        """Power to threshold at the points of a finger (1 + w, p): steady, then over time."""
+        times, (count, step) = record.times, self._window
+        inside = times >= max(self.settled, times[-1] - STEADY)
+        felt = over_threshold(record.accelerations, 1 / (times[1] - times[0]), self.threshold)
+        weights = np.hanning(count + 2)[1:-1]
+        power = sliding_window_view(felt**2, count, axis=0)[::step] @ weights
+        if frequencies:
+            fitted = np.abs(fit_tones(times[inside], record.accelerations[inside], frequencies))
+            level = sensation_level(np.array(frequencies), fitted, self.threshold)
+            steady = 10 ** (level / 10)
+        else:
+            last = np.hanning(inside.sum() + 2)[1:-1]
+            steady = 2 * last @ felt[inside] ** 2 / last.sum()
+        # That of a tone is the square of its amplitude, twice its mean square.
+        return np.vstack([steady, 2 * power / weights.sum()])
 
 
 def play(
     rig: Rig,
     reduced: ReducedPlate,
-    excitation: Excitation,
-    fingers: Placement,
+    layers: Sequence[Layer],
+    fingers: Sequence[Finger],
     *,
     duration: float,
-    ramp: float = ONSET_RAMP,
-    onset: Envelopes | None = None,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> Playback:
-    """Play an excitation for a duration [s] on a plate at rest, under these fingers.
+    """Play layers for a duration [s] on a plate at rest, under fingers, by number in the layers.
 
     The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
-    imperfections make of the rig's, for forces at its ERAs and loads; ramp [s], or onset in its
-    place. Latency, skew and noise are left out. Raises InputError for fingers off the plate, an
-    excitation that the rig cannot play, and a duration out of range.
+    imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
+    onset, or its ramp. Latency, skew and noise are left out. Raises InputError for fingers off the
+    plate, layers that the rig cannot play, and a duration out of range.
     """
-    check_fingers(together(fingers, Stimulus()), rig.plate)
-    frequencies, _ = base_amplitudes(excitation, rig.eras)
-    settled = max(envelope.duration for envelope in onset.values()) if onset else ramp
+    check_fingers(fingers, rig.plate)
+    driven = [_bases(layer, rig.eras) for layer in layers]
+    terms = [term for bases in driven for motion in bases for term in motion]
+    settled = max([term.start for term in terms], default=0.0)  # of the last, which goes on
     if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
             f"{duration:g} s; one second suffices for most plates"
         )
+    points, loaded, vibrations = _points(rig, fingers), None, []
+    for layer, bases in zip(layers, driven, strict=True):
+        frequencies, _ = base_amplitudes(layer.excitation, rig.eras, *layer.side_bands)
+        plant = _plant_under(rig, reduced, fingers, imperfections, loaded)
+        loaded = plant.loaded
+        for number, (era, motion) in enumerate(zip(rig.eras, bases, strict=True)):
+            plant.set_input(number, realised(motion, imperfections.errors_of(era.name, rig)))
+        times, felt = plant.advance(
+            duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(points)
+        )
+        records = _records(rig, fingers, times, felt)
+        vibrations.append(Vibration(tuple(frequencies.tolist()), layer.fingers, records))
+    return Playback(tuple(vibrations), settled, rig.threshold)
+
+
+def play_signals(
+    rig: Rig,
+    reduced: ReducedPlate,
+    signals: FloatArray,
+    fingers: Sequence[Finger],
+    *,
+    sample_rate: float,
+    imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
+) -> Playback:
+    """Play signals (eras, n) in full strokes on a plate at rest, for all fingers with a stimulus.
+
+    Records have the signals' samples [Hz]; the rest as of `play`.
+    """
+    check_fingers(fingers, rig.plate)
+    duration = signals.shape[1] / sample_rate
+    if not MIN_SIGNAL <= duration <= MAX_DURATION:
+        raise InputError(
+            f"signals must last from {MIN_SIGNAL:g} to {MAX_DURATION:g} s, got {duration:g} s"
+        )
+    plant = _plant_under(rig, reduced, fingers, imperfections)
+    felt = from_rest(
+        plant.loaded.plate,
+        signals,
+        plant.reduced.at(_points(rig, fingers)),
+        sample_rate=sample_rate,
+        factors=imperfections.factors(rig),
+    )
+    records = _records(rig, fingers, np.arange(len(felt)) / sample_rate, felt)
+    own = tuple([number for number, each in enumerate(fingers) if each.stimulus])
+    return Playback((Vibration((), own, records),), 0.0, rig.threshold)
+
+
+def _plant_under(
+    rig: Rig,
+    reduced: ReducedPlate,
+    fingers: Sequence[Finger],
+    imperfections: Imperfections,
+    loaded: LoadedPlate | None = None,
+) -> Plant:
+    """The plate at rest under fingers; loaded: where that is solved already."""
     plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
-    contacts = fingers.contacts
-    resting = fingertip_loads(rig.fingertip, contacts, fingers.loads)
-    plant.set_contacts(
-        {
-            str(n): replace(each, fingertip=imperfections.load_of(str(n), each.fingertip))
-            for n, each in enumerate(resting)
-        }
-    )
-    bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
-    for number, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
-        plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))
-    discs = [fingertip_points(*at, rig.plate) for at in contacts]
-    times, felt = plant.advance(
-        duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(np.concatenate(discs))
-    )
-    ends = np.cumsum([len(disc) for disc in discs])[:-1]
-    records = tuple(
-        Record(disc, fingertip_weights(*at, rig.plate), times, part)
-        for at, disc, part in zip(contacts, discs, np.split(felt, ends, axis=1), strict=True)
-    )
-    count = len(fingers.targets)
-    return Playback(
-        tuple(frequencies.tolist()), records[:count], records[count:], settled, rig.threshold
+    resting = imperfections.resting(rig, fingers)
+    plant.set_contacts({str(n): each for n, each in enumerate(resting)}, loaded=loaded)
+    return plant
+
+
+def _points(rig: Rig, fingers: Sequence[Finger]) -> FloatArray:
+    """Points (p, 2) of all fingertips, one after the other."""
+    return np.concatenate([fingertip_points(*each.at, rig.plate) for each in fingers])
+
+
+def _records(
+    rig: Rig, fingers: Sequence[Finger], times: FloatArray, felt: FloatArray
+) -> tuple[Record, ...]:
+    """Accelerations (n, p) at the points of all fingertips as a record of each finger."""
+    plate, split = rig.plate, np.split(felt, len(fingers), axis=1)
+    return tuple(
+        Record(fingertip_points(*each.at, plate), fingertip_weights(*each.at, plate), times, part)
+        for each, part in zip(fingers, split, strict=True)
     )
 
 
-def _tones(felt: Felt) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (f,) [Hz] and steady amplitudes (f, p) [m/s²]."""
-    return np.array(felt.frequencies), felt.amplitude
+def _bases(layer: Layer, eras: Sequence[Era]) -> Bases:
+    """Motion of the bases when a layer starts, its side bands included."""
+    voices = [
+        shaped(each.onset, eras)
+        if each.onset
+        else ramped_onset(each.excitation, eras, ramp=each.ramp)
+        for each in layer.voices
+    ]
+    return tuple(tuple(chain.from_iterable(each)) for each in zip(*voices, strict=True))

@@ -7,17 +7,26 @@ errors, ERAs in other places.
 
 import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from zlib import crc32
 
 import numpy as np
 
+from model.answer.fingers import Finger
+from model.arrays import ComplexArray
 from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import Era, Fingertip, PointLoad
+from model.structure.attachments import (
+    Era,
+    Fingertip,
+    FingertipLoad,
+    PointLoad,
+    fingertip_loads,
+)
+from model.study.exact_plates import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration.convergence import finer_mesh
 
@@ -134,6 +143,18 @@ class Imperfections:
         rng = np.random.default_rng([self.seed, crc32(finger.encode())])
         return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
 
+    def resting(self, rig: Rig, fingers: Sequence[Finger]) -> list[FingertipLoad]:
+        """Fingers as loads of the plate; none where the rig's are weightless."""
+        places, loads = [each.at for each in fingers], [each.load for each in fingers]
+        return [
+            replace(each, fingertip=self.load_of(str(number), each.fingertip))
+            for number, each in enumerate(fingertip_loads(rig.fingertip, places, loads))
+        ]
+
+    def factors(self, rig: Rig) -> ComplexArray:
+        """Gain and phase of each ERA's channel, (eras,)."""
+        return np.array([self.errors_of(era.name, rig).factor for era in rig.eras])
+
 
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
@@ -160,6 +181,35 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         mesh=_other_mesh(rig),
     )
     return Imperfections(channels, plate=plate, fingertip=std.fingertip, seed=seed)
+
+
+def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
+    """Draw a plate as those on which promises are checked (`model.study.exact_plates`).
+
+    As `draw_imperfections`, and with what the gains of all channels have in common.
+    """
+    drawn = draw_plates(
+        np.random.default_rng(seed),
+        rig.uncertainty,
+        count=1,
+        era_count=len(rig.eras),
+        contact_count=0,
+    )
+    plate = PlateErrors(
+        thickness=max(float(drawn.thickness[0]), _MIN_FACTOR),
+        loss_factor=float(drawn.loss[0]),
+        era_damping=float(drawn.damping[0]),
+        stiffness={
+            era.name: max(factor, _MIN_FACTOR)
+            for era, factor in zip(rig.eras, drawn.stiffness[0].tolist(), strict=True)
+        },
+        mesh=_other_mesh(rig),
+    )
+    channels = {
+        rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain))
+        for era, gain in zip(rig.eras, drawn.gain[0].tolist(), strict=True)
+    }
+    return Imperfections(channels, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed)
 
 
 def _other_mesh(rig: Rig) -> PlateMesh:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import runpy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from benchmarks.contrast.entry import read_entry
 from benchmarks.contrast.score import SetScore, score, summary
 from model.errors import InputError
 
+ROOT = Path(__file__).parents[2]
 SET = "paper_plate/1-00"
 DRIVE = {"SW": [200, 1.0, 0.0], "NE": [200, 0.7, 135.0]}
 TURNED = {"SW": [200, 1.0, 90.0], "NE": [200, 0.7, 225.0]}
@@ -120,3 +122,20 @@ def test_command_prints_rows_and_exports_the_data_set(tmp_path: Path) -> None:
         FILE.name,
         *(f"{name}.yaml" for name in data_set().plates),
     }
+
+
+def test_entries_of_the_sound_zones_are_scored(tmp_path: Path) -> None:
+    """Of one set: those of twenty drawn plates give more than those of the nominal plate alone."""
+    document = json.loads(FILE.read_text("utf-8"))
+    plate = document["plates"]["paper_plate"]
+    plate["sets"] = {SET: plate["sets"][SET]}
+    document["plates"] = {"paper_plate": plate}
+    (tmp_path / FILE.name).write_text(json.dumps(document), "utf-8")
+    (tmp_path / "paper_plate.yaml").write_text(plate["rig"], "utf-8")
+    runpy.run_path(str(ROOT / "examples" / "sound_zones.py"))["write_entries"](tmp_path)
+    for method in ("contrast-control", "pressure-matching"):
+        nominal, drawn = (
+            score(read_entry(tmp_path / f"{method}-{of}.json")[1])[SET].contrast_db
+            for of in ("nominal-plate", "20-drawn-plates")
+        )
+        assert 5 < nominal < drawn < 25

@@ -8,7 +8,7 @@ import pytest
 
 import era_haptics as era
 from era_haptics.arguments import as_points
-from era_haptics.drive import excitation_of
+from era_haptics.drive import layers_of
 from model.rig.rig import Channel
 from paper_plate import make_paper_rig
 
@@ -24,8 +24,12 @@ def test_commands_for_follows_the_wiring() -> None:
     rig = replace(RIG, wiring=wiring, amplifiers={"a": "sim://", "b": "sim://"})
     sets = era.commands_for(rig, {"SW": era.Drive(110, level=0.25), "NE": era.Tone(90, 5e-5, -1)})
     found = {
-        name: sorted((c.channel, c.frequency, round(c.level, 9), round(c.phase, 3)) for c in tones)
-        for name, tones in sets.items()
+        name: sorted(
+            (each.channel, each.frequency, round(each.level, 9), round(each.phase, 3))
+            for layer in layers
+            for each in layer.tones
+        )
+        for name, layers in sets.items()
     }
     assert found == {
         "a": [(0, 40.0, 0.0, 0.0), (1, 110, 0.25, 0.0)],
@@ -39,7 +43,8 @@ def test_open_amplifier_applies_the_limits_of_the_rig() -> None:
     with era.open_amplifier(rig, url=URL) as amplifier:
         amplifier.arm()
         (commands,) = era.commands_for(rig, {"SW": era.Drive(110, level=0.2)}).values()
-        (layer,) = amplifier.play(commands, duration=0.02).layers
+        layer, *silent = amplifier.play(commands, duration=0.05).layers
+        assert not any(each.commands for each in silent)
         levels = {command.channel: command.level for command in layer.commands}  # in 1/10000
         assert levels == {0: 2000, 1: 0, 2: 0, 3: 0}
         (commands,) = era.commands_for(rig, {"SW": era.Drive(110, level=0.21)}).values()
@@ -55,21 +60,29 @@ def test_open_amplifier_needs_a_name_when_there_are_several() -> None:
             era.open_amplifier(rig, name)
 
 
-def test_excitation_of_accepts_frequency_drive_and_tone() -> None:
-    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept."""
+def test_layers_of_accepts_frequency_drive_and_tone() -> None:
+    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept.
+
+    Several tones of an ERA are excitations beside the first.
+    """
     tone = era.Tone(250.0, 3e-5, 0.1)
     drives = {"SW": 110, "SE": era.Drive(110, level=0.25, phase_deg=-90), "NE": tone}
-    assert excitation_of(drives, RIG) == {
+    assert layers_of(drives, RIG)[0].excitation == {
         "SW": era.Tone(110, 1e-4, 0.0),
         "SE": era.Tone(110, 0.25e-4, -math.pi / 2),
         "NE": tone,
     }
+    (layer,) = layers_of({"SW": [110, era.Drive(90, level=0.5)], "SE": (110,)}, RIG)
+    assert layer.excitations == (
+        {"SW": era.Tone(110, 1e-4), "SE": era.Tone(110, 1e-4)},
+        {"SW": era.Tone(90, 0.5e-4)},
+    )
 
 
-def test_excitation_of_converts_numbers_of_numpy() -> None:
+def test_layers_of_converts_numbers_of_numpy() -> None:
     """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
     drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
-    tone = excitation_of({"SW": drive}, RIG)["SW"]
+    tone = layers_of({"SW": drive}, RIG)[0].excitation["SW"]
     assert tone == era.Tone(110.5, 0.25e-4, 0.0)
     assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
 
@@ -82,12 +95,13 @@ def test_excitation_of_converts_numbers_of_numpy() -> None:
         ({"SW": 0}, "frequency.* got 0 Hz"),
         ({"SW": math.inf}, "frequency.* got inf Hz"),
         ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
+        ({"SW": [110, -1]}, "frequency.* got -1 Hz"),
     ],
 )
-def test_excitation_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:
+def test_layers_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:
     """Unknown ERAs and frequencies that are not positive numbers."""
     with pytest.raises(era.InputError, match=message):
-        excitation_of(drives, RIG)
+        layers_of(drives, RIG)
 
 
 @pytest.mark.parametrize(

@@ -42,14 +42,17 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
-        "drive": DRIVE, "target": TARGET, "quiet": (), "loads": (1.5,), "duration": 0.3,
+        "drive": np.zeros((4, 300)), "target": TARGET, "quiet": (), "loads": (1.5,),
+        "duration": 0.3, "sample_rate": 3000,
     },
+    PLATE.responses: {"points": [TARGET], "frequencies": [60.0], "fingers": (), "seed": 1},
     era.draw_map: {"plate": PLATE, "drive": DRIVE},
     era.draw_contrast_map: {
         "table": None,
         "found": era.ContrastMap(*np.zeros((2, 1)), (TARGET,), {"phased": np.zeros((1, 1))}, {}),
     },
     era.draw_answer: {"table": None, "answer": ANSWER, "layer": 0},
+    era.draw_contents: {"table": None, "answer": ANSWER},
     era.draw_playback: {"playback": None},
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
     era.commands_for: {"rig": RIG, "drive": DRIVE},

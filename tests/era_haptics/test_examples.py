@@ -75,7 +75,7 @@ def test_researcher_example_reproduces_the_paper(
     assert (ran["study"]["phased"] >= ran["study"]["switched"] - 0.5).all()
     assert np.diff(ran["study"]["phased"]).min() > 0  # the farther, the easier
     pictures = sorted(path.name for path in tmp_path.iterdir())
-    assert pictures == ["answer.png", "map.png", "ramp.png", "shaped.png"]
+    assert pictures == ["answer.png", "contents.png", "map.png", "ramp.png", "shaped.png"]
 
 
 @pytest.mark.long
@@ -104,7 +104,7 @@ def test_page_example_feels_what_was_predicted(
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")
     assert ran["felt"].contrast_db == pytest.approx(ran["only"].fingers[0].contrast_db, abs=0.2)
-    assert (tmp_path / "answer.png").stat().st_size > 10_000
+    assert (tmp_path / "contents.png").stat().st_size > 10_000
 
 
 def test_page_documents_every_name() -> None:

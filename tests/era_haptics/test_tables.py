@@ -87,13 +87,16 @@ def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
 
 
 def test_results_become_frames(table: era.LocalizationTable) -> None:
-    """A row a finger of an answer, a row a point of a map, a row a moment of a playback."""
+    """A row a finger of an answer, a mode, a point of a map, a moment of a playback."""
     fingers = [era.Finger(at, era.Stimulus()) for at in (TARGET, QUIET[0])]
     answer = era.answer(table, fingers, drive_mode="phased")
     frame = answer.to_frame()
     assert list(frame["verdict"]) == [each.verdict for each in answer.fingers]
     assert frame.loc[1, "x_m"] == QUIET[0][0]
     plate = era.SolvedPlate(era.load_rig(str(era.example_rig_path()), mesh="12x9"))
+    modes = plate.modes.to_frame()
+    assert modes["frequency_hz"].tolist() == plate.modes.natural_frequencies.tolist()
+    assert modes["damping_ratio"].between(0, 1).all()
     field = plate.map({"SW": 110}, raster=(4, 3)).to_frame()
     assert field.shape == (12, 3)
     assert field["peak_m_s2"].min() > 0
@@ -151,6 +154,26 @@ def test_draw_answer_shows_fingers_and_levels() -> None:
     drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
     row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
     assert drawn[row, column] == pytest.approx(felt.level_db_sl, abs=1.0)
+
+
+def test_draw_contents_colours_each_finger_by_its_content() -> None:
+    """The plate under a finger has the hue of its ring; its promise is beside it; a panel each."""
+    frequencies, grid = np.array([60.0, 120.0, 250.0]), era.Grid(4, 3)
+    table = build_table(PLATE.rig, frequencies=frequencies, grid=grid, drive_mode="phased")
+    answer = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (TARGET, QUIET[0])])
+    figure = era.draw_contents(table, answer)
+    whole, *alone = figure.axes
+    assert len(alone) == len(answer.layers) == 2
+    for axes, layer in zip(alone, answer.layers, strict=True):
+        assert axes.get_title() == f"{layer.frequency:g} Hz alone"
+    rings = [patch for patch in whole.patches if isinstance(patch, Circle)][1::2]
+    pixels = np.asarray(whole.images[0].get_array())
+    for felt, ring, text in zip(answer.fingers, rings, whole.texts, strict=True):
+        (x, y), (rows, columns, _) = felt.finger.at, pixels.shape
+        here = pixels[round(y / 0.2286 * (rows - 1)), round(x / 0.3048 * (columns - 1))]
+        assert np.argmax(here) == np.argmax(ring.get_edgecolor()[:3])
+        assert np.ptp(here) > 0.2
+        assert f"{felt.promised_contrast_db:.0f} dB above the others" in text.get_text()
 
 
 def test_draw_playback_shows_peaks_over_time() -> None:

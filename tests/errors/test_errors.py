@@ -98,7 +98,7 @@ LONG = {
     "table verify table.npz rig.yaml": "model.study.verify.verify_table",
     "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
-    "demo --wire sim": "model.table.table_cache.cached_table",
+    "demo --wire sim": "model.table.build.cached_table",
 }
 """Other slow commands, with their slow function."""
 

@@ -20,13 +20,14 @@ NAMES = [
     "add-a-material",
     "add-a-touch-source",
     "add-an-effect",
+    "bring-your-own-method",
     "drive-a-signal-generator",
     "design-a-layout",
     "your-own-application",
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""
-SHORT = "add-a-material"
+SHORT = {"add-a-material", "bring-your-own-method"}
 """Executed by every run of the tests; the others by `make test-long`."""
 
 
@@ -51,7 +52,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.long, pytest.mark.alone])
+        pytest.param(name, marks=[] if name in SHORT else [pytest.mark.long, pytest.mark.alone])
         for name in [*NAMES, *WITH_CONFORMANCE]
     ],
 )

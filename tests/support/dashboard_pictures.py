@@ -35,7 +35,7 @@ class Screen:
 
 
 SCREENS = (
-    Screen("desktop", 1280, 860),
+    Screen("desktop", 1280, 800),
     Screen("tablet", 820, 1180, is_phone=True),
     Screen("phone", 390, 844, is_phone=True),
     Screen("phone_across", 844, 390, is_phone=True),
@@ -120,7 +120,9 @@ async def _take_one(
     async with fingers_down(page, *TWO_PEOPLE):
         await page.until("document.querySelectorAll('.contact').length === 2")
         await page.until("document.querySelectorAll('#layers button').length === 3")
-        await asyncio.sleep(0.3)  # the field is solved after the event
+        # Solved after the event.
+        await page.until("document.querySelector('#scale-high').textContent.includes('threshold')")
+        await asyncio.sleep(0.3)
         name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
         await page.screenshot(folder / f"{name}.png")
         if screen.is_phone:

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from controller.play import joint_answer, planner
-from model.answer.answer import Answer, Layer
+from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
 from model.answer.fingers import Finger, Placement, Stimulus, together
 from model.answer.plan import answer, prepare_answers, query
 from model.answer.search import Contents, Stream, Tones
-from model.answer.strength import NO_LIMITS, Limits, scaled
+from model.answer.strength import scaled
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
@@ -86,24 +86,26 @@ class SetTable:
 
 
 @dataclass(frozen=True, eq=False)
-class SetAnswer(Answer):
-    """An answer whose layers all play one drive."""
+class SetTones(Tones):
+    """Tones that are all one drive."""
 
     drive: Excitation = field(default_factory=dict)
+
+    def excitations(self, content: int, *on: Any) -> list[Excitation]:
+        """The drive at the content's gain."""
+        gain = self.gains[content]
+        return [
+            {n: replace(tone, amplitude=gain * tone.amplitude) for n, tone in self.drive.items()}
+        ]
+
+
+class SetAnswer(Answer):
+    """An answer whose layers all play one drive."""
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """Along ramps of 15 ms."""
         return tuple(replace(each, ramp=0.015) for each in Answer.layers.func(self))
-
-    def _excitations(self, content: int) -> list[Excitation]:
-        gain = self.tones.gains[content]
-        return [
-            {
-                name: replace(tone, amplitude=gain * tone.amplitude)
-                for name, tone in self.drive.items()
-            }
-        ]
 
 
 def set_answer(
@@ -125,7 +127,7 @@ def set_answer(
         stimulus = fingers[n].stimulus
         duration = None if stimulus is None else stimulus.duration
         streams.append(Stream((n,), level_db_sl, ((0, 1),), fingers[n].priority, duration))
-    tones = Tones(
+    tones = SetTones(
         [0] * len(felt),
         [[1.0]] * len(felt),
         [1.0] * len(felt),
@@ -137,6 +139,7 @@ def set_answer(
         foreign,
         1.0,
         is_apart=True,
+        drive=drive,
     )
     places = tuple(each.at for each in fingers)
     contents = Contents(places, (), tuple(streams), quiet, drive_mode=drive_mode)
@@ -149,7 +152,6 @@ def set_answer(
         (),
         np.array([110.0]),
         np.ones(1, np.float32),
-        drive=drive,
     )
     factor = limits.factor_within(found.amplitudes, defaultdict[str, float](lambda: STROKE))
     return scaled(found, 20 * np.log10(factor)) if factor < 1 else found

@@ -3,15 +3,16 @@
 import { Connection } from "./connection.js";
 import { colourOf, decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
-import { fixed, PlateOverlay } from "./plate.js";
-import { addEvent, annotate, showAmplifiers, showEffects, showLatency, timeOfDay } from "./side.js";
+import { atLeast, fixed, PlateOverlay } from "./plate.js";
+import { addEvent, annotate, showAmplifiers, showEffects, showLatency, showStrengths, timeOfDay } from "./side.js";
 
-const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate", "inputs"];
+const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate", "inputs", "strength"];
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: the events before or after them are shown.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
+const UNNAMED = /^(gateway|era|web:\d+ .*|http .*)$/;  // clients that no strength is kept for
 // Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
   daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],
@@ -145,7 +146,8 @@ function showUnknown(cause) {
   overlay.show({ contacts: [], layers: {} });
   showLayers();
   fieldView.clear();
-  at("summary").textContent = at("inputs").textContent = "";
+  at("inputs").textContent = "";
+  summarise("");
   showAmplifiers(at("amplifiers"), null, []);
   linkLoss = null;
 }
@@ -174,37 +176,28 @@ function showLayers() {
   }));
 }
 
-// What every finger feels of its own content, where there are several.
-function summariseContents({ contacts, latency_ms }) {
-  const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
-    const { verdict, frequency_hz, level_db_sl, promised_contrast_db: promised } = contact;
-    if (frequency_hz === null) return verdict;
-    return `${fixed(frequency_hz)} Hz ${verdict}, ${fixed(level_db_sl)} dB SL, at least ${fixed(promised)} dB over others`;
-  });
-  const text = `${contacts.length} fingers, ${overlay.drives.size} contents: ${targets.join("; ")}`;
-  at("summary").textContent = `${text}; ${fixed(latency_ms, 1)} ms from touch to wire`;
+// isDrawn: whether the plate shows it to those who see it.
+function summarise(text, isDrawn = false) {
+  at("summary").textContent = text;
+  at("summary").classList.toggle("drawn", isDrawn);
 }
 
-function summarise(pattern) {
-  if (overlay.drives.size > 1) {
-    summariseContents(pattern);
-    return;
-  }
-  const { contacts, latency_ms } = pattern;
-  const level = contacts.filter(({ role }) => role === "target").at(-1)?.level_db_sl;  // as at the finger
-  const { promised_contrast_db: promised, predicted_contrast_db: modelled } = pattern;
-  const parts = [];
-  if (level != null) parts.push(`target: ${fixed(level)} dB SL`);
-  if (promised != null) parts.push(`at least ${fixed(promised)} dB over the other fingers (${fixed(modelled)} as modelled)`);
-  parts.push(`${fixed(latency_ms, 1)} ms from touch to wire`);
-  at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
+// What every finger feels, with the figures that are beside it on the plate; why one feels nothing is not there.
+function summarisePattern({ contacts }) {
+  const targets = contacts.filter(({ role }) => role === "target").map(({ verdict, frequency_hz, level_db_sl, promised_contrast_db, held_back }) => {
+    if (verdict === "held back") return held_back;
+    const contrast = promised_contrast_db === null ? "" : `, at least ${atLeast(promised_contrast_db)} dB over others`;
+    return `${fixed(frequency_hz)} Hz ${verdict}, ${fixed(level_db_sl)} dB SL${contrast}`;
+  });
+  const isDrawn = contacts.every(({ verdict }) => verdict !== "held back");
+  summarise(`${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${targets.join("; ")}`, isDrawn);
 }
 
 // Why fingers feel nothing, if because of the state.
 function summariseSilence() {
-  if (!overlay.contacts.length) at("summary").textContent = "";
-  else if (DISARMED.includes(state)) at("summary").textContent = "silent: arm to feel touches";
-  else if (LATCHED.includes(state)) at("summary").textContent = "silent: clear, then arm to feel touches";
+  if (!overlay.contacts.length) summarise("");
+  else if (DISARMED.includes(state)) summarise("silent: arm to feel touches");
+  else if (LATCHED.includes(state)) summarise("silent: clear, then arm to feel touches");
 }
 
 const HANDLERS = {
@@ -230,12 +223,12 @@ const HANDLERS = {
   pattern(pattern) {
     overlay.show(pattern);
     showLayers();
-    summarise(pattern);
+    summarisePattern(pattern);
   },
   silence({ contacts, reason }) {
     overlay.show({ contacts, layers: {} });
     showLayers();
-    at("summary").textContent = `silent: ${reason}`;
+    summarise(`silent: ${reason}`);
     summariseSilence();
   },
   amplifiers({ amplifiers }) {
@@ -252,8 +245,8 @@ const HANDLERS = {
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
-  plate({ state, cause, remedy, robust, alarms }) {
-    const isBad = robust || state === "failed" || state === "restarting";
+  plate({ state, cause, remedy, cautious, alarms }) {
+    const isBad = cautious || state === "failed" || state === "restarting";
     const isAlarm = alarms > knownAlarms;
     knownAlarms = alarms;
     at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
@@ -265,6 +258,11 @@ const HANDLERS = {
     at("inputs").textContent = lacking.map(({ name, state, problem }) => `Touch ${name}: ${state}: ${problem}`).join(" · ");
     const counts = Object.entries(rejected_touches).map(([reason, count]) => `${reason.replaceAll("_", " ")} ${count}`);
     at("rejected").textContent = counts.length ? `Rejected touches: ${counts.join(", ")}` : "";
+  },
+  strength({ strengths }) {
+    const set = (name, gain) => attempt(() => connection.strength(name, gain));
+    const shown = Object.entries(strengths).filter(([name, gain]) => gain || !UNNAMED.test(name));
+    showStrengths(at("strengths-section"), at("strengths"), shown, set);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

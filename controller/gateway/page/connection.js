@@ -30,12 +30,14 @@ export class Connection {
   // disarmed() when the lease is lost: refused by the daemon, or not renewed in time, stopped(result) of each stop, lifted() when all fingers were lifted because
   // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
   // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
-  // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL.
-  constructor(token, topics, handlers, gateway = import.meta.url) {
+  // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL. source: name of the
+  // fingers and of the effects of this page, by which their strength is kept.
+  constructor(token, topics, handlers, gateway = import.meta.url, source = null) {
     this.token = token;
     this.topics = topics;
     this.handlers = handlers;
     this.gateway = gateway;
+    this.source = source;
     this.pending = new Map();
     this.lastId = 0;
     this.attempts = 0;
@@ -80,6 +82,7 @@ export class Connection {
       this.wasOpen = false;  // the daemon has too many clients: connected later
       socket.close();
     });
+    if (this.source) this.call("hello", { client: this.source }).catch(() => {});
     this.renew();
     this.handlers.opened?.(result, id);
   }
@@ -227,8 +230,13 @@ export class Connection {
   touch(touches) {
     this.touches = touches;
     if (!this.isOpen) return;
-    const params = { source: "page", touches };
+    const params = { source: this.source ?? "page", touches };
     this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
+  }
+
+  // Set the strength of a touch source or client, -40 to 0 dB, or ask for it; a promise of it.
+  async strength(name, gain_db = null) {
+    return (await this.call("strength", { name, gain_db })).strengths[name];
   }
 
   // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.

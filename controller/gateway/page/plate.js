@@ -19,6 +19,9 @@ const textWidth = (text) => 0.62 * TEXT_PX * text.length;  // approximate, in pi
 
 export const fixed = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
+// What is promised is not rounded up.
+export const atLeast = (value) => fixed(value === null ? null : Math.floor(value));
+
 export class PlateOverlay {
   constructor(plate, svg) {
     this.plate = plate;
@@ -157,20 +160,16 @@ export class PlateOverlay {
 
   era(era) {
     const { name } = era;
-    const tones = [...this.drives.values()].flatMap((drive) => drive[name] ?? []);
-    const [tone] = tones;
+    const isDriven = [...this.drives.values()].some((drive) => drive[name]);
     const side = ERA_PX * this.px;
     const [x, y] = this.eraCentre(era);
     const square = element("rect", {
-      class: tone ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
+      class: isDriven ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
     });
     const gap = 4 * this.px;
     this.occupied.push([x - side / 2 - gap, y - side / 2 - gap, x + side / 2 + gap, y + side / 2 + gap]);
-    const parts = [name];
-    if (tones.length === 1 && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
-    if (tone) parts.push(`${(100 * tones.reduce((sum, { level }) => sum + level, 0)).toFixed(0)} %`);
     const below = y < this.rig.width_m / 2;
-    return [square, this.label([x, below ? y + 2 * side : y - side], parts.join(" "))];
+    return [square, this.label([x, below ? y + 2 * side : y - side], name)];
   }
 
   get ringRadius() {
@@ -191,8 +190,8 @@ export class PlateOverlay {
     const rings = layer === undefined ? [ring] : [this.circle(contact, "halo", this.ringRadius), ring];
     if (layer !== undefined) ring.style.stroke = colourOf(layer);
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
-    let below = role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
-    if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${verdict}${isKnown(promised) ? `, ≥ ${fixed(promised)} dB` : ""}`;
+    let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB over others` : "";
+    if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${verdict}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }

@@ -4,7 +4,7 @@ import { fixed } from "./plate.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const MAX_EVENTS = 200;
-const OLD_REPLY_S = 1.5;  // three times the interval of status reads while disarmed
+const OLD_REPLY_S = 1;  // twice the interval of status reads while disarmed
 
 function element(name, text, className) {
   const made = document.createElement(name);
@@ -13,11 +13,14 @@ function element(name, text, className) {
   return made;
 }
 
+const rounded = (value, decimals = 1) => fixed(value, Math.abs(value) < 10 ? decimals : 0);
+
 export const timeOfDay = (date) => date.toLocaleTimeString();
 
 function ageText(seconds) {
-  if (seconds < OLD_REPLY_S) return `${fixed(1000 * seconds)} ms`;
-  return seconds < 120 ? `${fixed(seconds)} s` : `${fixed(seconds / 60)} min`;
+  if (seconds === null) return "none";
+  if (seconds < OLD_REPLY_S) return "just now";
+  return seconds < 120 ? `${fixed(seconds)} s ago` : `${fixed(seconds / 60)} min ago`;
 }
 
 function silenceText({ silence, may_play_for_s }) {
@@ -50,9 +53,9 @@ function tile(amplifier, eras, readings) {
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
   add("Energised", high_voltage === null ? "unknown" : high_voltage ? "yes" : "no");
   for (const [key, [label, unit, decimals]] of Object.entries(readings)) {
-    if (typeof amplifier[key] === "number") add(label, `${fixed(amplifier[key], decimals)} ${unit}`);
+    if (typeof amplifier[key] === "number") add(label, `${rounded(amplifier[key], decimals)} ${unit}`);
   }
-  add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
+  add("Last reply", ageText(reply_age_s));
   if (silence) add("Silence", silenceText(silence));
   made.append(list);
   reports.forEach(({ cause, remedy }) => made.append(element("p", `${cause}; ${remedy}`)));
@@ -65,13 +68,12 @@ export function showAmplifiers(container, amplifiers, eras, readings = {}) {
   container.replaceChildren(...(tiles ?? [element("p", "unknown", "quiet")]));
 }
 
-const threeDigits = (value) => fixed(value, Math.max(0, 2 - Math.floor(Math.log10(Math.max(value, 1)))));
 
 export function showLatency(numbers, svg, { count, median, p99, p999, histogram }) {
   // Percentiles need enough commands.
   const percentiles = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , min]) => count >= min);
   numbers.textContent = count
-    ? [`median ${threeDigits(median)} ms`, ...percentiles.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "touch" : "touches"}`].join(", ")
+    ? [`median ${rounded(median)} ms`, ...percentiles.map(([share, value]) => `${share} within ${rounded(value)} ms`), `of ${count} ${count === 1 ? "touch" : "touches"}`].join(", ")
     : "no touches yet";
   const max = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);
@@ -105,6 +107,42 @@ export function showEffects(section, container, effects, play) {
     button.addEventListener("click", () => play(name));
     return button;
   }));
+}
+
+const LOWEST_DB = -40;
+const FADE_MS = 100;  // the daemon leads to another strength within as long
+
+// A slider for each touch source and client, set(name, gain_db); one that is being moved stays as it is.
+export function showStrengths(section, container, strengths, set) {
+  section.hidden = !strengths.length;
+  const before = new Map([...container.children].map((row) => [row.dataset.name, row]));
+  const rows = strengths.map(([name]) => before.get(name) ?? strengthRow(name, set));
+  if (rows.length !== before.size || rows.some((row) => !before.has(row.dataset.name))) container.replaceChildren(...rows);
+  rows.forEach((row, index) => row.show(strengths[index][1]));
+}
+
+function strengthRow(name, set) {
+  const row = element("label", undefined, "strength");
+  const slider = element("input");
+  const figure = element("output");
+  let waiting = null;
+  Object.assign(slider, { type: "range", min: LOWEST_DB, max: 0, step: 1 });
+  row.dataset.name = name;
+  row.append(element("span", name), slider, figure);
+  const say = () => { figure.textContent = `${slider.value} dB`; };
+  row.show = (gain) => {
+    if (waiting !== null || slider.matches(":active")) return;
+    slider.value = gain;
+    say();
+  };
+  slider.addEventListener("input", () => {
+    say();
+    waiting ??= setTimeout(() => {
+      waiting = null;
+      set(name, Number(slider.value));
+    }, FADE_MS);
+  });
+  return row;
 }
 
 // Add an event to the log, newest first, or count it if it repeats the newest; returns its item, for

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import DriverError, LinkError
-from drivers.playing.contents import Tone
+from drivers.playing import contents
 from model.answer.answer import Layer
 from model.arrays import FloatArray
 from model.rig.rig import Rig
@@ -108,18 +108,20 @@ def _by_amplifier(
 ) -> FloatArray:
     """Record what an amplifier plays."""
     seconds = _SETTLING + _WINDOW
-    tones = [
-        Tone(
+    tones = tuple(
+        contents.Tone(
             rig.wiring[name].number,
             tone.frequency,
             tone.amplitude / rig.era(name).stroke,
             float(np.degrees(tone.phase)),
         )
         for name, tone in promise.layer.excitation.items()
-    ]
+    )
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
-            playing = thread.submit(amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP)
+            playing = thread.submit(
+                amplifier.play, [contents.Layer(0, tones, _RAMP)], duration=seconds + _SETTLING
+            )
             heard = card.run(np.zeros((round(seconds * card.rate), 0)))
             playing.result()
         except BaseException:  # leaving waits for the thread, which feeds the watchdog

@@ -20,7 +20,7 @@ from virtual_loop import in_virtual_time
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep
 MAPPINGS = {"drive": 1, "layers": 2, "parameters": 1, "layout": 1}
-MAPPINGS |= {"rejected_touches": 1, "rejected_examples": 1, "lost_events": 1}
+MAPPINGS |= {"strengths": 1, "rejected_touches": 1, "rejected_examples": 1, "lost_events": 1}
 
 
 def with_extra_keys(content: Any, mapping_depth: int = 0) -> Any:

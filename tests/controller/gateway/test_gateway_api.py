@@ -64,6 +64,7 @@ PARAMETERS: dict[str, dict[str, object]] = {
     "effects": {},
     "play": {"effect": "tap", "x_m": 0.1, "y_m": 0.2},
     "forget": {},
+    "strength": {"name": "page", "gain_db": -6},
 }
 
 

@@ -154,7 +154,7 @@ class Told:
 
     reply: Reply
     state: LearningState
-    are_robust: bool | None = None
+    is_cautious: bool | None = None
     taken: int | None = None
     levels: Sequence[str] | None = None
 
@@ -168,13 +168,13 @@ REFRESHED = RefreshedAnswers(answers(), answers())
 CHANGED, FOLLOWING = "changed", "following"
 EXPLAINING, ONLY_ALARMS = "explaining", "only_alarms"
 COURSES = {
-    # Changed and robust, until an estimate says that it is as it was.
+    # Changed and cautious, until an estimate says that it is as it was.
     "a plate that had changed stays so over a restart": [
-        Told(replace(ready(), answers=answers(), change="a crack"), CHANGED, are_robust=True),
+        Told(replace(ready(), answers=answers(), change="a crack"), CHANGED, is_cautious=True),
         Told(replace(QUIET, change="a crack"), CHANGED),
-        Told(replace(QUIET, answers=answers()), FOLLOWING, are_robust=False),
+        Told(replace(QUIET, answers=answers()), FOLLOWING, is_cautious=False),
     ],
-    # Not while patterns are held or answers are robust, and as soon as neither is so.
+    # Not while patterns are held or answers are cautious, and as soon as neither is so.
     "refreshed answers are taken again after a change": [
         Told(ready(), FOLLOWING),
         Told(replace(QUIET, alarm=True, is_held=True), EXPLAINING),
@@ -210,7 +210,7 @@ async def test_status_follows_the_estimator(
             estimators.reply(told.reply)
             status = learning.status
             assert status.state is told.state, told
-            assert told.are_robust in (None, status.robust), told
+            assert told.is_cautious in (None, status.cautious), told
             assert told.taken in (None, len(taking.taken)), told
             assert told.levels in (None, [each.levelname for each in caplog.records]), told
 
@@ -248,11 +248,11 @@ async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_p
         estimators.reply(QUIET)
         assert learning.status.state == "following"
         await asyncio.sleep(61.0)
-        assert not learning.status.robust
+        assert not learning.status.cautious
 
 
 @in_virtual_time
-async def test_readings_that_stay_away_make_answers_robust(
+async def test_readings_that_stay_away_make_answers_cautious(
     estimators: Estimators, tmp_path: Path
 ) -> None:
     """Nobody watches the plate: after a minute what was learned is not trusted."""
@@ -261,7 +261,7 @@ async def test_readings_that_stay_away_make_answers_robust(
         await asyncio.sleep(0.1)
         Readings.ending.set()
         await asyncio.sleep(61.0)
-        assert learning.status.robust
+        assert learning.status.cautious
 
 
 @in_virtual_time

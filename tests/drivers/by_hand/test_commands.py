@@ -15,7 +15,7 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.by_hand.cli import app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
-from drivers.playing.contents import Tone
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import READINGS, STATUS_FLAGS
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
@@ -25,6 +25,11 @@ LIMITS = GuardLimits(40.0, 500.0, 0.5)
 DRAWN = f"sim://{example_rig_path()}"
 
 
+def layer(channel: int, frequency: float, level: float) -> Layer:
+    """One tone at once, in a layer."""
+    return Layer(0, (Tone(channel, frequency, level),), ramp=0.0)
+
+
 def loop_threads() -> list[str]:
     """Names of the running event loop threads."""
     names = [thread.name for thread in threading.enumerate()]
@@ -32,20 +37,21 @@ def loop_threads() -> list[str]:
 
 
 def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
-    """Arm, play, stop and clear; nothing is left running, thread or vibration."""
+    """Arm, play, stop, clear; layers that are not given end, and nothing is left running."""
     with BlockingAmplifier(DRAWN, limits=LIMITS) as amplifier:
         assert amplifier.identity["serial_number"] == "SIM-main"
         assert amplifier.capabilities["channels"] == 4
         assert amplifier.arm(2.0)["state"] == "OPERATION_ENABLED"
-        played = amplifier.play([Tone(0, 110.004, 0.2)], duration=0.03, ramp=0.0)
+        played = amplifier.play([layer(0, 110.004, 0.2)], duration=0.03)
         assert played.layers[0].commands[0].frequency == 2200  # in 1/20 Hz
-        later = amplifier.apply([Tone(1, 110.0, 0.3)], ramp=0.0)
+        later = amplifier.apply([layer(1, 110.0, 0.3)])
+        assert [bool(each.commands) for each in later.layers] == [True] + [False] * 7
         status = amplifier.status()
         assert (status["token"], status["levels"]) == (later.token, [0.0, 0.3, 0.0, 0.0])
         amplifier.stop()
         assert amplifier.status()["state"] == "QUICK_STOP_ACTIVE"
         with pytest.raises(CommandRefused):
-            amplifier.apply([Tone(1, 110.0, 0.3)])
+            amplifier.apply([layer(1, 110.0, 0.3)])
         with pytest.raises(CommandRefused):
             amplifier.heartbeat()
         assert amplifier.clear()["state"] == "SWITCH_ON_DISABLED"
@@ -57,7 +63,7 @@ def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
     """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
     with BlockingAmplifier(DRAWN, limits=LIMITS) as amplifier:
         amplifier.arm(1.0)
-        amplifier.apply([Tone(2, 110.0, 0.2)], ramp=0.0)
+        amplifier.apply([layer(2, 110.0, 0.2)])
         reading = amplifier.measure([110.0], 1.2)
         assert amplifier.status()["state"] == "OPERATION_ENABLED"
         sensors = amplifier.sensors()
@@ -71,7 +77,7 @@ def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPat
     with BlockingAmplifier(DRAWN, limits=LIMITS) as amplifier:
         amplifier.arm(0.1)
         with pytest.raises(CommandRefused, match=r"WATCHDOG.*clear"):
-            amplifier.play([Tone(0, 110.0, 0.2)], duration=1.0)
+            amplifier.play([layer(0, 110.0, 0.2)], duration=1.0)
 
 
 def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:

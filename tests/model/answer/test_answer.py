@@ -18,7 +18,7 @@ from model.errors import InputError
 from model.finger.perception import detection_threshold
 from model.study.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
-from model.table.raster_kernel import read_fingertips
+from model.table.table import read_fingertips
 from only import drives, only, wants
 from only import phased as answer
 from paper_table import contact_sets, smooth_table

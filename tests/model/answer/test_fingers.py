@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement, Stimulus, check_fingers, together
 from model.answer.plan import answer, query
-from model.answer.strength import Limits
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid

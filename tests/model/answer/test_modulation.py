@@ -6,12 +6,13 @@ from itertools import chain
 import numpy as np
 import pytest
 
+from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement
-from model.answer.strength import Limits, with_gains
+from model.answer.strength import with_gains
 from model.finger.perception import detection_threshold
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table
-from model.table.raster_kernel import read_fingertips
+from model.table.table import read_fingertips
 from only import phased as answer
 from only import wants
 from paper_table import contact_sets, smooth_rig

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.clicks import clicks_on, given
+from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement, Stimulus
-from model.answer.over_duration import OverDuration, on_drawn_plates, pulse_ramp, shaped_gain
+from model.answer.over_duration import (
+    OverDuration,
+    RingingUnderFingers,
+    on_drawn_plates,
+    pulse_ramp,
+    shaped_gain,
+)
 from model.answer.plan import answer, query
-from model.answer.ringing_under_fingers import RingingUnderFingers
-from model.answer.strength import Limits
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.transients.base_motion import ramped_onset, ramped_pulse

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.ensemble.attached_plate import attach
+from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickness_nodes
 from model.ensemble.draws import Drawing
-from model.ensemble.plate_on_eras import MODELLED, PlateOnEras, thickness_nodes
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import TouchedPlate
 from model.fem.mesh import ELEMENTS, Mesh

@@ -205,8 +205,8 @@ def test_answer_figure_shows_field_and_fingers(table):
 
 
 def test_answer_figure_without_an_answer():
-    """ERAs that move a nanometre have a picture without a field."""
+    """ERAs that move a nanometre have a picture of words."""
     rig = make_paper_rig(12, 9)
     still = replace(rig, eras=tuple(replace(era, stroke=1e-9) for era in rig.eras))
     table = build_table(still, frequencies=np.array([110.0]), grid=Grid(2, 2))
-    assert len(answer_figure(table).axes[0].collections) == 0
+    assert answer_figure(table).axes == []

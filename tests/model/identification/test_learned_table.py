@@ -46,7 +46,7 @@ def test_answers_wait_for_an_explanation(
 def test_unexplained_change_widens_the_errors_of_answers(
     hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
-    """Answers then are robust to the errors of a plate that was not measured, also when resumed."""
+    """Answers then allow for the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
     learned = LearnedTable(table, known, file=file)
     played(learned.take, hidden, hidden.mounted, count=12)
@@ -97,9 +97,9 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     played(learned.take, hidden, hidden.mounted, count=3)
     learned.live.known = replace(learned.live.known, change="a crack")
     learned.save()
-    robust = LearnedTable.resumed(table, known, file=file)
-    assert robust.change == "a crack"
-    assert robust.current.uncertainty.thickness == Uncertainty().thickness
+    cautious = LearnedTable.resumed(table, known, file=file)
+    assert cautious.change == "a crack"
+    assert cautious.current.uncertainty.thickness == Uncertainty().thickness
     learned.live.known = replace(learned.live.known, change="")
     learned.save()
     again = LearnedTable.resumed(table, known, file=file)

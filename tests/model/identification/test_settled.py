@@ -8,11 +8,17 @@ import pytest
 
 from benchmarks.identification.hidden import draw
 from model.arrays import FloatArray
-from model.identification.alarm import WINDOW, Alarm, Observation
+from model.identification.changes import WINDOW, Alarm, Observation
 from model.identification.forward import Sensor
 from model.identification.in_service import LivePlate, PlateEstimate
-from model.identification.settled import PatternModel, SettledPattern
-from model.identification.settled_update import NoiseLevel, State, StateUpdate, update
+from model.identification.settled import (
+    NoiseLevel,
+    PatternModel,
+    SettledPattern,
+    State,
+    StateUpdate,
+    update,
+)
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import settled_patterns
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from model.answer.fingers import Placement
-from model.ensemble.measures import percentile
+from model.ensemble.draws import percentile
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold

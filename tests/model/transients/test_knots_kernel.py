@@ -14,11 +14,10 @@ from model.transients.knots import (
     FingerResponses,
     ending_by_numpy,
     onset_by_numpy,
-    quiet_weight,
 )
-from model.transients.knots_kernel import ending_knots, onset_knots
+from model.transients.knots_kernel import ending_knots, onset_knots, quiet_weight
 from model.transients.measures import Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import Shaper, of_eras, responses_at
 from model.vibration.excitation import Tone
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -43,7 +42,7 @@ def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, FingerResponses]:
         hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
     )
     at = rng.standard_normal((1 + 5 * quiet, r))
-    return carrier, FingerResponses.at(carrier, at[:1], at[1:])
+    return carrier, responses_at(carrier, at[:1], at[1:])
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")
@@ -65,7 +64,7 @@ def test_knots_are_those_of_numpy(eras, quiet, level):
     np.testing.assert_array_equal(knots[-1], weights)
     assert np.abs(knots[1:-1]).max() <= 1
     active = np.arange(eras)[rng.permutation(eras) > 0]
-    for felt in (None, found.of(active)):
+    for felt in (None, of_eras(found, active)):
         weight = 0.0 if felt is None else quiet_weight(carrier, weights, active, felt)
         knots = ending_knots(carrier, weights, active, felt)
         expected = ending_by_numpy(carrier, weights, active, felt, weight)

@@ -27,7 +27,6 @@ from model.transients.base_motion import (
 )
 from model.transients.knots import (
     ENDING_KNOTS,
-    FingerResponses,
     bounded_minimum,
     mean_square,
     solve_carrier,
@@ -35,6 +34,7 @@ from model.transients.knots import (
 )
 from model.transients.measures import Transients
 from model.transients.ringing import ramped_ringing
+from model.transients.shaping import responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone
 from paper_plate import make_paper_rig
@@ -87,7 +87,7 @@ def test_while_ending_is_the_mean_square_of_the_response():
         shape = (ENDING_KNOTS, 4)  # the tone, then seven knots, in strokes; the eighth is silence
         knots = 0.1 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
         knots += (rng.standard_normal(4) + 1j) * np.linspace(1, 0, ENDING_KNOTS)[:, None]
-        felt = FingerResponses.at(carrier, rows, rows)
+        felt = responses_at(carrier, rows, rows)
         form, right = while_ending(felt, knots[0], gain_variance=0.0)
         added = value(form, right, knots[1:].ravel())
         stopped = np.vstack([knots[:1], 0 * knots[1:]])

@@ -44,7 +44,7 @@ def tones(rig, frequency, weights) -> Excitation:
     }
 
 
-def robust_weights(plate, frequency, target, quiet):
+def loaded_weights(plate, frequency, target, quiet):
     """R w = conj(h) with errors of 0.1, from steady accelerations at both fingertips."""
     omega = 2 * np.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
@@ -122,7 +122,7 @@ PAIRS = [
 def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, frequency):
     """In the first 100 ms and with errors: 6 dB more than a 20 ms ramp, 6 dB off steady at most."""
     rig, plate, shaper, transients = setup
-    weights = robust_weights(plate, frequency, target, quiet)
+    weights = loaded_weights(plate, frequency, target, quiet)
     excitation = tones(rig, frequency, weights)
     onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
 
@@ -183,7 +183,7 @@ def test_shaping_includes_the_errors_of_the_eras(setup):
     """With errors the robust onset and ending do better than those that know of no errors."""
     rig, plate, shaper, transients = setup
     target, quiet, frequency = PAIRS[2]
-    excitation = tones(rig, frequency, robust_weights(plate, frequency, target, quiet))
+    excitation = tones(rig, frequency, loaded_weights(plate, frequency, target, quiet))
     low = random_excitation(rig, 110.8, np.random.default_rng(1))
     found = [(shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low))]
     shaper = Shaper(plate, gain_variance=0.0)
@@ -204,7 +204,7 @@ def test_shaped_onset_target_follows_its_ramp(setup):
     """A target has nothing at first, half its amplitude within 35 ms, and most of it by 60 ms."""
     rig, plate, shaper, transients = setup
     for target, quiet, frequency in PAIRS[1:]:
-        weights = robust_weights(plate, frequency, target, quiet)
+        weights = loaded_weights(plate, frequency, target, quiet)
         excitation = tones(rig, frequency, 0.1 * weights)
         onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
         felt = transients.acceleration(shaped(onset, rig.eras), np.array([target]), duration=0.3)[
@@ -223,7 +223,7 @@ def test_ending_keeps_known_quiet_finger_quiet(setup):
     """
     rig, plate, shaper, transients = setup
     for target, quiet, frequency in PAIRS:
-        weights = robust_weights(plate, frequency, target, quiet)
+        weights = loaded_weights(plate, frequency, target, quiet)
         excitation = tones(rig, frequency, 0.2 * weights)
         knowing = shaped(shaper.ending(excitation, targets=[target], quiet=[quiet]), rig.eras)
         peaks = [

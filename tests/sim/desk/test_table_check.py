@@ -18,7 +18,7 @@ from desk_card import DeskCard
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
-from drivers.playing.contents import Tone
+from drivers.playing.contents import Layer
 from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
@@ -31,7 +31,7 @@ from model.study.table_check import CheckSettings
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable
-from model.vibration.excitation import tone_amplitudes
+from model.vibration.excitation import tone_fields
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors
@@ -80,7 +80,7 @@ def felt_contrast(rig: Rig, promise: Promise) -> float:
     """Felt contrast [dB] at the sensors of a promise, by the direct solver."""
     points = np.array([PLACES[name] for name in promise.sensors])
     respond = direct_responder(rig.plate, rig.mesh)
-    frequencies, found = tone_amplitudes(
+    frequencies, found = tone_fields(
         promise.layer.excitation, rig.eras, lambda f: respond(rig.eras, f, points)
     )
     felt = np.linalg.norm(found / detection_threshold(frequencies)[:, None], axis=0)
@@ -286,16 +286,14 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
     class Observed(BlockingAmplifier):
         """Notes how what it plays ends."""
 
-        def apply(
-            self, tones: Sequence[Tone], *, ramp: float = 0.02, valid_for: float = 0.0
-        ) -> Staged:
-            staged = super().apply(tones, ramp=ramp, valid_for=valid_for)
+        def apply(self, layers: Sequence[Layer]) -> Staged:
+            staged = super().apply(layers)
             playing.set()
             return staged
 
-        def play(self, tones: Sequence[Tone], *, duration: float, ramp: float = 0.02) -> Staged:
+        def play(self, layers: Sequence[Layer], *, duration: float) -> Staged:
             try:
-                staged = super().play(tones, duration=duration, ramp=ramp)
+                staged = super().play(layers, duration=duration)
             except CommandRefused:
                 ended.append("disarmed")
                 raise

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.fingers import Placement
+from model.answer.answer import Layer
+from model.answer.fingers import Placement, Stimulus, together
 from model.errors import InputError
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -19,7 +20,7 @@ from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone
-from sim.plant.excited_plate import Playback, play
+from sim.plant.excited_plate import Playback, Vibration, play
 from sim.plant.fingers import Fingers, Record, measure_vibration
 
 
@@ -129,7 +130,7 @@ def test_playback_steady_measures_agree_with_the_frequency_domain(
     """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
     rig = replace(coarse_rig, fingertip=fingertip)
     fingers = replace(FINGERS, loads=pressed)
-    played = play(rig, reduced, EXCITATION, fingers, duration=1.2)
+    played = play(rig, reduced, [Layer(EXCITATION)], together(fingers, Stimulus()), duration=1.2)
     tips = [fingertip.scaled(each) for each in pressed or (1, 1)] if fingertip else []
     loads = [FingertipLoad(*at, tip) for at, tip in zip((TARGET, QUIET), tips, strict=False)]
     at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
@@ -156,12 +157,14 @@ def test_playback_measures_of_several_targets() -> None:
 
     quiet = record(0.1, 0.2)
     quiet.accelerations[:1000] *= 10.0  # louder while it starts
-    played = Playback((100.0,), (record(3.0, 5.0), record(2.0, 2.0)), (quiet,), settled=0.1)
+    at_targets = record(3.0, 5.0), record(2.0, 2.0)
+    vibration = Vibration((100.0,), (0, 1), (*at_targets, quiet))
+    played = Playback((vibration,), settled=0.1)
     assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
     assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=0.01)
     assert played.quiet_level_db_sl is not None
     assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
-    alone = Playback((100.0,), (record(3.0, 5.0),), (), settled=0.1)
+    alone = Playback((Vibration((100.0,), (0,), at_targets[:1]),), settled=0.1)
     assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
 
 
@@ -173,7 +176,8 @@ def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate)
         "NE": BaseEnvelope(110.0, 0, (5e-6, 0)),
     }
     rig = replace(coarse_rig, fingertip=None)
-    played = play(rig, reduced, excitation, FINGERS, duration=0.2, onset=onset)
+    layer = Layer(excitation, onset=onset)
+    played = play(rig, reduced, [layer], together(FINGERS, Stimulus()), duration=0.2)
     assert played.settled == pytest.approx(0.015)
     transients = Transients(plate_in_time(reduced, coarse_rig.eras))
     for record in (*played.targets, *played.quiet):
@@ -198,7 +202,13 @@ def test_playback_refuses_invalid_input(
 ) -> None:
     """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
     with pytest.raises(InputError, match=says):
-        play(coarse_rig, reduced, EXCITATION, fingers, duration=duration)
+        play(
+            coarse_rig,
+            reduced,
+            [Layer(EXCITATION)],
+            together(fingers, Stimulus()),
+            duration=duration,
+        )
 
 
 def test_playback_reads_steady_measures_at_the_end() -> None:
@@ -206,6 +216,6 @@ def test_playback_reads_steady_measures_at_the_end() -> None:
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
     record = Record(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
-    playback = Playback((100.0,), (record,), (), settled=0.04)
+    playback = Playback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
     expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
     assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

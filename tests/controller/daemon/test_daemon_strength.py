@@ -1,0 +1,153 @@
+"""The strength of touch sources and clients, from the API to the skin, in virtual time."""
+
+import asyncio
+import json
+import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.api.async_client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.demo.run import layout_of_people
+from daemon_bench import DaemonBench, ready_daemon
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.table.build import build_table
+from model.table.table import LocalizationTable
+from paper_plate import make_paper_rig
+from registry import clock
+from virtual_loop import in_virtual_time
+
+PLACES = {"left": (0.03, 0.11), "right": (0.216, 0.0572)}
+FADE, WINDOW, STEP = 0.100, 0.050, 0.001  # s
+LOWER = 10 ** (-6 / 20)  # of -6 dB
+STEEPEST = (1 - LOWER) * math.pi / 2 * STEP / FADE
+"""Largest change of an envelope of 1 along the raised cosine, within a step."""
+
+
+@cache
+def phased_table() -> LocalizationTable:
+    """For two contents at once."""
+    frequencies = np.arange(60.0, 301.0, 20.0)
+    return build_table(make_paper_rig(12, 9), frequencies=frequencies, drive_mode="phased")
+
+
+@asynccontextmanager
+async def seats(folder: Path, more: str = "") -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
+    """An armed daemon with a region for each of two, whose fingers lie on its plate."""
+    layout = layout_of_people(make_paper_rig(12, 9).plate, dict.fromkeys(PLACES))
+    (folder / "layout.yaml").write_text(json.dumps(layout), encoding="utf-8")
+
+    def table(rig: Rig) -> LocalizationTable:
+        return phased_table()
+
+    async with ready_daemon(folder, f"layout: layout.yaml\n{more}", table=table) as (bench, era):
+        bench.far.bench.place_fingers(PLACES, now=clock.now())
+        await era.arm("test", lease_s=60)
+        yield bench, era
+
+
+async def hold(seconds: float, *touching: tuple[AsyncClient, str, str]) -> None:
+    """Let clients report a finger each for a time [s]: their sources, and where."""
+    end = clock.now() + seconds
+    while clock.now() < end:
+        for era, source, place in touching:
+            await era.touch([PLACES[place]], source=source)
+        await asyncio.sleep(0.02)
+
+
+def envelope(bench: DaemonBench, finger: str, frequency: float, at: FloatArray) -> FloatArray:
+    """Amplitude of one tone at a fingertip [m/s²] at times [s], under a Hann window."""
+    records, _ = bench.far.bench.records(at[0] - WINDOW, at[-1] + WINDOW)
+    felt = records[finger]
+    turned = np.exp(-2j * np.pi * frequency * felt.times) * (felt.accelerations @ felt.weights)
+    weights = np.cos(np.pi * np.clip((felt.times - at[:, None]) / WINDOW, -0.5, 0.5)) ** 2
+    return np.asarray(np.abs(weights @ turned) / weights.sum(axis=1))
+
+
+@in_virtual_time
+async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_path: Path) -> None:
+    """6 dB less within 100 ms and back, monotone and as steep as a raised cosine; others as before.
+
+    On the amplifier exactly, at the skin as the plate follows.
+    """
+    async with seats(tmp_path) as (bench, era):
+        both = [(era, name, name) for name in PLACES]
+        await hold(1.0, *both)
+        tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
+        for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
+            set_at = clock.now()
+            await era.strength(name="left", gain_db=gain)
+            await hold(0.02, *both)
+            led = np.arange(clock.now(), set_at + 0.2, STEP)
+            moving = [
+                np.array([abs(tone.transition.at(time)) for time in led])
+                for channel in bench.far.amplifier.outputs
+                for tone in channel
+                if tone.frequency == pytest.approx(tones["left"], abs=0.01)
+            ]
+            await hold(0.4, *both)
+            at = np.arange(set_at, set_at + 0.3, STEP)
+            for name, frequency in tones.items():
+                found = envelope(bench, name or "", frequency or 0.0, at)
+                if name == "left":
+                    moving.append(found)
+                    reached = found[round((FADE + WINDOW / 2 + 0.01) / STEP) :]
+                    assert 20 * np.log10(reached / found[0]) == pytest.approx(gain or 6.0, abs=0.2)
+                    assert 20 * np.log10(found[-1] / found[0]) == pytest.approx(gain or 6, abs=0.05)
+                else:
+                    assert 20 * np.log10(found / found[0]) == pytest.approx(0.0, abs=0.1)
+            assert len(moving) == 5
+            for course in moving:
+                changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)
+                slack = 0.1 if course is moving[-1] else 0.01
+                assert -slack * STEEPEST <= changes.min()
+                assert changes.max() <= (1 + slack) * STEEPEST
+
+
+@in_virtual_time
+async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
+    """A client's for all its sources and those of its namesakes, and for what it plays elsewhere.
+
+    Each name counts once, also after its client and the daemon have come back; what they leave
+    below the threshold is held back. What is no strength, or not a known name, is refused.
+    """
+
+    async def levels(era: AsyncClient) -> list[float]:
+        await asyncio.sleep(0.4)
+        return [round(each.level_db_sl or 0.0, 1) for each in (await era.status()).contacts]
+
+    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
+        one, other = await bench.client("seat"), await bench.client("seat")
+        held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "seat", "right")))
+        assert await levels(era) == [20, 20]
+        await era.strength(name="pen", gain_db=-3)
+        await era.strength(name="seat", gain_db=-6)
+        assert await levels(era) == [11, 14]
+        await era.strength(name="test", gain_db=-2)
+        await era.play("buzz", PLACES["right"])
+        assert await levels(era) == [11, 12]
+        for gain, what in ((3.0, "at most 0"), (-41.0, "at least -40"), (math.nan, "finite")):
+            with pytest.raises(InputError, match=f"^strength: gain_db must be .*{what}.*, got"):
+                await era.strength(name="pen", gain_db=gain)
+        with pytest.raises(RpcError, match=r"^name must be .*, got 'pan'; choose one of pen, "):
+            await era.strength(name="pan", gain_db=-6)
+        held.cancel()
+        await asyncio.gather(one.close(), other.close())
+    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
+        assert (await era.status()).strengths == {"pen": -3, "seat": -6, "test": -2}
+        one, other = await bench.client("seat"), await bench.client("another")
+        held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
+        assert await levels(era) == [11, 20]
+        await era.strength(name="pen", gain_db=-40)
+        assert await levels(era) == [-26, 20]
+        weak, felt = (await era.status()).contacts
+        assert (weak.verdict, felt.verdict) == ("held back", "own")
+        assert "-46 dB" in (weak.held_back or "")
+        held.cancel()

@@ -9,16 +9,22 @@ from model.calibration.calibration_result import Calibration
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
 from model.diagnosis.consistency import check_consistency
+from model.progress import Progress, check_progress, unseen
 from model.rig.rig import Rig
 
 
-def calibrate(rig: Rig, measured: Path | str, *, all_scales: bool = False) -> Calibration:
+def calibrate(
+    rig: Rig, measured: Path | str, *, all_scales: bool = False, progress: Progress = unseen
+) -> Calibration:
     """Fit a rig to measured responses, a .csv, .uff or .unv file, as `era calibrate` does.
 
-    all_scales: estimate the scale of every sensor, not only of wrong ones. The result's `rig` has
-    the fitted values and their uncertainty, its `parameters` their standard errors; use it only if
-    `is_good`. Raises InputError for responses that are not what they claim, by their cause.
+    all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
+    the fits done and all. The result's `rig` has the fitted values and their uncertainty, its
+    `parameters` their standard errors; use it only if `is_good`. Raises InputError for responses
+    that are not what they claim, by their cause.
     """
     expect_rig(rig)
+    check_progress(progress)
     responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
-    return fit(rig, responses, check_consistency(rig, responses), all_scales=all_scales)
+    screened = check_consistency(rig, responses)
+    return fit(rig, responses, screened, all_scales=all_scales, progress=progress)

@@ -23,6 +23,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
+from model.progress import Progress, check_progress, unseen
 from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
 from model.table.build import cached_table
@@ -35,20 +36,23 @@ def table(
     drive_mode: str = "switched",
     frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Load the rig's localization table from the user's cache, or build it in a second or two.
 
     drive_mode: its default, `switched` or `phased`; frequencies (f,) [Hz]:
     ascending, within the rig's limits, by default 40 to 500 in steps of 10 within these; grid:
-    target cells. The table of `era table build`; `load_table` and `save_table` are for files.
-    Raises InputError.
+    target cells; progress: called with the parts built and all. The table of `era table build`;
+    `load_table` and `save_table` are for files. Raises InputError.
     """
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
     chosen = None if frequencies is None else as_frequencies(frequencies)
-    found, _ = cached_table(rig, frequencies=chosen, grid=grid, drive_mode=drive_mode)
-    return found
+    check_progress(progress)
+    return cached_table(
+        rig, frequencies=chosen, grid=grid, drive_mode=drive_mode, progress=progress
+    )[0]
 
 
 def query(
@@ -129,12 +133,13 @@ def contrast_map(
     drive_modes: Sequence[str] = (),
     level_db_sl: float = STRONG_DB_SL,
     grid: Grid | None = None,
+    progress: Progress = unseen,
 ) -> ContrastMap:
     """Map the contrast of a finger at every place to these quiet fingers [m], as `era table map`.
 
     drive_modes: the table's own for none, several to compare them; level_db_sl: at each place;
-    grid: places, the table's cells if None. Raises InputError for fingers off the plate, and for
-    an unknown drive mode.
+    grid: places, the table's cells if None; progress: called with the questions asked and all.
+    Raises InputError for fingers off the plate, and for an unknown drive mode.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")
@@ -143,12 +148,14 @@ def contrast_map(
         expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     for mode in drive_modes:
         _expect_mode(mode)
+    check_progress(progress)
     return map_contrast(
         table,
         as_points(quiet, what="quiet"),
         drive_modes=drive_modes,
         level_db_sl=float(level_db_sl),
         grid=grid,
+        progress=progress,
     )
 
 

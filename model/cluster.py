@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
+from model.arguments import shown
 from model.errors import InputError
 from model.version import code_version
 
@@ -15,15 +16,6 @@ _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
 Shared = TypeVar("Shared")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-
-def check_address(address: str) -> None:
-    """Raise InputError for what is not the address of a scheduler."""
-    if not _ADDRESS.fullmatch(address):
-        raise InputError(
-            f"--cluster must be the address that `dask scheduler` prints, for example "
-            f"tcp://192.168.1.5:8786, got {address[:60]!r}"
-        )
 
 
 def on_cluster(
@@ -38,6 +30,11 @@ def on_cluster(
     shared: its first argument. A task whose worker is lost is solved again. Raises InputError where
     no scheduler answers, it has no workers, or one runs other code.
     """
+    if not _ADDRESS.fullmatch(str(address)):
+        raise InputError(
+            "--cluster must be the address that `dask scheduler` prints, for example "
+            f"tcp://192.168.1.5:8786, got {shown(address)}"
+        )
     try:
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:

@@ -5,7 +5,7 @@ counts: what nine of ten plates give. A pattern that leaves the target of more t
 over 0.5 dB below the level, and a set without a pattern, count 0 dB.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, da
 from model.answer.answer import Layer
 from model.answer.fingers import Stimulus, together
 from model.finger.perception import decibels
+from model.progress import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
@@ -52,7 +53,7 @@ def score(
     excitations: Mapping[str, Excitation],
     *,
     in_time: bool = False,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Progress = unseen,
 ) -> dict[str, SetScore]:
     """Score the excitations by set, of every plate that has one; in_time: play each, too.
 

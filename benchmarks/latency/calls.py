@@ -16,7 +16,6 @@ from typing import Any
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
-from controller.play.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
@@ -97,16 +96,16 @@ async def measure(rig: Rig) -> list[str]:
         lines=lambda: MemoryLines(rig, recorder.written),
         intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
         timing=Timing(table),
-        observer=Observer(pattern_applied=lambda applied: played.set()),
         watchdog=2.0,
     )
+    controller.cycle.observers.pattern_applied.append(lambda applied: played.set())
     await controller.open()
     await controller.arm()
-    running = asyncio.create_task(controller.run())
+    running = asyncio.create_task(controller.cycle.run())
     x, y = rig.plate.length / 3, rig.plate.width / 3
 
     def deliver(*touches: Touch) -> None:
-        controller.deliver(TouchFrame("panel", asyncio.get_running_loop().time(), touches))
+        controller.cycle.deliver(TouchFrame("panel", asyncio.get_running_loop().time(), touches))
 
     async def rest() -> None:
         for _ in range(round(_RESTING / _FRAME_INTERVAL)):

@@ -1,7 +1,7 @@
 """Check of a surface layout on the plate of a table: how every region will feel."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
-from controller.effects.band import band_problem
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.region import Region
-from controller.play.intent import Target
+from controller.play.intent import Target, band_problem
+from model.progress import Progress, unseen
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
@@ -103,7 +103,7 @@ def check_layout(
     layout: SurfaceLayout,
     table: LocalizationTable,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[CheckedEffect]:
     """Simulate touches over every region of a layout, alone and with a resting second finger.
 

@@ -1,7 +1,7 @@
 """Which regions of a layout can be felt apart at the same time: two and three fingers at once."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any, TypeAlias
@@ -13,7 +13,7 @@ from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, TouchSimulator
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.play.chooser import ChoiceRequest
+from controller.play.chooser import ChoiceRequest, Intention
 from controller.play.content import Selection
 from controller.play.intent import Target
 from controller.play.joint_answer import fingers_of
@@ -23,6 +23,7 @@ from model.answer.plan import answer
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.counting import counted
+from model.progress import Progress, unseen
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
@@ -64,7 +65,7 @@ def check_together(
     layout: SurfaceLayout,
     table: LocalizationTable,
     *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> list[Together]:
     """Answer fingers in every two and every three regions at their worst places.
 
@@ -236,7 +237,8 @@ def _felt(
     for one, level in zip(short, leaks, strict=True):
         key = one[0].key
         beside = Selection((), (), quiet_levels={key: level})
-        requested = ChoiceRequest((one,), contacts, protected or frozenset(), {}, (beside,))
+        intended = Intention(contacts, (), (one,), protected or frozenset())
+        requested = ChoiceRequest(intended, {}, (beside,))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
         (predicted,) = chosen.predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict

@@ -11,7 +11,7 @@ from controller.play.chooser import Chooser
 from controller.play.intent import Target
 from controller.play.joint_answer import answered
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import Answer
+from model.answer.answer import Answer, Limits
 from model.arrays import FloatArray
 from model.choice import NEARLY
 from model.drive_modes import DRIVE_MODES
@@ -66,8 +66,7 @@ class TouchSimulator:
         self.capabilities = PlaybackCapabilities(
             drive_mode=DRIVE_MODES[-1],
             playable=DRIVE_MODES,
-            frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
-            max_amplitudes=table.strokes,
+            limits=Limits((float(table.frequencies[0]), float(table.frequencies[-1]))),
             envelope_support=RAMPS_ONLY,
         )
         """Of amplifiers that play whatever the table has."""

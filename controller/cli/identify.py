@@ -4,20 +4,20 @@ Also how commands measure it.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from model.commands.fitted_rig_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, progress_bar
 from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.config.document import Document
-    from model.identification.measurement import DeviceSettings, MeasuredPlate
+    from model.identification.measurement import MeasuredPlate
     from model.rig.rig import Rig
 
 _NOT_EXPLAINED = (
@@ -108,7 +108,7 @@ def identify(
     from model.config.points import parse_frequencies
     from model.identification import identification_report
     from model.identification.identify import identify as fit
-    from model.identification.measurement import DeviceSettings
+    from model.identification.measurement import DeviceSettings, measure_by_device
     from model.identification.promise import expected_contrast
     from model.structure.modal_elasticity import check_measurable
 
@@ -137,14 +137,14 @@ def identify(
         check_rig_output(output, rig_file, source)
         require_untouched(is_known=untouched, has_terminal=not as_json)
         if settings is not None:
-            measured = _measured_by_device(rig, settings, is_shown=not as_json)
+            with progress_bar("runs") as progress:
+                measured = measure_by_device(rig, settings, progress=progress)
         else:
-            measured = measured_by_amplifiers(
-                rig, url or [], level=level, is_quick=quick, is_shown=not as_json
-            )
+            measured = measured_by_amplifiers(rig, url or [], level=level, is_quick=quick)
     started = time.perf_counter()
     try:
-        found = fit(rig, measured.measurement, seed=seed)
+        with progress_bar("fits") as progress:
+            found = fit(rig, measured.measurement, seed=seed, progress=progress)
     except InputError as error:
         typer.echo(f"era: {error}; no rig is written", err=True)
         raise typer.Exit(NO_FIT) from error
@@ -170,16 +170,6 @@ def identify(
         elapsed=time.perf_counter() - started,
         refusal=None if found.is_explained else _NOT_EXPLAINED,
     )
-
-
-def _measured_by_device(
-    rig: "Rig", settings: "DeviceSettings", *, is_shown: bool
-) -> "MeasuredPlate":
-    """Measure by a sound card, with a progress bar on a terminal."""
-    from model.identification.measurement import measure_by_device
-
-    with shown_progress("runs", is_shown=is_shown) as progress:
-        return measure_by_device(rig, settings, progress=progress)
 
 
 def _refuse(given: Mapping[str, object], *, rule: str) -> None:
@@ -225,9 +215,9 @@ def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
 
 
 def measured_by_amplifiers(
-    rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool, is_shown: bool
+    rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool
 ) -> "MeasuredPlate":
-    """Measure by the rig's amplifiers, with a progress bar on a terminal.
+    """Measure by the rig's amplifiers, and show the steps.
 
     urls: `[NAME=]URL` in place of those of the rig; level: of every tone, None for the usual one;
     is_quick: every tone on one ERA only. Raises DriverError and InputError.
@@ -240,21 +230,12 @@ def measured_by_amplifiers(
     at = _urls_of(rig, urls)
 
     async def measure() -> "MeasuredPlate":
-        with shown_progress("steps", is_shown=is_shown) as on_step:
+        with progress_bar("steps") as progress:
             return await PlateSelfMeasurement(
-                rig, Lines, at, level=level, is_quick=is_quick, on_step=on_step
+                rig, Lines, at, level=level, is_quick=is_quick, progress=progress
             ).run()
 
     return asyncio.run(measure())
-
-
-def shown_progress(
-    unit: str, *, is_shown: bool
-) -> AbstractContextManager[Callable[[int, int], None]]:
-    """A progress bar of units in plural, or nothing, which yields its update(done, total)."""
-    from model.commands.options import progress_bar
-
-    return progress_bar(unit) if is_shown else nullcontext(lambda done, total: None)
 
 
 def _urls_of(rig: "Rig", texts: Sequence[str]) -> dict[str, str]:

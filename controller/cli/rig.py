@@ -86,7 +86,7 @@ def check(
         if mesh is not None:
             raise InputError("--mesh is of --measured; write mesh into the rig file")
         rig, plate, observation = _measured(
-            rig_file, url, level=level, is_untouched=untouched, is_shown=not as_json
+            rig_file, url, level=level, is_untouched=untouched, has_terminal=not as_json
         )
         details, rows = measured_json(plate), [measured_line(rig, plate), *plate.notes]
     else:
@@ -118,7 +118,7 @@ def check(
 
 
 def _measured(
-    rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, is_shown: bool
+    rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, has_terminal: bool
 ) -> "tuple[Rig, MeasuredPlate, Responses]":
     """Measure the plate by the sensors of its amplifiers."""
     from controller.diagnosis.plate_measurement import observation_of
@@ -126,8 +126,8 @@ def _measured(
 
     with rig_of_file(rig_file) as (_, rig):
         check_measurable(rig.plate)
-        require_untouched(is_known=is_untouched, has_terminal=is_shown)
-        plate = measured_by_amplifiers(rig, urls, level=level, is_quick=False, is_shown=is_shown)
+        require_untouched(is_known=is_untouched, has_terminal=has_terminal)
+        plate = measured_by_amplifiers(rig, urls, level=level, is_quick=False)
     return rig, plate, observation_of(plate.measurement, rig)
 
 

@@ -22,7 +22,7 @@ from controller.operation.dumps import FaultDumps
 from controller.operation.links import Supervisor
 from controller.operation.states import ENERGISED, DaemonState, Operation
 from controller.play.loop import Controller
-from controller.play.observer import Observer
+from controller.play.observer import Observers
 from controller.process.log import LogThread
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
@@ -43,9 +43,9 @@ _logger = logging.getLogger(__name__)
 class Daemon:
     """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT at which the gateway serves the page, or None. observer: of the control
-    loop. lines: makes the lines to its amplifiers. watchdog [s]: of these, a longer one for
-    simulated amplifiers on a machine that is busy.
+    dashboard: HOST:PORT at which the gateway serves the page, or None. observe: adds observers of
+    the control loop. lines: makes the lines to its amplifiers. watchdog [s]: of these, a longer one
+    for simulated amplifiers on a machine that is busy.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
-        observer: Observer = Observer(),  # noqa: B008  frozen
+        observe: Callable[[Observers], None] = lambda loop: None,
         lines: Callable[[], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
@@ -111,13 +111,14 @@ class Daemon:
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
             connected=self._connected,
-            observer=self._supervisor.observer(),
             intent_source=self._layout,
             timing=timing,
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
-        self._controller.observers.append(self._publisher.observer())
+        cycle = self._controller.cycle
+        self._supervisor.observe(cycle.observers)
+        self._publisher.observe(cycle.observers)
         if config.learn is not None:
             self.learning = Learning(
                 config.rig,
@@ -128,12 +129,12 @@ class Daemon:
                 changed=self._publisher.plate_changed,
                 estimated=self._publisher.learning_latencies.add,
             )
-            self._controller.observers.append(self.learning.observer)
-        self._controller.observers.append(observer)
+            self.learning.observe(cycle.observers)
+        observe(cycle.observers)
         self._inputs = TouchInputs(
-            self._controller.deliver,
-            self._controller.lift,
-            rejects=self._controller.rejects,
+            cycle.deliver,
+            cycle.lift,
+            rejects=cycle.rejects,
             changed=lambda: self._publisher.hub.publish("inputs", self._publisher.inputs),
         )
         self._api = ApiService(
@@ -149,7 +150,7 @@ class Daemon:
             self._api.handlers(),
             on_disconnect=self._api.client_left,
             holds_lease=self._api.holds_lease,
-            is_busy=lambda: self._controller.is_preparing,
+            is_busy=lambda: cycle.is_preparing,
             stop_all=self._supervisor.stop_anyhow,
             requested=self._dumps.requested,
             clock=clock.now,
@@ -230,7 +231,7 @@ class Daemon:
             self._layout.replace(new.effective_layout)
             self._warn_of_bands(new)
             self._publisher.layout_changed(new.layout)
-            self._controller.request_update()
+            self._controller.cycle.request_update()
         self._config = new
         _logger.info("config: reloaded, applied %s", "layout" if differs else "no change")
 

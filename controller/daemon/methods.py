@@ -103,7 +103,7 @@ class ApiService:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
         if client.number is not None:
-            self._controller.lift(f"{_origin(client)}:")
+            self._controller.cycle.lift(f"{_origin(client)}:")
         self._clients.discard(client)
 
     def holds_lease(self, client: Connection) -> bool:
@@ -148,10 +148,10 @@ class ApiService:
             latency_ms=self._publisher.latencies.summary(),
             lift_latency_ms=self._publisher.lift_latencies.summary(),
             lost_events=dict(self._publisher.hub.lost),
-            rejected_touches=dict(self._controller.rejects.counts),
-            rejected_examples=dict(self._controller.rejects.examples),
+            rejected_touches=dict(self._controller.cycle.rejects.counts),
+            rejected_examples=dict(self._controller.cycle.rejects.examples),
             inputs=self._publisher.inputs().inputs,
-            clicks_too_late=self._controller.clicks_too_late,
+            clicks_too_late=self._controller.cycle.clicks_too_late,
             learning=self._publisher.learning_summary(),
             strengths=self._publisher.strengths().strengths,
             slow_reason=why_slow(),
@@ -273,7 +273,7 @@ class ApiService:
         )
         # The same source name of two clients denotes two sources.
         name = f"{origin}:{params.source}"
-        self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
+        self._controller.cycle.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
     @api_method()
@@ -325,7 +325,7 @@ class ApiService:
             level_db_sl=params.level_db_sl,
             player=client.name,
         )
-        self._controller.request_update()
+        self._controller.cycle.request_update()
         return Empty()
 
     @api_method()
@@ -344,7 +344,7 @@ class ApiService:
             )
         if params.gain_db is not None:
             self._layout.strengths.set(name, params.gain_db)
-            self._controller.request_update()
+            self._controller.cycle.request_update()
             if (file := self._config.strengths) is not None:
                 async with self._saving:  # the newest last
                     try:

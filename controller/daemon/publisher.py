@@ -36,7 +36,7 @@ from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
-from controller.play.observer import Observer, PlayReport, SilenceReport
+from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from registry import clock
 
@@ -94,14 +94,12 @@ class EventPublisher:
             clock=clock.now,
         )
 
-    def observer(self) -> Observer:
-        """The observer of the control loop."""
-        return Observer(
-            contacts_changed=self._contacts_changed,
-            pattern_applied=partial(self._reported, "pattern"),
-            silenced=partial(self._reported, "silence"),
-            refused=self._refused,
-        )
+    def observe(self, loop: Observers) -> None:
+        """Publish what the control loop reports."""
+        loop.contacts_changed.append(self._contacts_changed)
+        loop.pattern_applied.append(partial(self._reported, "pattern"))
+        loop.silenced.append(partial(self._reported, "silence"))
+        loop.refused.append(self._refused)
 
     def state_changed(self, old: Operation, new: Operation) -> None:
         """Publish a transition; outside OPERATION_ENABLED nothing plays, because of the state."""

@@ -18,7 +18,7 @@ from controller.demo.touch_row import (
 )
 from controller.play.content import Prediction
 from controller.play.layers import LayerContent
-from controller.play.observer import Observer, PlayReport, SilenceReport
+from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import HELD_BACK
 from model.transients.measures import ONSET_WINDOW
@@ -78,7 +78,7 @@ class _PlayedPattern:
 
 
 class TouchRecorder:
-    """Collects a row per touch: pass `observer` to the daemon.
+    """Collects a row per touch: pass `observe` to the daemon.
 
     tasks: measure and make rows; all are made once it has ended. Times of rows count from `start`.
     on_row is called with each row once the touch was lifted and its pattern measured.
@@ -106,14 +106,11 @@ class TouchRecorder:
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
 
-    @property
-    def observer(self) -> Observer:
-        """The callbacks for the control loop."""
-        return Observer(
-            contacts_changed=self._contacts_changed,
-            pattern_applied=self._pattern_applied,
-            silenced=self._silenced,
-        )
+    def observe(self, loop: Observers) -> None:
+        """Observe what the control loop reports."""
+        loop.contacts_changed.append(self._contacts_changed)
+        loop.pattern_applied.append(self._pattern_applied)
+        loop.silenced.append(self._silenced)
 
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""

@@ -150,7 +150,7 @@ async def run_demo(
                     log=LogThread(None),  # nothing is logged: rows and causes tell it
                     manager=ServiceManager({}),
                     dashboard=None,
-                    observer=recorder.observer,
+                    observe=recorder.observe,
                     watchdog=WATCHDOG,
                 )
                 serving = tasks.create_task(daemon.run(lock))

@@ -24,6 +24,7 @@ from model.calibration.responses import Responses
 from model.choice import best_first, best_of
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
+from model.progress import Progress, unseen
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
 from registry import clock
@@ -50,7 +51,7 @@ class PlateSelfMeasurement:
     """Plays interleaved tones on all ERAs of a rig and reads the sensors of its amplifiers.
 
     lines: to its amplifiers, urls: by name. level: of every tone, 0..1 of full stroke, None for the
-    usual one; is_quick: one round; on_step: called with the number of steps done and of all.
+    usual one; is_quick: one round; progress: called with the number of steps done and of all.
     """
 
     def __init__(
@@ -61,13 +62,13 @@ class PlateSelfMeasurement:
         *,
         level: float | None = None,
         is_quick: bool = False,
-        on_step: Callable[[int, int], None] = lambda done, of: None,
+        progress: Progress = unseen,
     ) -> None:
         self._rig = rig
         self._player = TonePlayer(rig, lines, urls)
         self._level = checked_level(rig, level)
         self._is_quick = is_quick
-        self._on_step = on_step
+        self._progress = progress
 
     async def run(self) -> MeasuredPlate:
         """Measure; always ends silent and disarmed.
@@ -80,7 +81,7 @@ class PlateSelfMeasurement:
             sensors = await plate_sensors(self._rig, self._player.amplifiers)
             tones = interleaved(
                 self._rig,
-                _frequency_range(can.frequencies, sensors.used),
+                _frequency_range(can.limits.frequencies, sensors.used),
                 is_quick=self._is_quick,
             )
             started = clock.now()
@@ -108,12 +109,12 @@ class PlateSelfMeasurement:
         count = len(tones.steps) + 2
         for step in tones.steps:
             heard.append(await self._hear(step, tones, sensors, level=self._level))
-            self._on_step(len(heard), count)
+            self._progress(len(heard), count)
         loudest = best_of([np.nanmax(np.abs(each.responses)) for each in heard])
         half = await self._hear(tones.steps[loudest], tones, sensors, level=self._level / 2)
-        self._on_step(count - 1, count)
+        self._progress(count - 1, count)
         last = await self._hear(tones.steps[0], tones, sensors, level=self._level)
-        self._on_step(count, count)
+        self._progress(count, count)
         return heard, (loudest, half), last
 
     async def _hear(

@@ -3,16 +3,15 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Strict, model_validator
 
-from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
-from controller.play.intent import Pulse, Target
+from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
-from model.config.sections import Quantity
+from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY, RATIO
 from model.finger.perception import STRONG_DB_SL
 
@@ -121,6 +120,34 @@ class SteadyRun(EffectRun):
         return EffectStimulus(
             self.level_db_sl, until=end, pulse=self.pulse, modulation_hz=self.modulation_hz
         )
+
+
+_FREQUENCY = Annotated[float, Quantity(FREQUENCY, at_least=10, at_most=1000)]
+
+
+class TunedSection(Section):
+    """A section that may fix the frequency, or the band that it is in."""
+
+    frequency: _FREQUENCY | None = None
+    band: Annotated[tuple[_FREQUENCY, _FREQUENCY], Strict(strict=False)] | None = None
+
+    @model_validator(mode="after")
+    def _check_band(self) -> Self:
+        if self.band is None:
+            return self
+        if self.frequency is not None:
+            raise ValueError("must have frequency or band, got both; remove one")
+        if self.band[0] >= self.band[1]:
+            low, high = self.band
+            raise ValueError(
+                f"band must be a lower and a higher frequency, got {low:g} Hz and {high:g} Hz"
+            )
+        return self
+
+    @property
+    def tuned_band(self) -> Band | None:
+        """The band of its frequency; None where it is free."""
+        return self.band if self.frequency is None else (self.frequency, self.frequency)
 
 
 class Effect(TunedSection, ABC):

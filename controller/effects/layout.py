@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.effects.band import Band, band_problem
 from controller.effects.effect import Effect
 from controller.effects.kinds import BUILT_IN
 from controller.effects.region import Region
+from controller.play.intent import Band, band_problem
 from model.arrays import FloatArray
 from model.finger.perception import STRONG_DB_SL
 
@@ -37,9 +37,10 @@ class SurfaceLayout:
 
     def region_at(self, x: float, y: float) -> Region | None:
         """Return the topmost region at a position [m], or None."""
-        return next(
-            (region for region in reversed(self.regions) if region.shape.contains(x, y)), None
-        )
+        for region in reversed(self.regions):
+            if region.shape.contains(x, y):
+                return region
+        return None
 
     def uses(self) -> Iterator[tuple[Region | None, str, str]]:
         """Yield every effect of every region: the region, None outside of all, key and name."""

@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from controller.effects.band import TunedSection
-from controller.effects.effect import Effect, Level
+from controller.effects.effect import Effect, Level, TunedSection
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region

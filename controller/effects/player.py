@@ -4,12 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from controller.effects.band import Band
 from controller.effects.effect import EffectRun, EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.strengths import Strengths
-from controller.play.intent import NO_CONTACTS, HapticIntent, Pulse, Target
+from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
 
@@ -29,7 +28,10 @@ _MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 @dataclass
 class _Play:
-    """A run of an effect at one finger, numbered in order of start; player: who requested it."""
+    """A run of an effect at one finger, numbered in order of start.
+
+    is_elsewhere: whether it is the effect outside of all regions; player: who requested it.
+    """
 
     name: str
     run: EffectRun
@@ -37,12 +39,8 @@ class _Play:
     priority: int
     band: Band | None
     region: Region | None
+    is_elsewhere: bool
     player: str | None = None
-
-    @property
-    def is_elsewhere(self) -> bool:
-        """Whether it is the effect outside of all regions."""
-        return self.region is None and self.priority != REQUESTED_PRIORITY
 
 
 @dataclass
@@ -83,45 +81,42 @@ class EffectPlayer:
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        felt: list[tuple[int, _Play, Contact, EffectStimulus]] = []
-        ends: list[float] = []
+        sensed: list[tuple[int, _Play, ContactKey, EffectStimulus]] = []
+        ends, protected, newest_elsewhere = list[float](), set[ContactKey](), 0
         for contact in contacts:
-            play, stimulus = self._current_stimulus(contact, now, ends)
+            finger = self._fingers[contact.key]
+            if finger.region is not None and finger.region.is_protected:
+                protected.add(contact.key)
+            play, stimulus = self._current_stimulus(finger, contact, now, ends)
             if play is not None and stimulus is not None:
-                felt.append((play.number, play, contact, stimulus))
-        felt.sort()
-        elsewhere = [number for number, play, _, _ in felt if play.is_elsewhere]
-        waiting, self._waiting = self._waiting, {}
-        sensing, targets, gains_db = (
-            set[ContactKey](),
-            list[Target](),
-            dict[tuple[ContactKey, bool], float](),
-        )
-        for number, play, contact, stimulus in felt:
-            sensing.add(contact.key)
-            if number in elsewhere[:-1]:
-                continue  # of these only the newest is felt
+                sensed.append((play.number, play, contact.key, stimulus))
+                if play.is_elsewhere:
+                    newest_elsewhere = max(newest_elsewhere, play.number)
+        sensed.sort()
+        waiting, self._waiting, targets = self._waiting, {}, list[Target]()
+        gains_db = dict[tuple[ContactKey, bool], float]()
+        self._sensing, self._targets, self._felt = set(), set(), set()
+        for number, play, key, stimulus in sensed:
+            self._sensing.add(key)
+            if play.is_elsewhere and number < newest_elsewhere:
+                continue
             target = stimulus.target(
-                contact.key, play.name, play.region, band=play.band, priority=play.priority
+                key, play.name, play.region, band=play.band, priority=play.priority
             )
             targets.append(target)
-            gains_db[target.key, target.is_short] = self.strengths.gain_db(
-                contact.key.source, play.player
-            )
-            if target.key in waiting and target.is_short:
-                self._waiting[target.key] = waiting[target.key]
-        now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
-        self._sensing, self._targets = sensing, {each.key for each in targets}
-        self._felt = {each.key for each in now_felt}
-        protected = [
-            key
-            for key, finger in self._fingers.items()
-            if finger.region is not None and finger.region.is_protected
-        ]
+            self._targets.add(key)
+            gains_db[key, target.is_short] = self.strengths.gain_db(key.source, play.player)
+            if key in waiting and target.is_short:
+                self._waiting[key] = waiting[key]
+        felt = list[Target]()
+        for target in targets:
+            if not self._waits(target, now, ends):
+                felt.append(target)
+                self._felt.add(target.key)
         return HapticIntent(
-            now_felt,
-            "" if now_felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
-            until=min(ends, default=None),
+            tuple(felt),
+            "" if felt else "; ".join(dict.fromkeys(map(self.why_not, self._fingers))),
+            until=min(ends, default=math.inf),
             protected=frozenset(protected),
             gains_db=gains_db,
         )
@@ -225,10 +220,13 @@ class EffectPlayer:
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
-        since = {contact.key: contact.since for contact in contacts}
-        # One that came down again with the same id, perhaps between two intents, is another.
-        for key in [key for key, one in self._fingers.items() if since.get(key) != one.since]:
-            del self._fingers[key]
+        since: dict[ContactKey, float] = {}
+        for contact in contacts:
+            since[contact.key] = contact.since
+        for key, one in [*self._fingers.items()]:
+            # One that came down again with the same id, perhaps between two intents, is another.
+            if since.get(key) != one.since:
+                del self._fingers[key]
         if pressed := self._already_pressed.items():
             self._already_pressed = {key: then for key, then in pressed if since.get(key) == then}
         for contact in contacts:
@@ -300,16 +298,16 @@ class EffectPlayer:
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
-        finger.plays.append(_Play(name, run, self._number, priority, band, region))
+        is_elsewhere = region is None and priority != REQUESTED_PRIORITY
+        finger.plays.append(_Play(name, run, self._number, priority, band, region, is_elsewhere))
 
     def _current_stimulus(
-        self, contact: Contact, now: float, ends: list[float]
+        self, finger: _Finger, contact: Contact, now: float, ends: list[float]
     ) -> tuple[_Play | None, EffectStimulus | None]:
         """Return the play that a finger feels now and its stimulus; add all `until` to ends.
 
         All its plays are called, because those for motion follow the finger.
         """
-        finger = self._fingers[contact.key]
         felt: tuple[_Play | None, EffectStimulus | None] = (None, None)
         lasting: list[_Play] = []
         for play in finger.plays:

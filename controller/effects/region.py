@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from controller.effects.band import Band
+from controller.play.intent import Band
 from model.config.shapes import Shape
 
 

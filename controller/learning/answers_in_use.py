@@ -40,7 +40,7 @@ class AnswersInUse:
         """Shape onsets and endings for the present table, while nothing is on its way."""
         timing, frequencies = Timing(self.table), self.table.frequencies.tolist()
         while frequencies:
-            if not self._controller.is_preparing:
+            if not self._controller.cycle.is_preparing:
                 timing.prepare([frequencies.pop()])
             await asyncio.sleep(_PAUSE)
         self._use(self.table, timing.following(self.table))

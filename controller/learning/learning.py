@@ -24,7 +24,7 @@ from controller.learning.estimator_process import (
 from controller.learning.messages import Answers, Estimate, Note, Ready, RefreshedAnswers, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.play.loop import Controller
-from controller.play.observer import Observer, PlayReport
+from controller.play.observer import Observers, PlayReport
 from controller.sources.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.answer.timing import Timing
@@ -100,14 +100,11 @@ class Learning:
         """Process number of the estimator, if one runs."""
         return None if self._estimator is None else self._estimator.pid
 
-    @property
-    def observer(self) -> Observer:
-        """The callbacks for the control loop."""
-        return Observer(
-            contacts_changed=self._contacts_changed,
-            pattern_applied=self._pattern_applied,
-            silenced=lambda silenced: self.ended(),
-        )
+    def observe(self, loop: Observers) -> None:
+        """Observe what the control loop reports."""
+        loop.contacts_changed.append(self._contacts_changed)
+        loop.pattern_applied.append(self._pattern_applied)
+        loop.silenced.append(lambda silenced: self.ended())
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         if self._readings is not None:

@@ -19,7 +19,7 @@ from controller.operation.states import (
     DaemonState,
     Trigger,
 )
-from controller.play.observer import Observer
+from controller.play.observer import Observers
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import GroupState
@@ -40,7 +40,7 @@ _logger = logging.getLogger(__name__)
 class Supervisor(Operator):
     """The operation of the plate by the amplifiers of a controller.
 
-    Its controller must be created with its `observer` and `connected`.
+    Its controller must be created with its `connected`, and be observed by it first.
     link_changed receives the kind of change, the amplifiers concerned where they are known, and a
     message; alive is called after each cycle of the control loop, which runs in every state.
     """
@@ -57,13 +57,11 @@ class Supervisor(Operator):
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self._closing = asyncio.Event()
 
-    def observer(self) -> Observer:
-        """The first observer of the control loop: of refusals, losses and cycles."""
-        return Observer(
-            refused=self._check_own_stop,
-            link_lost=self._link_lost,
-            cycle_completed=self._cycle_completed,
-        )
+    def observe(self, loop: Observers) -> None:
+        """Observe refusals, losses and cycles of the control loop."""
+        loop.refused.append(self._check_own_stop)
+        loop.link_lost.append(self._link_lost)
+        loop.cycle_completed.append(self._cycle_completed)
 
     def _link_lost(self, cause: str) -> None:
         if not self._is_loss_handled:
@@ -110,7 +108,7 @@ class Supervisor(Operator):
         """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
         while True:
             try:
-                await self.controller.run()
+                await self.controller.cycle.run()
             except Exception as error:
                 _logger.exception("control loop failed, stopping all amplifiers")
                 await self._stop_after(error)

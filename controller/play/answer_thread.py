@@ -32,13 +32,10 @@ class AnswerThread(Generic[T]):
     def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
         self._arrived, self._freed = arrived, freed
         self._threads = DaemonThreads()
+        self.is_busy = False
+        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
         self._answer: asyncio.Future[T] | None = None
         self._late = set[asyncio.Future[T]]()  # given up, and still computed
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
-        return self._answer is not None
 
     @property
     def is_blocked(self) -> bool:
@@ -47,7 +44,7 @@ class AnswerThread(Generic[T]):
 
     def compute(self, question: Callable[[], T], *, instead: T) -> None:
         """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
-        loop = asyncio.get_running_loop()
+        loop, self.is_busy = asyncio.get_running_loop(), True
         self._answer = loop.run_in_executor(self._threads, question)
         self._answer.add_done_callback(self._note)
         loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
@@ -57,7 +54,7 @@ class AnswerThread(Generic[T]):
         answer = self._answer
         if answer is None or not answer.done():
             return None
-        self._answer = None
+        self._answer, self.is_busy = None, False
         return None if answer.cancelled() else answer.result()
 
     def _give_up(self, answer: "asyncio.Future[T]", instead: T) -> None:

@@ -8,7 +8,6 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Self
 
 from drivers.host.amplifier import Amplifier
@@ -49,37 +48,26 @@ class PlaybackCapabilities:
     """Capabilities that all amplifiers of a rig share.
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
-    play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
-    envelope_support: knots that every amplifier plays; max_power: sum of squared levels of
-    all ERAs; slew [1/s]: highest rise of a level; ramp_max [s]; layers: contents at once.
+    play; limits: of a drive; envelope_support: knots that every amplifier plays; ramp_max [s];
+    layers: contents at once.
     """
 
     drive_mode: str
     playable: tuple[str, ...]
-    frequencies: tuple[float, float]
-    max_amplitudes: Mapping[str, float]
+    limits: Limits
     envelope_support: EnvelopeSupport
-    max_power: float = math.inf
-    slew: float = math.inf
     ramp_max: float = math.inf
     layers: int = 1
-
-    @cached_property
-    def limits(self) -> Limits:
-        """Those of a drive."""
-        return Limits(self.frequencies, self.max_amplitudes, self.max_power, self.slew)
 
     def left_by(self, taken: Mapping[str, float], strokes: Mapping[str, float]) -> Self:
         """Return what amplitudes [m] leave of these and of the power, their peaks together."""
         levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
-        return replace(
-            self,
-            max_amplitudes={
-                name: max(highest - taken.get(name, 0.0), 1e-12)
-                for name, highest in self.max_amplitudes.items()
-            },
-            max_power=max(math.sqrt(self.max_power) - math.hypot(*levels), 1e-9) ** 2,
-        )
+        left = {
+            name: max(highest - taken.get(name, 0.0), 1e-12)
+            for name, highest in (self.limits.amplitudes or strokes).items()
+        }
+        power = max(math.sqrt(self.limits.power) - math.hypot(*levels), 1e-9) ** 2
+        return replace(self, limits=replace(self.limits, amplitudes=left, power=power))
 
 
 def playback_capabilities(
@@ -111,20 +99,20 @@ def playback_capabilities(
             f"{drive_mode}; leave it out for the best"
         )
     limits = {name: one.ledger.limits for name, one in amplifiers.items()}
+    levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
         playable=playable,
-        frequencies=(
-            max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
-            min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
+        limits=Limits(
+            (
+                max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
+                min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
+            ),
+            {era.name: era.stroke * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
+            power=min(one.power for one in limits.values()),
+            slew=min(one.slew for one in limits.values()),
         ),
-        max_amplitudes={
-            era.name: era.stroke * _LEVEL.from_wire(limits[rig.wiring[era.name].amplifier].level)
-            for era in rig.eras
-        },
         envelope_support=envelope_support(rig, amplifiers),
-        max_power=min(one.power for one in limits.values()),
-        slew=min(one.slew for one in limits.values()),
         ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
         layers=min(one.capabilities["layers"] for one in amplifiers.values()),
     )

@@ -34,29 +34,41 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class ChoiceRequest:
-    """What is to be chosen among contacts: for short pulses, and what lasts, None where it is kept.
+class Intention:
+    """Who is to feel what, among contacts: what lasts, and short pulses.
 
-    protected: contacts that must not notice the contents of others; before: what is felt now, by
-    finger and voice; kept: what plays on beside it; takes_long: whether what lasts takes longer
-    than the control loop may wait; is_moving: whether only places have changed; is_rested: whether
-    what plays would do, too, but kept its frequencies while a finger moved.
+    protected: contacts that must not notice the contents of others.
     """
 
-    short: Targets
     contacts: tuple[Contact, ...]
-    protected: frozenset[ContactKey]
-    before: Mapping[tuple[ContactKey, int], Content]
-    kept: tuple[Selection, ...]
-    lasting: Targets | None = None
-    takes_long: bool = False
-    is_moving: bool = False
-    is_rested: bool = False
+    lasting: Targets
+    short: Targets
+    protected: frozenset[ContactKey] = frozenset()
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are to feel nothing of what these targets feel."""
-        keys = {contact.key for contact, _ in targets}
-        return tuple([each for each in self.contacts if each.key not in keys])
+        quiet = [*self.contacts]
+        for contact, _ in targets:
+            quiet.remove(contact)
+        return tuple(quiet)
+
+
+@dataclass(frozen=True)
+class ChoiceRequest:
+    """What is to be chosen; of what is intended only that.
+
+    before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
+    whether what lasts takes longer than the control loop may wait; is_moving: whether only places
+    have changed; is_rested: whether what plays would do, too, but kept its frequencies while a
+    finger moved.
+    """
+
+    intended: Intention
+    before: Mapping[tuple[ContactKey, int], Content]
+    kept: tuple[Selection, ...]
+    takes_long: bool = False
+    is_moving: bool = False
+    is_rested: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,11 +94,11 @@ class Chooser:
     def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
         """Choose what is asked for, what lasts first."""
         kept, lasting, is_limited = [*requested.kept], None, False
-        if requested.lasting is not None:
-            lasting, is_limited = self._lasting(requested, requested.lasting, capabilities)
+        if requested.intended.lasting:
+            lasting, is_limited = self._lasting(requested, capabilities)
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
-        for each in requested.short:
+        for each in requested.intended.short:
             left = self._left_by(_contents(kept), capabilities)
             found = self._chosen(requested, (each,), left, kept)
             kept.append(found)
@@ -94,12 +106,13 @@ class Chooser:
         return Choice(requested, lasting, short, is_limited)
 
     def _lasting(
-        self, requested: ChoiceRequest, targets: Targets, capabilities: PlaybackCapabilities
+        self, requested: ChoiceRequest, capabilities: PlaybackCapabilities
     ) -> tuple[Selection, bool]:
         """Choose what lasts, and whether it is limited by pulses that play.
 
         Beside these what it replaces fades, too.
         """
+        targets = requested.intended.lasting
         free = self._chosen(requested, targets, capabilities)
         pulses = _contents(requested.kept) if requested.kept else []
         if not pulses:
@@ -110,7 +123,9 @@ class Chooser:
         if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
-        return limited if limited.contents else silent(requested, targets, _USED_UP), True
+        if not limited.contents:
+            limited = silent(requested.intended, targets, _USED_UP)
+        return limited, True
 
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
@@ -132,14 +147,14 @@ class Chooser:
 
         beside: what a pulse is felt beside; None for what lasts.
         """
-        table, quiet, before = self.table, requested.quiet_beside(targets), requested.before
+        table, intended, before = self.table, requested.intended, requested.before
+        quiet, protected = intended.quiet_beside(targets), intended.protected
         is_long = requested.takes_long and beside is None
         kept_within: float | None = KEPT_WITHIN
         if not is_long:
             kept_within = math.inf if _is_step(targets, before) else None
         elif requested.is_moving:
             kept_within = math.inf
-        by = requested.protected
         try:
             answer = answered(
                 table,
@@ -147,7 +162,7 @@ class Chooser:
                 quiet,
                 capabilities,
                 before=before,
-                protected=by,
+                protected=protected,
                 kept_within=kept_within,
             )
             if not is_long:
@@ -159,18 +174,18 @@ class Chooser:
                 quiet,
                 before=before,
                 shape=self.shape if is_long else None,
-                protected=by,
+                protected=protected,
                 is_in_phase=is_long,
             )
             if beside:
-                found = _beside(requested, found, beside)
+                found = _beside(intended, found, beside)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
             else:
                 _logger.error("loop: table failed, silencing its targets", exc_info=error)
                 reason = failure_text(error)
-            found = silent(requested, targets, reason)
+            found = silent(intended, targets, reason)
         return found
 
 
@@ -210,13 +225,13 @@ def _alike(found: Answer, target: Target) -> Answer:
     return scaled(found, -excess) if excess > 0 else found
 
 
-def _beside(requested: ChoiceRequest, found: Selection, beside: Sequence[Selection]) -> Selection:
+def _beside(intended: Intention, found: Selection, beside: Sequence[Selection]) -> Selection:
     """Return what was chosen for a pulse with what its finger feels of others besides."""
     ((contact, _),) = found.targets
     heard = [each.quiet_levels[contact.key] for each in beside if contact.key in each.quiet_levels]
     if not found.contents:
         is_used_up = bool(_contents(beside)) and found.reason == LIMITS_LEAVE_NOTHING
-        return silent(requested, found.targets, _USED_UP) if is_used_up else found
+        return silent(intended, found.targets, _USED_UP) if is_used_up else found
     if not heard:
         return found
     (content,), others = found.contents, sum_db(heard)
@@ -239,17 +254,18 @@ def _contents(parts: Iterable[Selection]) -> list[Content]:
 
 def unanswered(requested: ChoiceRequest, reason: str) -> Choice:
     """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
-    none = silent(requested, requested.lasting or (), reason)
+    intended = requested.intended
+    none = silent(intended, intended.lasting, reason)
     return Choice(
         requested,
         None if requested.is_rested else none,
-        {each[0].key: silent(requested, (each,), reason) for each in requested.short},
+        {each[0].key: silent(intended, (each,), reason) for each in intended.short},
         is_limited=False,
     )
 
 
-def silent(requested: ChoiceRequest, targets: Targets, reason: str) -> Selection:
+def silent(intended: Intention, targets: Targets, reason: str) -> Selection:
     """Return the selection of targets that feel nothing, for a reason."""
-    quiet = requested.quiet_beside(targets)
+    quiet = intended.quiet_beside(targets)
     skipped = tuple(not_served(contact, reason) for contact, _ in targets)
-    return Selection(targets, quiet, (), reason, skipped, protected=requested.protected)
+    return Selection(targets, quiet, (), reason, skipped, protected=intended.protected)

@@ -80,22 +80,17 @@ class Prediction:
 class Content:
     """What one layer plays, with the contacts as they were when it was chosen.
 
-    targets: the finger whose content it is, then those that share it; placement: where they are,
-    and all others; predictions: one per target; voice: 0, or the number of a side band of the
-    finger's content, which has no predictions; gain_db: that the layer has, its fingers' strength.
+    key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
+    predictions; targets: that finger, then those that share it; placement: where they are, and all
+    others; predictions: one per target; gain_db: that the layer has, its fingers' strength.
     """
 
+    key: tuple[ContactKey, int]
     targets: Targets
     placement: Placement
     layer: Layer
     predictions: tuple[Prediction, ...] = ()
-    voice: int = 0
     gain_db: float = 0.0
-
-    @property
-    def key(self) -> tuple[ContactKey, int]:
-        """The finger whose content it is, and the voice."""
-        return self.targets[0][0].key, self.voice
 
     @property
     def frequency(self) -> float | None:
@@ -131,10 +126,10 @@ class Selection:
             found[contact.key] = contact
         return found
 
-    @cached_property
-    def target_keys(self) -> frozenset[ContactKey]:
+    @property
+    def target_keys(self) -> set[ContactKey]:
         """Contacts of the targets."""
-        return frozenset([contact.key for contact, _ in self.targets])
+        return {contact.key for contact, _ in self.targets}
 
     @property
     def pulses(self) -> list[Pulse]:

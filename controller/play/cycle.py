@@ -3,11 +3,12 @@
 import asyncio
 import logging
 import math
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from typing import ParamSpec
 
-from controller.play.intent import IntentSource
 from controller.play.layers import RELEASE_RAMP
-from controller.play.observer import Observer, ignore, play_report, silence_report
+from controller.play.observer import Observers, play_report, silence_report
 from controller.play.planner import Plan, Planner
 from controller.sources.contacts import Change, ContactTracker
 from controller.sources.reject_counter import RejectCounter
@@ -22,38 +23,35 @@ from drivers.errors import (
 )
 from drivers.host.group import Group
 from drivers.protocol.timing import HEARTBEAT
-from model.answer.timing import Timing
 from model.counting import counted
-from model.rig.rig import Rig
+from model.structure.plate import Plate
 from registry import clock
 
 # s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
 IDLE_INTERVAL = 0.5
 
+_P = ParamSpec("_P")
 _logger = logging.getLogger(__name__)
 
 
 class Cycle:
     """The cycle of the control loop of one plate; fingers are followed amid it, too.
 
-    group: all amplifiers, which are opened and armed elsewhere; observers: called in order.
+    group: all amplifiers, which are opened and armed elsewhere.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        group: Group,
-        *,
-        intent_source: IntentSource,
-        timing: Timing,
-        observer: Observer,
-    ) -> None:
-        self._rig = rig
+    def __init__(self, plate: Plate, group: Group) -> None:
         self.group = group
-        """All amplifiers together."""
-        self.observers = [observer]
-        self._intent_source, self._timing = intent_source, timing
-        self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
+        """All amplifiers together; replaced while `sending` is held."""
+        self.planner: Planner | None = None
+        """Plans for the amplifiers; None until they were open."""
+        self.observers = Observers()
+        self.tracker = ContactTracker(plate)
+        """The contacts, also while no amplifier is open."""
+        self.sending = asyncio.Lock()
+        """Held while a turn sends."""
+        self.is_closed = False
+        """Whether `run` ends."""
         self.rejects = RejectCounter(_logger)
         """What of touches was rejected, at the sources and as contacts: the only such counter."""
         self.clicks_too_late = 0
@@ -63,19 +61,16 @@ class Cycle:
         fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
         do not allow.
         """
-        self._planner_if_open: Planner | None = None
         self._plan: Plan | None = None  # that is on its way to the amplifiers
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
-        self._sending = asyncio.Lock()  # held while a turn sends
-        self._is_closed = False
         self._is_armed_anew = False  # until the next turn, which sends again what is to play
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
     def is_preparing(self) -> bool:
         """Whether a change of contacts is on its way to the amplifiers."""
-        planner, plan = self._planner_if_open, self._plan
+        planner, plan = self.planner, self._plan
         if planner is None:
             return False
         if plan is not None and self.group.members.last_sent_at < plan.since:
@@ -88,14 +83,14 @@ class Cycle:
         It sends only while they are armed. A loss is reported to observers; all others are stopped
         by then; a loss while disarmed shows in the next request, as the supervisor checks.
         """
-        while not self._is_closed:
+        while not self.is_closed:
             await self.step()
-            self._report("cycle_completed")
+            _report(self.observers.cycle_completed)
             await self._wait_for_event()
 
     async def step(self) -> None:
         """Run the loop once: plan, send what changes, then the heartbeat if it is due."""
-        planner, now = self._planner_if_open, clock.now()
+        planner, now = self.planner, clock.now()
         self._expire(now)
         self._wake.clear()
         if planner is None:
@@ -105,12 +100,12 @@ class Cycle:
             planner.forget()
         plan = planner.plan(now)
         try:
-            async with self._sending:
+            async with self.sending:
                 with suppress(LinkDegraded):  # what plays is unknown, and planned anew; others feed
                     if plan is not None and self.group.is_armed:
                         await self._send(planner, plan)
                 # Not after a set that was given up: the next cycle silences it first.
-                if self._is_heartbeat_due:
+                if self._is_heartbeat_due(planner):
                     # From its beginning: the watchdog has run since its request was sent.
                     due = self._heartbeat_due = clock.now() + HEARTBEAT
                     try:
@@ -122,9 +117,9 @@ class Cycle:
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and planned anew
         except LinkError as error:
-            self._report("link_lost", str(error))
+            _report(self.observers.link_lost, str(error))
         except DriverError as error:
-            self._report("refused", str(error))
+            _report(self.observers.refused, str(error))
 
     async def _send(self, planner: Planner, plan: Plan) -> None:
         """Send what a plan changes, and report the outcome; raises DriverError.
@@ -142,7 +137,7 @@ class Cycle:
         finally:
             self._plan = None
         if reason := plan.sets.reason:
-            self._report("refused", reason)
+            _report(self.observers.refused, reason)
         if plan.is_reported:
             sent_at = outcome if isinstance(outcome, float) else None
             self._report_playing(planner, plan, sent_at=sent_at)
@@ -172,22 +167,41 @@ class Cycle:
         planner.confirm(sets, played, now=clock.now())
         return played.sent_at
 
-    def _count_too_late(self, clicks: int) -> None:
+    def count_too_late(self, clicks: int) -> None:
+        """Count clicks that came too late to be felt, while armed."""
         if self.group.is_armed:
             self.clicks_too_late += clicks
             _logger.warning(
                 "%s came too late to be felt: replies are late", counted(clicks, "click")
             )
 
-    def _feed_at_once(self) -> None:
+    def wake(self) -> None:
+        """Look at once at what is to be done."""
+        self._wake.set()
+
+    def feed_at_once(self) -> None:
+        """Feed the watchdogs at once."""
         self._heartbeat_due = clock.now()
         self._wake.set()
+
+    def note_armed(self, *, was_armed: bool) -> None:
+        """Note that the amplifiers have been armed: what is to play is sent, watchdogs are fed.
+
+        was_armed: also before, so that what plays goes on. Raises CommandError without a planner.
+        """
+        if self.planner is None:
+            raise CommandError("controller must be open; call open() first")
+        self._is_armed_anew = True
+        if not was_armed:
+            self.planner.layers.may_play = frozenset()
+        self._schedule_expiry()  # fingers may have rested since before
+        self.feed_at_once()
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
         # Contacts that came since the last cycle have not been decided yet.
-        is_undecided = self.group.is_armed and self._wake.is_set()
-        change = self._tracker.update(frame, keeps_taps=is_undecided)
+        is_undecided = self._wake.is_set() and self.group.is_armed
+        change = self.tracker.update(frame, keeps_taps=is_undecided)
         if change:
             self._follow(change)
         self._schedule_expiry()
@@ -196,7 +210,7 @@ class Cycle:
 
     def lift(self, prefix: str) -> None:
         """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
-        for source in self._tracker.sources_of(prefix):
+        for source in self.tracker.sources_of(prefix):
             try:
                 self.deliver(TouchFrame(source, clock.now(), ()))
             except Exception:
@@ -204,39 +218,32 @@ class Cycle:
 
     def request_update(self) -> None:
         """Query the intent source again, because its intent changed without a touch."""
-        if self._planner_if_open is not None:
-            self._planner_if_open.look_again()
+        if self.planner is not None:
+            self.planner.look_again()
         self._wake.set()
 
-    @property
-    def _is_heartbeat_due(self) -> bool:
+    def _is_heartbeat_due(self, planner: Planner) -> bool:
         """Whether to feed the watchdogs now; pending silence has priority."""
-        if not self.group.is_armed or self._planner.is_silence_pending:
+        if not self.group.is_armed or planner.is_silence_pending:
             return False
         return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
 
-    @property
-    def _planner(self) -> Planner:
-        if self._planner_if_open is None:
-            raise CommandError("controller must be open; call open() first")
-        return self._planner_if_open
-
     def _follow(self, change: Change) -> None:
         """Act on a change of contacts, also while amplifiers are being awaited."""
-        planner = self._planner_if_open
-        if planner is not None:  # else the amplifiers were never open
-            planner.note(change)
+        planner = self.planner
         self._wake.set()
-        if planner is not None and planner.is_silence_pending:
-            self.group.abort_exchange()
-        self._report("contacts_changed", self._tracker.contacts, change)
+        if change.up and planner is not None:  # else the amplifiers were never open
+            planner.note_lifts(change.up)
+            if planner.is_silence_pending:
+                self.group.abort_exchange()
+        _report(self.observers.contacts_changed, self.tracker.contacts, change)
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.
 
         A timer that is due before stays: nothing is set anew for every frame of a source.
         """
-        due = self._tracker.next_expiry
+        due = self.tracker.next_expiry
         if self._expiry is not None:
             if self._expiry.when() <= due < math.inf:
                 return
@@ -253,19 +260,19 @@ class Cycle:
 
     def _expire(self, now: float) -> None:
         """Lift fingers that no source has confirmed in time: here alone, and before every plan."""
-        if (change := self._tracker.expire(now)).up:
+        if (change := self.tracker.expire(now)).up:
             self._follow(change)
 
     def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
         """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
         now = clock.now()
         if plan.selection.contents and plan.sets.silence is None:
-            playing = planner.layers.contents
-            applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=self._timing)
-            self._report("pattern_applied", applied)
+            playing, timing = planner.layers.contents, planner.timing
+            applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=timing)
+            _report(self.observers.pattern_applied, applied)
             return
         silenced = silence_report(plan, sent_at=sent_at, now=now)
-        self._report("silenced", silenced)
+        _report(self.observers.silenced, silenced)
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, or the expiry of an intent."""
@@ -273,8 +280,8 @@ class Cycle:
             return
         now = clock.now()
         until = now + IDLE_INTERVAL
-        if self._planner_if_open is not None:
-            until = min(until, self._planner_if_open.due)
+        if self.planner is not None:
+            until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
         pause = max(0.0, until - now)
@@ -284,13 +291,11 @@ class Cycle:
         finally:
             timer.cancel()
 
-    def _report(self, event: str, *args: object) -> None:
-        """Report an event, a field of `Observer`, to all that observe it; exceptions are logged."""
-        for observer in self.observers:
-            callback = getattr(observer, event)
-            if callback is ignore:
-                continue
-            try:
-                callback(*args)
-            except Exception:
-                _logger.exception("loop: observer failed")
+
+def _report(callbacks: Iterable[Callable[_P, object]], *args: _P.args, **kwargs: _P.kwargs) -> None:
+    """Call all observers of an event; their exceptions are logged."""
+    for callback in callbacks:
+        try:
+            callback(*args, **kwargs)
+        except Exception:
+            _logger.exception("loop: observer failed")

@@ -6,7 +6,7 @@ The interface between the meaning of touches and their playback. All other conta
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -26,8 +26,13 @@ FADED_AFTER = 0.05
 
 NO_CONTACTS = "no contact on the plate"
 
+Band: TypeAlias = tuple[float, float]
+"""Lowest and highest frequency [Hz]; equal ones stand for the nearest that a table has."""
+
 Gains = Mapping[tuple[ContactKey, bool], float]
 """Strengths [dB], 0 at most, of what is felt by a contact, and whether that is a short pulse."""
+
+_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 
 
 @dataclass(slots=True, unsafe_hash=True)
@@ -66,18 +71,17 @@ class Target:
     """A contact that shall feel something of its own.
 
     level_db_sl: how strongly, where the plate can; None for as strongly as the neighbours allow.
-    pulse: None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand
-    for the nearest of the table. priority: lower ones give way first. content: a name; fingers of
-    one name may share one vibration where the plate cannot give each its own. None: of this one
-    alone. is_own: whether it feels its own content or none; may_share: whether it may also feel
-    that of any finger that may share. modulation_hz: how often a second the strength of what lasts
-    comes and goes.
+    pulse: None without an end of its own. priority: lower ones give way first. content: a name;
+    fingers of one name may share one vibration where the plate cannot give each its own. None: of
+    this one alone. is_own: whether it feels its own content or none; may_share: whether it may also
+    feel that of any finger that may share. modulation_hz: how often a second the strength of what
+    lasts comes and goes.
     """
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
     pulse: Pulse | None = None
-    band: tuple[float, float] | None = None
+    band: Band | None = None
     priority: int = 0
     content: str | None = None
     is_own: bool = False
@@ -102,21 +106,19 @@ class HapticIntent:
     """Targets and their levels at one moment.
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
-    none. until: when [s] the intent may change though no contact has; None for never. protected:
-    contacts that must not notice the contents of others. gains_db: by which what is chosen for
-    targets is played weaker.
+    none. until: when [s] the intent may change though no contact has. protected: contacts that must
+    not notice the contents of others. gains_db: by which what is chosen for targets is played
+    weaker.
     """
 
     targets: tuple[Target, ...]
     reason: str = "no target"
-    until: float | None = None
+    until: float = math.inf
     protected: frozenset[ContactKey] = frozenset()
     gains_db: Gains = field(default_factory=dict)
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""
-        if self.until is None:
-            return math.inf
         return self.until if self.until > now else now + _MIN_WAIT
 
 
@@ -130,7 +132,7 @@ class IntentSource(Protocol):
         """
 
 
-def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
+def band_of_table(band: Band, frequencies: FloatArray) -> Band:
     """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
     low, high = band
     if low < high and ((frequencies >= low) & (frequencies <= high)).any():
@@ -138,3 +140,13 @@ def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[f
     middle = np.sqrt(low * high)
     nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
     return nearest, nearest
+
+
+def band_problem(band: Band, frequencies: FloatArray) -> str | None:
+    """Return what a table with these frequencies [Hz] plays instead of a band that it lacks."""
+    low, high = band
+    nearest = band_of_table(band, frequencies)[0]
+    if low * (1 - _TOLERANCE) <= nearest <= high * (1 + _TOLERANCE):
+        return None
+    given = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+    return f"frequency {given} is not in the table, which plays {nearest:g} Hz instead"

@@ -124,16 +124,15 @@ def selection_of(
             unfelt.add(contact.key)
             skipped.append(not_served(contact, reason))
     for layer in found.layers:
-        served = [
-            (contact, target, felt[number][1])
-            for number in layer.fingers
-            for contact, target in (felt[number][0],)
-            if contact.key not in unfelt
-        ]
-        if not served:
+        own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
+        for number in layer.fingers:
+            finger, sensation = felt[number]
+            if finger[0].key not in unfelt:
+                own.append(finger)
+                sensations.append(sensation)
+        if not own:
             continue
-        contact, placed = served[0][0], found.placement(layer)
-        voices, own = layer.voices, tuple([(finger, target) for finger, target, _ in served])
+        contact, placed, voices = own[0][0], found.placement(layer), layer.voices
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
@@ -146,23 +145,23 @@ def selection_of(
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
-                    own,
+                    (contact.key, voice),
+                    tuple(own),
                     placed,
                     shape(placed, played, is_continued) if shape else played,
-                    () if voice else _predictions(served, layer),
-                    voice,
+                    () if voice else _predictions(own, sensations, layer),
                 )
             )
+    quiet_levels: dict[ContactKey, float] = {}
+    for contact, level in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True):
+        quiet_levels[contact.key] = -math.inf if math.isnan(level) else level
     return Selection(
         tuple(targets),
         tuple(quiet),
         tuple(contents),
         None if contents else skipped[0].held_back,
         tuple(skipped),
-        quiet_levels={
-            contact.key: -math.inf if math.isnan(level) else level
-            for contact, level in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True)
-        },
+        quiet_levels=quiet_levels,
         protected=protected,
     )
 
@@ -180,19 +179,14 @@ def fingers_of(
     single target, and of what ends before an onset would have settled.
     """
     found = []
-    for contact, target in (*targets, *[(each, None) for each in quiet]):
-        at = contact.x, contact.y
-        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
-        if target is None:
-            found.append(Finger(at, load=contact.load, max_foreign_db_sl=bound))
-            continue
+    for contact, target in targets:
         is_over = len(targets) == 1 or target.is_short
         duration = None
         if is_over and target.pulse is not None and target.pulse.is_raised:
             duration = target.pulse.duration
         stimulus = Stimulus(
             MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
-            playable_band(target.band, table.frequencies, capabilities.frequencies),
+            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
             duration,
             None if duration is not None else target.modulation_hz,
             is_limit=target.level_db_sl is None,
@@ -201,15 +195,18 @@ def fingers_of(
         sharing = NEVER if target.is_own else ANY if target.may_share else BY_NAME
         found.append(
             Finger(
-                at,
+                (contact.x, contact.y),
                 stimulus,
                 contact.load,
                 target.priority,
                 sharing,
                 min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
-                max_foreign_db_sl=bound,
+                max_foreign_db_sl=IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf,
             )
         )
+    for contact in quiet:
+        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
+        found.append(Finger((contact.x, contact.y), load=contact.load, max_foreign_db_sl=bound))
     return found
 
 
@@ -290,16 +287,17 @@ def _why_unfelt(felt: Sensation) -> str | None:
 
 
 def _predictions(
-    served: Sequence[tuple[Contact, Target, Sensation]], layer: Layer
+    targets: Sequence[tuple[Contact, Target]], sensations: Sequence[Sensation], layer: Layer
 ) -> tuple[Prediction, ...]:
     """What is predicted of a layer's finger, and of those that share it."""
-    first, own, _ = served[0]
+    first, own = targets[0]
     shares = (
         f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
         "apart"
     )
-    return tuple(
-        [
+    predictions: list[Prediction] = []
+    for (contact, _), felt in zip(targets, sensations, strict=True):
+        predictions.append(
             Prediction(
                 contact,
                 felt_db_sl(felt),
@@ -312,9 +310,8 @@ def _predictions(
                 own.content,
                 felt.level_db_sl,
             )
-            for contact, _, felt in served
-        ]
-    )
+        )
+    return tuple(predictions)
 
 
 def _held_back(contact: Contact, felt: Sensation) -> Prediction:

@@ -26,7 +26,7 @@ from controller.play.routing import (
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
-from drivers.playing.contents import Layer
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
@@ -248,28 +248,31 @@ class Layers:
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return those of the contents that are still wanted that have ended by themselves."""
         if self._over:
-            over = [(each.targets, each.placement, each.voice) for each in self._over]
+            over = [(each.key, each.targets, each.placement) for each in self._over]
             self._over = tuple(
-                [one for one in contents if (one.targets, one.placement, one.voice) in over]
+                [one for one in contents if (one.key, one.targets, one.placement) in over]
             )
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
-        numbers = {n: one.content for n, one in self.contents.items() if one.content in contents}
-        kept = [*numbers.values()]
-        new = []
+        numbers: dict[int, Content] = {}
+        for number, one in self.contents.items():
+            if one.content in contents:
+                numbers[number] = one.content
+        kept, new = [*numbers.values()], list[Content]()
         for content in contents:
             if content in kept:
                 continue
-            number = self._layer_of.get(content.key)
-            if number is None or number in numbers:  # a pulse beside what others share
+            known = self._layer_of.get(content.key)
+            if known is None or known in numbers:  # a pulse beside what others share
                 new.append(content)
             else:
-                numbers[number] = content
-        every = [*sorted(self.may_play), *range(self._count)]
-        free = [number for number in dict.fromkeys(every) if number not in numbers]
-        return {**numbers, **dict(zip(free, new, strict=False))}
+                numbers[known] = content
+        for number in (*sorted(self.may_play), *range(self._count)):
+            if new and number not in numbers:
+                numbers[number] = new.pop(0)
+        return numbers
 
     def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:
         """Return the layers that start by the contents of all, and which of these restart.
@@ -277,12 +280,10 @@ class Layers:
         A carrier and its side bands must count their phases from one moment: where one starts, all
         of the content restart.
         """
-        restarting = set[int]()
-        changed = [
-            number
-            for number, content in numbers.items()
-            if number not in self.contents or self.contents[number].content != content
-        ]
+        restarting, changed = set[int](), list[int]()
+        for number, content in numbers.items():
+            if number not in self.contents or self.contents[number].content != content:
+                changed.append(number)
         for number in changed if len(numbers) > 1 else ():
             content = numbers[number]
             voices = [n for n, one in numbers.items() if one.targets == content.targets]
@@ -298,7 +299,10 @@ class Layers:
             self._fades_until = now + FADED_AFTER
         self._replace(playing)
         self.is_silent = False
-        self._layer_of = {one.content.key: number for number, one in [*playing.items()][::-1]}
+        layer_of: dict[tuple[ContactKey, int], int] = {}
+        for number, one in playing.items():
+            layer_of.setdefault(one.content.key, number)
+        self._layer_of = layer_of
         self.may_play |= sets.started
 
     def _sets(
@@ -308,7 +312,10 @@ class Layers:
         numbers = self.numbered(contents)
         starting, restarting = self.starting(numbers)
         layers: dict[int, PlateLayer] = {}
-        playing = {n: one for n, one in self.contents.items() if n in numbers and n not in starting}
+        playing: dict[int, LayerContent] = {}
+        for number, one in self.contents.items():
+            if number in numbers and number not in starting:
+                playing[number] = one
         settled = [0.0]
         for number in starting:
             content = numbers[number]
@@ -343,7 +350,10 @@ class Layers:
         """Whether anything that plays is ended or replaced."""
         if len(sets.layers) > len(sets.started):
             return True
-        return any(one.drive for number, one in self.contents.items() if number in sets.started)
+        for number in sets.started:
+            if number in self.contents and self.contents[number].drive:
+                return True
+        return False
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
         """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
@@ -389,13 +399,13 @@ class Layers:
 
         Wire and amplifier round these.
         """
-        one = self.contents.get(number)
-        requested = {} if one is None else one.layer.excitation
-        return {
-            name: replace(tone, frequency=requested[name].frequency)
-            for name, tone in (one.drive.items() if one else ())
-            if name in requested
-        }
+        drive: dict[str, Tone] = {}
+        if (one := self.contents.get(number)) is None:
+            return drive
+        for name, tone in one.drive.items():
+            if name in one.layer.excitation:
+                drive[name] = replace(tone, frequency=one.layer.excitation[name].frequency)
+        return drive
 
 
 def _requested_at(one: LayerContent) -> float:

@@ -7,7 +7,6 @@ from typing import Any
 from controller.play.capabilities import playback_capabilities
 from controller.play.cycle import Cycle
 from controller.play.intent import IntentSource
-from controller.play.observer import Observer
 from controller.play.planner import Planner
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
@@ -20,13 +19,12 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from registry import clock
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 
 
-class Controller(Cycle):
-    """Drives the amplifiers of a rig by touch frames: open, arm, run, close.
+class Controller:
+    """Drives the amplifiers of a rig by touch frames: open, arm, run its `cycle`, close.
 
     table: for this rig; lines: makes the lines to its amplifiers, anew for each opening; urls and
     expected serial numbers by amplifier name. Starts disarmed: contacts are followed but nothing is
@@ -36,7 +34,6 @@ class Controller(Cycle):
     intent_source: what contacts shall feel. timing: shapes the patterns of the table. drive_mode:
     None for the best that the amplifiers can play.
     connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
-    observers: called in order.
     """
 
     def __init__(
@@ -49,18 +46,13 @@ class Controller(Cycle):
         timing: Timing,
         urls: Mapping[str, str] | None = None,
         serial_numbers: Mapping[str, str] | None = None,
-        observer: Observer = Observer(),  # noqa: B008  frozen
         drive_mode: str | None = None,
         connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
         watchdog: float = WATCHDOG,
     ) -> None:
-        super().__init__(
-            rig,
-            Group({}, watchdog=watchdog),
-            intent_source=intent_source,
-            timing=timing,
-            observer=observer,
-        )
+        self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
+        """The control loop."""
+        self._rig, self._intent_source, self._timing = rig, intent_source, timing
         self.table = table
         """The table that answers."""
         self.urls = dict(rig.amplifiers if urls is None else urls)
@@ -82,6 +74,11 @@ class Controller(Cycle):
         self._drive_mode = drive_mode
 
     @property
+    def group(self) -> Group:
+        """All amplifiers together."""
+        return self.cycle.group
+
+    @property
     def is_released(self) -> bool:
         """Whether all lines are closed."""
         return self._lines is None
@@ -89,8 +86,8 @@ class Controller(Cycle):
     @property
     def drive_mode(self) -> str:
         """The drive mode of questions to the table; the best possible one until `open`."""
-        if self._planner_if_open is not None:
-            return self._planner_if_open.capabilities.drive_mode
+        if self.cycle.planner is not None:
+            return self.cycle.planner.capabilities.drive_mode
         return self._drive_mode or DRIVE_MODES[-1]
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
@@ -100,8 +97,8 @@ class Controller(Cycle):
         here.
         """
         self.table, self._timing = table, timing
-        if self._planner_if_open is not None:
-            self._planner_if_open.replace_answers(table, timing)
+        if self.cycle.planner is not None:
+            self.cycle.planner.replace_answers(table, timing)
 
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
@@ -113,14 +110,15 @@ class Controller(Cycle):
         After a LinkError the lines stay open for the next attempt, until `release`: a board may
         restart whenever its port is opened.
         """
-        self._is_closed = False
+        cycle = self.cycle
+        cycle.is_closed = False
         if self._lines is None or self._lines.is_closing:
             self._lines = self._make_lines()
         lines = self._lines
         try:
-            async with self._sending:  # to those of before
-                self.group = Group(
-                    self._opened, watchdog=self.watchdog, restored=self._feed_at_once
+            async with cycle.sending:  # to those of before
+                cycle.group = Group(
+                    self._opened, watchdog=self.watchdog, restored=cycle.feed_at_once
                 )
             opening = [self._amplifier(lines, name) for name in self.urls]
             results = await asyncio.gather(*opening, return_exceptions=True)
@@ -140,22 +138,22 @@ class Controller(Cycle):
             planner = Planner(
                 self._rig,
                 self.table,
-                tracker=self._tracker,
+                tracker=cycle.tracker,
                 capabilities=playback_capabilities(
                     self._rig, amplifiers, drive_mode=self._drive_mode
                 ),
                 intent_source=self._intent_source,
                 timing=self._timing,
                 check=self.group.sets.refusal_of,
-                arrived=self._wake.set,
-                too_late=self._count_too_late,
+                arrived=cycle.wake,
+                too_late=cycle.count_too_late,
             )
             await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
         except BaseException as error:
             if not isinstance(error, LinkError):
                 await self.release()
             raise
-        self._planner_if_open = planner
+        cycle.planner = planner
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send the stop that it is owed.
@@ -181,15 +179,10 @@ class Controller(Cycle):
         return amplifier
 
     async def arm(self) -> None:
-        """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
+        """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
         was_armed = self.group.is_armed
         await self.group.arm()
-        self._is_armed_anew = True
-        if not was_armed:  # else what plays goes on
-            self._planner.layers.may_play = frozenset()
-        self._heartbeat_due = clock.now()
-        self._schedule_expiry()  # fingers may have rested since before
-        self._wake.set()
+        self.cycle.note_armed(was_armed=was_armed)
 
     async def disarm(self) -> None:
         """Ramp to silence, then switch the high voltage off."""
@@ -243,9 +236,9 @@ class Controller(Cycle):
         await self.group.clear()
 
     async def close(self) -> None:
-        """Release the amplifiers, and end `run`."""
-        self._is_closed = True
-        self._wake.set()
+        """Release the amplifiers, and end the cycle."""
+        self.cycle.is_closed = True
+        self.cycle.wake()
         await self.release()
 
     async def release(self) -> None:

@@ -146,21 +146,19 @@ def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceR
     )
 
 
-def ignore(*_: object) -> None:
-    """Do nothing."""
-
-
 @dataclass(frozen=True)
-class Observer:
-    """Callbacks of the control loop, called within it: they must return at once.
+class Observers:
+    """Callbacks of the control loop by event, called within it in order: they must return at once.
 
     Their exceptions are logged and go no further.
     """
 
-    contacts_changed: Callable[[tuple[Contact, ...], Change], None] = ignore
-    pattern_applied: Callable[[PlayReport], None] = ignore
-    silenced: Callable[[SilenceReport], None] = ignore
-    refused: Callable[[str], None] = ignore
-    link_lost: Callable[[str], None] = ignore
-    cycle_completed: Callable[[], None] = ignore
+    contacts_changed: list[Callable[[tuple[Contact, ...], Change], object]] = field(
+        default_factory=list
+    )
+    pattern_applied: list[Callable[[PlayReport], object]] = field(default_factory=list)
+    silenced: list[Callable[[SilenceReport], object]] = field(default_factory=list)
+    refused: list[Callable[[str], object]] = field(default_factory=list)
+    link_lost: list[Callable[[str], object]] = field(default_factory=list)
+    cycle_completed: list[Callable[[], object]] = field(default_factory=list)
     """Called after each cycle of the loop, at least once a second."""

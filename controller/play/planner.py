@@ -15,7 +15,7 @@ from controller.play.intent import IntentSource, Pulse
 from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
 from controller.play.routing import FADE_RAMP
 from controller.play.selection import Selector
-from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.timing import HEARTBEAT
@@ -92,7 +92,9 @@ class Planner:
     ) -> None:
         self.capabilities = capabilities
         """Of the amplifiers together."""
-        self._tracker, self._intent_source, self._timing = tracker, intent_source, timing
+        self._tracker, self._intent_source = tracker, intent_source
+        self.timing = timing
+        """Shapes the patterns of the table."""
         self.layers = Layers(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
         """What they play."""
         self._selector = Selector(
@@ -112,7 +114,7 @@ class Planner:
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
-        self._timing, layers = timing, self.layers
+        self.timing, layers = timing, self.layers
         layers.builder = replace(layers.builder, timing=timing)
         self._selector.chooser = Chooser(table, layers.builder.shape)
 
@@ -121,13 +123,13 @@ class Planner:
 
         Raises InputError for a table that has no pattern for these amplifiers.
         """
-        table, timing = self._selector.chooser.table, self._timing
+        table, timing = self._selector.chooser.table, self.timing
         mode = self.capabilities.drive_mode
         prepare_answers(table, mode)
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
         placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))
-        band = self.capabilities.frequencies
+        band = self.capabilities.limits.frequencies
         (layer,) = query(table, placed, MIN_LEVEL_DB_SL, drive_mode=mode, band_hz=band).layers
         onset, ending = support.onset_knots > 0, support.ending_knots > 0
         layer = timing.with_envelopes(layer, placed, onset=onset, ending=ending)
@@ -151,10 +153,10 @@ class Planner:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self.layers.is_silent
 
-    def note(self, change: Change) -> None:
-        """Note that contacts have changed."""
-        seen = {each.key for each in self._seen} if change.up else ()
-        if change.up and (unseen := sum(each.key not in seen for each in change.up)):
+    def note_lifts(self, up: Sequence[Contact]) -> None:
+        """Note that contacts have lifted."""
+        seen = {each.key for each in self._seen}
+        if unseen := sum(each.key not in seen for each in up):
             self._too_late(unseen)
 
     def look_again(self) -> None:

@@ -170,7 +170,7 @@ def route(
         )
     before: Drive = playing or {}
     restarted = restarted_by(excitation, before) if restarted is None else restarted
-    strokes = {era.name: era.stroke for era in rig.eras}
+    strokes = rig.strokes
     onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():

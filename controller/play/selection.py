@@ -6,15 +6,24 @@ One question is answered at a time, with the fingers as they are when the one be
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
-from controller.play.chooser import Choice, ChoiceRequest, Chooser, is_alone, sum_db, unanswered
+from controller.play.chooser import (
+    Choice,
+    ChoiceRequest,
+    Chooser,
+    Intention,
+    is_alone,
+    sum_db,
+    unanswered,
+)
 from controller.play.content import (
     BEING_CHOSEN,
+    Content,
     Prediction,
     Selection,
     Targets,
@@ -44,48 +53,44 @@ _UNANSWERED = (GIVEN_UP, BLOCKED)
 _NOTHING = Selection((), ())
 
 
-@dataclass(frozen=True)
-class _Intention:
-    """Who is to feel what, among contacts: what lasts, short pulses, and who must not notice."""
+def _is_met_by(intended: Intention, chosen: Selection) -> bool:
+    """Whether what was chosen also serves what lasts of what is intended now."""
+    if not (chosen.targets and _is_part_of(intended, chosen, _targets_of)):
+        return False
+    is_whole, then = chosen.is_whole, chosen.contacts
+    now = {each.key: each for each in intended.contacts}
+    same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
+    return same and all(
+        math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+        and contact.load == then[key].load
+        and (key in intended.protected) == (key in chosen.protected)
+        for key, contact in now.items()
+    )
 
-    contacts: tuple[Contact, ...]
-    lasting: Targets
-    short: Targets
-    protected: frozenset[ContactKey]
 
-    def is_met_by(self, chosen: Selection) -> bool:
-        """Whether what was chosen also serves what lasts among these contacts."""
-        if not (chosen.targets and self._is_part_of(chosen, _targets_of)):
-            return False
-        is_whole, then = chosen.is_whole, chosen.contacts
-        now = {each.key: each for each in self.contacts}
-        same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
-        return same and all(
-            math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-            and contact.load == then[key].load
-            and (key in self.protected) == (key in chosen.protected)
-            for key, contact in now.items()
-        )
+def _is_moved_from(intended: Intention, chosen: Selection) -> bool:
+    """Whether those that feel what was chosen are to feel it still, in other places."""
+    return _is_among(intended, chosen) and _is_part_of(intended, chosen, _of_any_level)
 
-    def is_moved_from(self, chosen: Selection) -> bool:
-        """Whether those that feel what was chosen are to feel it still, in other places."""
-        return self.is_among(chosen) and self._is_part_of(chosen, _of_any_level)
 
-    def is_among(self, chosen: Selection) -> bool:
-        """Whether all contacts were there when it was chosen, and have not lifted since."""
-        then = {(each.key, each.since) for each in chosen.contacts.values()}
-        return all((each.key, each.since) in then for each in self.contacts)
+def _is_among(intended: Intention, chosen: Selection) -> bool:
+    """Whether all contacts were there when it was chosen, and have not lifted since."""
+    then = {(each.key, each.since) for each in chosen.contacts.values()}
+    return all((each.key, each.since) in then for each in intended.contacts)
 
-    def _is_part_of(self, chosen: Selection, kinds: Callable[[Targets], set[Target]]) -> bool:
-        """Whether what lasts was chosen, and no more that would leave others more if it ended.
 
-        The content of a finger that feels a short pulse meanwhile has not ended.
-        """
-        intended, had = kinds(self.lasting), kinds(chosen.targets)
-        if not intended <= had:
-            return False
-        pulsing = {contact.key for contact, _ in self.short}
-        return chosen.is_whole or all(target.key in pulsing for target in had - intended)
+def _is_part_of(
+    intended: Intention, chosen: Selection, kinds: Callable[[Targets], set[Target]]
+) -> bool:
+    """Whether what lasts was chosen, and no more that would leave others more if it ended.
+
+    The content of a finger that feels a short pulse meanwhile has not ended.
+    """
+    now, had = kinds(intended.lasting), kinds(chosen.targets)
+    if not now <= had:
+        return False
+    pulsing = {contact.key for contact, _ in intended.short}
+    return chosen.is_whole or all(target.key in pulsing for target in had - now)
 
 
 def _targets_of(targets: Targets) -> set[Target]:
@@ -151,17 +156,21 @@ class Selector:
         # Lists: a generator would be a call for each.
         targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
         served, skipped = _within_layers(targets, capabilities)
-        lasting: list[tuple[Contact, Target]] = []
-        short: list[tuple[Contact, Target]] = []
-        for each in served:
-            (short if each[1].is_short else lasting).append(each)
-        intended = _Intention(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
-        fingers = {contact.key: contact.since for contact, _ in lasting}
-        came, self._fingers = fingers.items() - self._fingers.items(), fingers
-        back = self._lasting.target_keys & dict(came).keys()
-        if back and not intended.is_met_by(self._lasting):  # who has come back may be elsewhere
+        lasting, short = list[tuple[Contact, Target]](), list[tuple[Contact, Target]]()
+        before, self._fingers, came = self._fingers, {}, set[ContactKey]()
+        for contact, target in served:
+            if target.is_short:
+                short.append((contact, target))
+                continue
+            lasting.append((contact, target))
+            self._fingers[contact.key] = contact.since
+            if before.get(contact.key) != contact.since:
+                came.add(contact.key)
+        intended = Intention(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        back = came.intersection([contact.key for contact, _ in self._lasting.targets])
+        if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
-        arrived = self._thread.take()
+        arrived = self._thread.take() if self._thread.is_busy else None
         if arrived is not None:
             self._take(arrived, is_late=not self._is_intended(arrived, intended))
         pulses, self._short = self._short, {}
@@ -188,7 +197,7 @@ class Selector:
                         partial(chooser.choose, requested, capabilities),
                         instead=unanswered(requested, GIVEN_UP),
                     )
-        parts = [_felt(self._lasting, fingers.keys()), *self._short.values()]
+        parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
         if self._thread.is_busy and len(found.predictions) < len(targets):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
@@ -202,7 +211,7 @@ class Selector:
 
     def _to_request(
         self,
-        intended: _Intention,
+        intended: Intention,
         pulses: Mapping[ContactKey, Selection],
         now: float,
         *,
@@ -213,7 +222,7 @@ class Selector:
         A pulse that has waited for the thread goes before what lasts, for which it would be late.
         """
         lasting = intended.lasting
-        is_kept = not lasting or intended.is_met_by(self._lasting)
+        is_kept = not lasting or _is_met_by(intended, self._lasting)
         is_due = self.due < math.inf and self.due <= now
         is_rested = bool(lasting) and is_due and is_kept
         if is_due:
@@ -222,33 +231,33 @@ class Selector:
         if is_kept and not is_rested and not new:
             return
         felt = _felt(self._lasting, self._fingers.keys())
-        before = {one.key: one for one in felt.contents}
+        before = {each.key: each for each in felt.contents}
         for contact, _ in intended.short:
             before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
-        playing = _playing(self._short, now)
-        requested = ChoiceRequest(
-            new, intended.contacts, intended.protected, before, (felt, *playing)
-        )
-        if has_waited or is_kept:
-            if new:
-                yield requested
-                new, playing = (), _playing(self._short, now)
-            if is_kept and not is_rested:
-                return
+        if new and (has_waited or is_kept):
+            pulses_alone = replace(intended, lasting=(), short=new)
+            yield ChoiceRequest(pulses_alone, before, (felt, *self._playing(now)))
+            new = ()
+        if is_kept and not is_rested:
+            return
         takes_long = not is_alone(lasting, intended.protected)
-        is_moving = takes_long and not is_rested and intended.is_moved_from(self._lasting)
+        is_moving = takes_long and not is_rested and _is_moved_from(intended, self._lasting)
         self.due = now + _RESTS_AFTER if is_moving else math.inf
-        yield replace(
-            requested,
-            short=new,
-            kept=playing,
-            lasting=lasting,
-            takes_long=takes_long,
-            is_moving=is_moving,
-            is_rested=is_rested,
+        yield ChoiceRequest(
+            replace(intended, short=new),
+            before,
+            self._playing(now),
+            takes_long,
+            is_moving,
+            is_rested,
         )
 
-    def _is_intended(self, chosen: Choice, intended: _Intention) -> bool:
+    def _playing(self, now: float) -> tuple[Selection, ...]:
+        """Return the short pulses that have not ended at a time [s]."""
+        parts = self._short.values()
+        return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
+
+    def _is_intended(self, chosen: Choice, intended: Intention) -> bool:
         """Whether what was chosen to last is for those that are on the plate by now.
 
         Places may have changed since, and what effects change, or a program that plays them again:
@@ -260,8 +269,8 @@ class Selector:
             return True  # in doubt nothing plays
         return (
             found is not None
-            and (chosen.requested.is_rested or not intended.is_met_by(self._lasting))
-            and intended.is_among(found)
+            and (chosen.requested.is_rested or not _is_met_by(intended, self._lasting))
+            and _is_among(intended, found)
             and intended.protected <= found.protected
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
@@ -286,7 +295,10 @@ def _together(
     reason: str,
 ) -> Selection:
     """Join what was chosen apart, contacts as they were then; reason: why there are no targets."""
-    chosen = [part for part in parts if part.targets]
+    chosen: list[Selection] = []
+    for part in parts:
+        if part.targets:
+            chosen.append(part)
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
     then = {key: each for part in chosen for key, each in part.contacts.items()}
@@ -307,22 +319,26 @@ def _together(
     )
 
 
-def _playing(short: Mapping[ContactKey, Selection], now: float) -> tuple[Selection, ...]:
-    """Return the short pulses that have not ended at a time [s]."""
-    return tuple([part for part in short.values() if any(now < each.end for each in part.pulses)])
-
-
 def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
     """Return what was chosen, without the contents of all fingers but some, by key."""
-    if keys >= chosen.target_keys:
+    targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], list[Content]()
+    for contact, target in chosen.targets:
+        if contact.key in keys:
+            targets.append((contact, target))
+        else:
+            quiet.append(contact)
+    if len(targets) == len(chosen.targets):
         return chosen
+    for content in chosen.contents:
+        for contact, _ in content.targets:
+            if contact.key in keys:
+                contents.append(content)
+                break
     return replace(
         chosen,
-        targets=tuple([each for each in chosen.targets if each[0].key in keys]),
-        quiet=(*chosen.quiet, *[each for each, _ in chosen.targets if each.key not in keys]),
-        contents=tuple(
-            [each for each in chosen.contents if any(one.key in keys for one, _ in each.targets)]
-        ),
+        targets=tuple(targets),
+        quiet=tuple(quiet),
+        contents=tuple(contents),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
 

@@ -246,7 +246,9 @@ def _source_of(frame: TouchFrame) -> _Source:
 
 def _valid_touches(frame: TouchFrame, plate: Plate, rejected: list[str]) -> dict[ContactKey, Touch]:
     """Return the touches that can be contacts; add a reason for each of the others."""
-    last = {touch.id: touch for touch in frame.touches}
+    last: dict[int, Touch] = {}
+    for touch in frame.touches:
+        last[touch.id] = touch
     rejected += ["twice"] * (len(frame.touches) - len(last))
     valid = {}
     for touch in last.values():

@@ -103,7 +103,8 @@ class TuioReader:
         A cursor that is alive but was never set is omitted; positions may be NaN.
         """
         bundle = _read_bundle(datagram)
-        self._count(bundle, f"{peer[0]}:{peer[1]}")
+        if bundle.others or bundle.malformed:
+            self._count(bundle, f"{peer[0]}:{peer[1]}")
         if bundle.alive is None and not bundle.positions:
             return None
         name = self._name(bundle, peer, now)
@@ -117,10 +118,14 @@ class TuioReader:
             sender.alive = tuple(dict.fromkeys(bundle.alive))
         known = sender.positions | bundle.positions
         alive = tuple(bundle.positions) if sender.alive is None else sender.alive
-        sender.positions = {id: known[id] for id in alive if id in known}
+        sender.positions, touches = {}, list[Touch]()
+        for id in alive:
+            if id in known:
+                sender.positions[id] = known[id]
+                touches.append(Touch(id, *known[id]))
         sender.resting = 0 if alive else sender.resting + 1
-        touches = tuple([Touch(id, x, y) for id, (x, y) in sender.positions.items()])
-        return TouchFrame(name, now, touches, self._timeout, origin=f"tuio:{peer[0]}:{peer[1]}")
+        origin = f"tuio:{peer[0]}:{peer[1]}"
+        return TouchFrame(name, now, tuple(touches), self._timeout, origin=origin)
 
     def is_mute(self, *, since: float, now: float) -> bool:
         """Whether nothing was read since a time [s] though it should have been.
@@ -223,37 +228,43 @@ class TuioReader:
 
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the messages of a datagram."""
-    bundle = _Bundle()
+    bundle, cursors = _Bundle(), list[tuple[Argument, ...]]()
     messages = osc_messages(datagram, limit=_MAX_MESSAGES + 1)
     if len(messages) > _MAX_MESSAGES:
         bundle.malformed.append(f"bundle must have at most {_MAX_MESSAGES} messages")
     for message in messages[:_MAX_MESSAGES]:
         try:
             address, arguments = read_message(message)
-            if address == ADDRESS:
-                _read_cursors(bundle, arguments)
-            else:
-                is_idle = arguments[:1] in (("source",), ("fseq",)) or arguments == ("alive",)
-                is_idle |= address in _IDLE_ADDRESSES
-                bundle.others[address] = not is_idle or bundle.others.get(address, False)
         except OscError as error:
             bundle.malformed.append(str(error))
+            continue
+        if address == ADDRESS:
+            cursors.append(arguments)
+            continue
+        is_idle = arguments[:1] in (("source",), ("fseq",)) or arguments == ("alive",)
+        is_idle |= address in _IDLE_ADDRESSES
+        bundle.others[address] = not is_idle or bundle.others.get(address, False)
+    _read_cursors(bundle, cursors)
     return bundle
 
 
-def _read_cursors(bundle: _Bundle, arguments: tuple[Argument, ...]) -> None:
-    """Add a message of cursors to a bundle; raises OscError."""
-    match arguments:
-        case ("source", str(name), *_):
-            bundle.source = name[:_MAX_NAME]
-        case ("alive", *ids):
-            bundle.alive = tuple(map(_whole, ids))
-        case ("set", id, int(x) | float(x), int(y) | float(y), *_):
-            bundle.positions[_whole(id)] = (float(x), float(y))
-        case ("fseq", number, *_):
-            bundle.sequence = _whole(number)
-        case _:
-            raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
+def _read_cursors(bundle: _Bundle, messages: Iterable[tuple[Argument, ...]]) -> None:
+    """Add the messages of cursors, by their arguments, to a bundle."""
+    for arguments in messages:
+        try:
+            match arguments:
+                case ("source", str(name), *_):
+                    bundle.source = name[:_MAX_NAME]
+                case ("alive", *ids):
+                    bundle.alive = tuple(map(_whole, ids))
+                case ("set", id, int(x) | float(x), int(y) | float(y), *_):
+                    bundle.positions[_whole(id)] = (float(x), float(y))
+                case ("fseq", number, *_):
+                    bundle.sequence = _whole(number)
+                case _:
+                    raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
+        except OscError as error:
+            bundle.malformed.append(str(error))
 
 
 def _whole(value: Argument) -> int:

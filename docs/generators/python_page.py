@@ -60,7 +60,8 @@ def _tree(thing: Any) -> ast.stmt:
 
 def _of_stub(base: type) -> list[ast.stmt]:
     """The members of a class in the stub file of its module, if there is one."""
-    stub = Path(inspect.getfile(base)).with_suffix(".pyi") if base is not object else Path("none")
+    is_ours = base.__module__ != "builtins"
+    stub = Path(inspect.getfile(base)).with_suffix(".pyi") if is_ours else Path("none")
     if not stub.is_file():
         return []
     (found,) = (

@@ -235,7 +235,8 @@ class Ledger:
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
         late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
-        self.playback.advance(late)
+        if late >= self.playback.changes_at:
+            self.playback.advance(late)
         if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
             return
         refusal = self._refusal_of_sums(layers, late, until)
@@ -283,7 +284,7 @@ class Ledger:
         playback, full = self.playback, _LEVEL.per_unit
         levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
         for one in (*layers, *playback.waiting):
-            is_at_once = not one.after and playback.end_of(one.layer) > until
+            is_at_once = not one.after and until < playback.next_due
             for command in one.commands:
                 peak = command.level
                 for shape in (command.onset, command.ending):
@@ -298,8 +299,8 @@ class Ledger:
                 largest = abs(way.last)
                 if late < way.end:
                     largest = max(largest, abs(way.first), *map(abs, way.knots))
-                if ending is not None:
-                    largest = max(largest, ending.peak / full)
+                if ending is not None and ending.knots:
+                    largest = max(largest, max(ending.knots)[0] / full)
                 if not voice.has_ended and way.last:
                     largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
                 levels[channel] += largest

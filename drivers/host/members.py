@@ -44,11 +44,11 @@ class Members:
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        return tuple(
-            name
-            for name, each in self.amplifiers.items()
-            if each.silence_cause is not None and not is_lost(each)
-        )
+        names = []
+        for name, each in self.amplifiers.items():
+            if each.silence_cause is not None and not is_lost(each):
+                names.append(name)
+        return tuple(names)
 
     @property
     def lost_by(self) -> Mapping[str, str]:

@@ -35,6 +35,7 @@ from model.choice import best_of
 from model.errors import InputError
 from model.identification.held_out import SHARE, relative_rms
 from model.identification.parameters import KINDS
+from model.progress import Progress, unseen
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
 
@@ -95,12 +96,18 @@ _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
 def calibrate(
-    rig: Rig, responses: Responses, screened: Screening, *, all_scales: bool = False
+    rig: Rig,
+    responses: Responses,
+    screened: Screening,
+    *,
+    all_scales: bool = False,
+    progress: Progress = unseen,
 ) -> Calibration:
     """Fit a rig to responses measured on it, as `check_consistency` has found them.
 
-    all_scales: estimate the scale of every sensor, not only of wrong ones. Raises InputError if
-    fewer than three sensors have a signal, and for a plate of another size.
+    all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
+    the fits done and all. Raises InputError if fewer than three sensors have a signal, and for a
+    plate of another size.
     """
     dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
     while True:
@@ -119,6 +126,7 @@ def calibrate(
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     fit = _with_median_scale_one(part, solve(part, start))
+    progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
     free_scales = part.free_scales
     if not all_scales:
         scales, error = part.scales(fit.z), part.scale_errors(fit)
@@ -127,15 +135,18 @@ def calibrate(
     problem, found = _identified(replace(part, free_scales=free_scales), fit)
     if all_scales:
         found = _with_median_scale_one(problem, found)
+    progress(2, 3)
     _check_sides(problem, found)
     _check_outliers(problem, found)
-    return _report(
+    report = _report(
         problem,
         found,
         live,
         dead_sensors=tuple(compress(responses.sensors, dead)),
         dead_eras=tuple(compress((era.name for era in rig.eras), dead_eras)),
     )
+    progress(3, 3)
+    return report
 
 
 def _identified(problem: CalibrationProblem, start: Fit) -> tuple[CalibrationProblem, Fit]:

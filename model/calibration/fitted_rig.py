@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 from scipy.optimize import brentq
@@ -145,14 +145,14 @@ def uncertainty_of(
         if known["loss_factor"] and known["damping"]
         else math.log(before.damping)
     )
-    return replace(
-        before,
-        gain=_rounded(gain),
-        phase_deg=_rounded(phase_deg),
-        thickness=_rounded(min(rms("modulus") / 2, 0.03)) if known["modulus"] else before.thickness,
-        stiffness=_rounded(min(rms("stiffness"), 0.5)) if known["stiffness"] else before.stiffness,
-        damping=1 + _rounded(math.exp(min(losses, math.log(4.0))) - 1),
-    )
+    fitted = {
+        "gain": _rounded(gain),
+        "phase_deg": _rounded(phase_deg),
+        "thickness": _rounded(rms("modulus") / 2) if known["modulus"] else before.thickness,
+        "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
+        "damping": 1 + _rounded(math.exp(losses) - 1),
+    }
+    return Uncertainty.clipped(**asdict(before) | fitted)
 
 
 def pooled_error(bias: FloatArray, error: FloatArray) -> float:

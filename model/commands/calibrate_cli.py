@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from model.commands.fitted_rig_cli import check_rig_output, finish, write_fitted_rig
-from model.commands.options import JsonOption, MeshOption, RigArgument, Stopwatch
+from model.commands.options import JsonOption, MeshOption, RigArgument, Stopwatch, progress_bar
 from model.counting import counted
 from model.files.replacing import check_picture
 
@@ -52,9 +52,9 @@ def calibrate(
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_measured(measured_file), rig)
-    with Stopwatch() as timed:
+    with Stopwatch() as timed, progress_bar("fits") as progress:
         screened = check_consistency(rig, responses)
-        calibration = fit(rig, responses, screened, all_scales=all_scales)
+        calibration = fit(rig, responses, screened, all_scales=all_scales, progress=progress)
     rows = calibration_report.change_rows(calibration)
     notes = [
         *calibration_report.finding_rows(calibration),

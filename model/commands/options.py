@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from model.errors import InputError
+from model.progress import Progress
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
@@ -114,25 +115,26 @@ _LINE_INTERVAL = 2.0  # s
 
 
 @contextmanager
-def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(unit: str) -> Iterator[Progress]:
     """Show a progress bar on standard error, or lines if that is no terminal.
 
     Yield its update(done, total). unit: plural of the things counted.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
 
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _lines(unit)
         return
     columns = (BarColumn(), MofNCompleteColumn(), unit, TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
+    with Bars(*columns, console=console) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _lines(unit: str) -> Callable[[int, int], None]:
+def _lines(unit: str) -> Progress:
     """Print how far it is every two seconds."""
     printed = time.monotonic()
 

@@ -68,7 +68,10 @@ class ConfigError(InputError):
 
 @dataclass(frozen=True)
 class Document:
-    """The content of a file, its text, and the line of every key and list entry by its path."""
+    """The content of a file, its text, and the line of every key and list entry by its path.
+
+    Keys that were given in a program have no text and no lines.
+    """
 
     source: str
     text: str
@@ -84,11 +87,11 @@ class Document:
             value = value[key]
         return value
 
-    def line_of(self, path: KeyPath) -> int:
+    def line_of(self, path: KeyPath) -> int | None:
         """The line of a key or list entry, or of the nearest one above it if it is missing."""
         while path and path not in self.lines:
             path = path[:-1]
-        return self.lines.get(path, 1)
+        return self.lines.get(path, 1) if self.lines else None
 
     def beside(self, name: str) -> Path:
         """The path of a file that this one names, relative to its folder; `~` is the home."""

@@ -49,7 +49,7 @@ class ConfigKind:
         return {"$schema": draft, **self.keys(), "title": self.title}
 
 
-_KINDS = {
+KINDS = {
     "daemon": "controller.daemon.config:DAEMON",
     "layout": "controller.effects.layout_file:LAYOUT",
     DEFAULT_KIND: "model.rig.kind:RIG",
@@ -59,12 +59,12 @@ _KINDS = {
 
 def kind_called(name: str) -> ConfigKind:
     """Return the kind of a name; raises InputError for an unknown one."""
-    if name not in _KINDS:
+    if name not in KINDS:
         raise InputError(
-            f"unknown kind of configuration {name[:40]!r}; {did_you_mean(name, _KINDS)}"
-            f"known are {', '.join(_KINDS)}"
+            f"unknown kind of configuration {name[:40]!r}; {did_you_mean(name, KINDS)}"
+            f"known are {', '.join(KINDS)}"
         )
-    kind: ConfigKind = resolve_name(_KINDS[name])
+    kind: ConfigKind = resolve_name(KINDS[name])
     return kind
 
 
@@ -83,7 +83,7 @@ def check_is_rig(document: Document) -> None:
 
 
 def _name_of(document: Document) -> str:
-    for name in _KINDS:
+    for name in KINDS:
         if name != DEFAULT_KIND and kind_called(name).recognises(document):
             return name
     return DEFAULT_KIND

@@ -1,7 +1,6 @@
 """Files, pictures and summary of a design."""
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +9,16 @@ from matplotlib.figure import Figure
 
 from model.config.document import Value
 from model.config.editing import data_text
-from model.design.run import Design, Layout
+from model.design.layout_keys import layout_keys
+from model.design.run import Design, RankedLayout
 from model.figures import save_figure
 from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Columns, write_columns
-from model.rig.rig import Channel, Rig
 from model.structure.support import rigid_body_frequencies, static_loads
 
 MAX_SHOWN = 10
 """Layouts in a summary; the CSV file has all."""
-
-MAX_CHANNELS = 4
-"""Channels of an amplifier beyond the rig's own ones."""
 
 
 def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> list[Path]:
@@ -40,7 +36,7 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     return [rig, table, *(folder / name for name in pictures)]
 
 
-def _columns(layouts: Sequence[Layout]) -> Columns:
+def _columns(layouts: Sequence[RankedLayout]) -> Columns:
     """A row for each layout, in the order of their ranks."""
     rows = [_row(each) for each in layouts]
     at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
@@ -49,69 +45,36 @@ def _columns(layouts: Sequence[Layout]) -> Columns:
     return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
 
 
-def _row(layout: Layout) -> dict[str, Any]:
+def _row(layout: RankedLayout) -> dict[str, Any]:
     """A layout for JSON."""
-    found = layout.found
-    eras = layout.problem.eras(found.positions)
+    eras = layout.eras
     return {
         "layout": layout.name,
         "at_m": {era.name: [era.x, era.y] for era in eras},
         "stiffness_n_m": eras[-1].stiffness,
-        "supported": found.is_supported,
-        "expected_contrast_db": found.score_db if found.is_supported else None,
+        "supported": layout.found.is_supported,
+        "expected_contrast_db": layout.expected_contrast,
         "contrast_db": layout.judged.summary if layout.judged else None,
     }
 
 
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     """The text of the rig's file with the ERAs of the best layout, on free channels."""
-    problem = design.problem
-    rig = problem.rig
-    before, amplifiers = data["eras"], data["amplifiers"]
-    assert isinstance(before, dict)  # noqa: S101  the rig was read from this data
-    assert isinstance(amplifiers, dict)  # noqa: S101
-    like = problem.like.name
-    channels = iter(_free_channels(rig, problem.kept, count=problem.count))
-    eras: dict[str, Value] = {}
-    mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
-    for name, mount in zip(rig.supports, mounts, strict=True):
-        eras[name] = deepcopy(before[name])
-        _set_damping(eras[name], mount.damping)
-    used = {}
-    for era in problem.eras(design.best.found.positions):
-        if era.name in problem.kept:
-            eras[era.name] = deepcopy(before[era.name])
-            _set_damping(eras[era.name], era.damping)
-            continue
-        section = deepcopy(before[like])  # no aliases in a file
-        assert isinstance(section, dict)  # noqa: S101
-        channel = next(channels)
-        used[channel.amplifier] = True
-        section |= {
-            "at": [round(era.x, 6), round(era.y, 6)],
-            "amplifier": channel.amplifier,
-            "channel": channel.number,
-            **({} if problem.stiffness is None else {"stiffness": problem.stiffness}),
-        }
-        _set_damping(section, era.damping)
-        eras[era.name] = section
-    own = {rig.wiring[name].amplifier for name in problem.kept}
-    given = {name: amplifiers[name] for name in amplifiers if name in own or name in used}
-    added: dict[str, Value] = {name: {"url": "sim://"} for name in used if name not in amplifiers}
+    keys = layout_keys(design.problem, design.best.found.positions, data)
+    added = [name for name in keys["amplifiers"] if name not in design.problem.rig.amplifiers]
     comment = (
-        f"# Designed for contrast: {problem.count} ERAs, "
+        f"# Designed for contrast: {design.problem.count} ERAs, "
         f"{design.best.mean_db:.1f} dB over fresh contact sets.\n"
     )
     if added:
         comment += f"# Give the amplifiers {', '.join(added)} the URLs of real ones.\n"
-    return comment + data_text({**data, "eras": eras, "amplifiers": {**given, **added}})
+    return comment + data_text(keys)
 
 
 def summary(design: Design) -> dict[str, Any]:
     """The design for JSON."""
     problem, best = design.problem, design.best
-    eras = problem.eras(best.found.positions)
-    rig = problem.rig
+    eras, rig = best.eras, problem.rig
     loads = static_loads(rig.plate, eras, loads=rig.masses)
     lowest = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
     return {
@@ -144,30 +107,11 @@ def summary(design: Design) -> dict[str, Any]:
     }
 
 
-def _set_damping(section: Value, damping: float) -> None:
-    """State damping by itself: its ratio refers to the number of ERAs."""
-    assert isinstance(section, dict)  # noqa: S101
-    section.pop("damping_ratio", None)
-    section["damping"] = float(f"{damping:.6g}")
-
-
-def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
-    """The rig's channels without those of kept ERAs, and further amplifiers of MAX_CHANNELS."""
-    free = [channel for name, channel in rig.wiring.items() if name not in kept]
-    names = (
-        name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers
-    )
-    while len(free) < count:
-        name = next(names)
-        free += [Channel(name, number) for number in range(MAX_CHANNELS)]
-    return free
-
-
 def contrast_figure(design: Design) -> Figure:
     """Promised felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
     contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
-    eras = design.problem.eras(design.best.found.positions)
+    eras = design.best.eras
     ratio = plate.width / plate.length
     kinds = judged.kinds
     figure = Figure(figsize=(3.4 * len(kinds) + 1, 3.0 * ratio + 1.2), layout="compressed")

@@ -5,7 +5,6 @@ A layout is judged by the answers of its localization table to fresh contact set
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
@@ -16,13 +15,19 @@ from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
 from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_first
+from model.config.document import Document
+from model.design.layout_keys import layout_keys
 from model.design.problem import DesignProblem, NamedLayouts
 from model.design.search import LayoutSearch, ScoredLayout
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.processes import on_processes
+from model.progress import Progress, unseen
+from model.rig.file import rig_of
+from model.rig.from_keys import stated
 from model.rig.rig import Rig
+from model.structure.attachments import Era
 from model.structure.support import support_problem
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -111,8 +116,8 @@ def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tu
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """A layout of one problem, and its answers on fresh contact sets if it was judged.
+class RankedLayout:
+    """A layout of a design, and its answers on fresh contact sets if it was judged.
 
     name: of a given one, or the number of its start.
     """
@@ -138,29 +143,50 @@ class Layout:
         """Mean contrast of one that was judged [dB]."""
         return self.answers.mean_db
 
+    @property
+    def eras(self) -> tuple[Era, ...]:
+        """Its ERAs, without wiring."""
+        return self.problem.eras(self.found.positions)
+
+    @property
+    def contrast(self) -> float | None:
+        """Promised felt contrast [dB], mean over numbers of quiet fingers, if it was judged."""
+        return None if self.judged is None else self.mean_db
+
+    @property
+    def expected_contrast(self) -> float | None:
+        """The score [dB] that ranks others, None where it does not support the plate."""
+        return self.found.score_db if self.found.is_supported else None
+
+    @property
+    def rig(self) -> Rig:
+        """The rig with these ERAs, as `era design` writes it: on free channels."""
+        keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
+        return rig_of(Document("RankedLayout.rig", "", keys, {}))
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
     """Result of a design.
 
-    layouts: all of them, judged ones first by their mean contrast, then others by score; starts: of
-    these the ends of the searches of the best one's problem, none if layouts were given; by_count:
-    the best judged for each number of ERAs of that problem; by_stiffness: the best for each
-    stiffness [N/m] tried; sensitivities (n,): change of the score [dB/m] with the place of each
-    ERA of the best; own: the rig's own layout, None if it does not support the plate.
+    layouts: judged ones first by their mean contrast, then others by score; starts: ends of the
+    best problem's searches; by_count: the best judged for each number of ERAs of that problem;
+    by_stiffness: the best for each stiffness [N/m] tried; sensitivities (n,): change of the score
+    [dB/m] with the place of each ERA of the best; own: the rig's own layout, None if it does not
+    support the plate.
     """
 
-    layouts: tuple[Layout, ...]
-    starts: tuple[Layout, ...]
-    by_count: dict[int, Layout]
-    by_stiffness: dict[float, Layout]
+    layouts: tuple[RankedLayout, ...]
+    starts: tuple[RankedLayout, ...]
+    by_count: dict[int, RankedLayout]
+    by_stiffness: dict[float, RankedLayout]
     sensitivities: FloatArray
     own: Assessment | None
     sets: list[FloatArray]
 
     @property
-    def best(self) -> Layout:
-        """That of the most contrast of as many ERAs as were sought."""
+    def best(self) -> RankedLayout:
+        """The layout of the most contrast of as many ERAs as were sought."""
         return self.layouts[0]
 
     @property
@@ -174,32 +200,21 @@ class Design:
         return max((self.best.mean_db - each.mean_db for each in self.starts), default=0.0)
 
 
-@contextmanager
-def _unseen(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Progress that is not shown."""
-    yield lambda done, total: None
-
-
 @dataclass(frozen=True)
 class Runner:
-    """Solves tasks on machines.
-
-    progress: shows what is being done; yields an update(done, total).
-    """
+    """Solves tasks on machines; progress: of one stage after the other."""
 
     machines: Machines = _HERE
-    progress: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = _unseen
+    progress: Progress = unseen
 
     def run(
-        self, what: str, solve: Callable[[Any, Any], Any], shared: object, tasks: Sequence[Any]
+        self, solve: Callable[[Any, Any], Any], shared: object, tasks: Sequence[Any]
     ) -> list[Any]:
         """Results of tasks, in their order."""
         done: dict[int, Any] = {}
-        with self.progress(what) as update:
-            update(0, len(tasks))
-            for number, result in self.machines(solve, shared, dict(enumerate(tasks))):
-                done[number] = result
-                update(len(done), len(tasks))
+        for number, result in self.machines(solve, shared, dict(enumerate(tasks))):
+            done[number] = result
+            self.progress(len(done), len(tasks))
         return [done[number] for number in range(len(tasks))]
 
 
@@ -212,10 +227,8 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
     """
     tasks = [(number, start) for number in range(len(problems)) for start in range(starts)]
     layouts = [
-        Layout(problems[number], f"start {start}", each)
-        for (number, start), found in zip(
-            tasks, runner.run("starts", _start, problems, tasks), strict=True
-        )
+        RankedLayout(problems[number], f"start {start}", each)
+        for (number, start), found in zip(tasks, runner.run(_start, problems, tasks), strict=True)
         for each in found
     ]
     for problem in problems:
@@ -231,7 +244,7 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
     best = best_by(ends, lambda each: each.mean_db)
     further = _search_of(best.problem).one_more(best.found.positions)
     if further is not None:
-        judged += _judged([Layout(best.problem, "one more", further)], runner)
+        judged += _judged([RankedLayout(best.problem, "one more", further)], runner)
     return _design(best, judged, [each for each in ends if each.problem is best.problem], runner)
 
 
@@ -246,9 +259,9 @@ def rank_layouts(
         for at in range(0, len(given[problem]), CHUNK)
     ]
     tasks = [(number, list(chunk.values())) for number, chunk in chunks]
-    scored = runner.run("chunks", _score, problems, tasks)
+    scored = runner.run(_score, problems, tasks)
     layouts = [
-        Layout(problems[number], name, each)
+        RankedLayout(problems[number], name, each)
         for (number, chunk), found in zip(chunks, scored, strict=True)
         for name, each in zip(chunk, found, strict=True)
     ]
@@ -263,13 +276,15 @@ def rank_layouts(
     return _design(best_by(judged, lambda each: each.mean_db), judged + rest, [], runner)
 
 
-def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: Runner) -> Design:
+def _design(
+    best: RankedLayout, layouts: list[RankedLayout], starts: list[RankedLayout], runner: Runner
+) -> Design:
     """The result of layouts, of which some were judged, the best among them."""
     judged = [each for each in layouts if each.judged is not None]
     order = best_first([each.mean_db for each in judged]).tolist()
     ranked = [judged[each] for each in order]
-    by_count: dict[int, Layout] = {}
-    by_stiffness: dict[float, Layout] = {}
+    by_count: dict[int, RankedLayout] = {}
+    by_stiffness: dict[float, RankedLayout] = {}
     for each in [best, *ranked]:
         if each.problem is best.problem or not starts:
             by_count.setdefault(each.count, each)
@@ -280,7 +295,7 @@ def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: R
     own = None
     rig = problem.rig
     if support_problem(rig.plate, rig.eras, loads=rig.masses) is None:
-        (own,) = runner.run("answers", _answers, [problem], [(0, None)])
+        (own,) = runner.run(_answers, [problem], [(0, None)])
     return Design(
         (best, *dict.fromkeys(rest)),
         tuple(starts),
@@ -292,13 +307,13 @@ def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: R
     )
 
 
-def _judged(layouts: Sequence[Layout], runner: Runner) -> list[Layout]:
+def _judged(layouts: Sequence[RankedLayout], runner: Runner) -> list[RankedLayout]:
     """The layouts with their answers; those of several starts that end in one are found once."""
     problems = list(dict.fromkeys(each.problem for each in layouts))
     keys = [(problems.index(each.problem), each.found.positions.tobytes()) for each in layouts]
     different = dict(zip(keys, layouts, strict=True))
     tasks = [(number, each.found.positions) for (number, _), each in different.items()]
-    answers = dict(zip(different, runner.run("answers", _answers, problems, tasks), strict=True))
+    answers = dict(zip(different, runner.run(_answers, problems, tasks), strict=True))
     return [replace(each, judged=answers[key]) for key, each in zip(keys, layouts, strict=True)]
 
 

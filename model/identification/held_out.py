@@ -17,6 +17,7 @@ from model.arrays import FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.least_squares import IdentificationProblem, solve
 from model.identification.stages import FittedModel, chi2
+from model.progress import Progress, unseen
 
 SHARE = 5
 """One in so many is held out."""
@@ -41,7 +42,7 @@ class HeldOutPaths:
     disagreement: FloatArray
 
 
-def hold_out(fitted: FittedModel) -> HeldOutPaths | None:
+def hold_out(fitted: FittedModel, *, progress: Progress = unseen) -> HeldOutPaths | None:
     """Predict paths from a fit to the others; None where these do not tell enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
     folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % SHARE
@@ -49,6 +50,7 @@ def hold_out(fitted: FittedModel) -> HeldOutPaths | None:
     free, fits = np.flatnonzero(fitted.space.uncertain), []
     noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
     for fold in range(SHARE):
+        progress(1 + fold, 1 + SHARE)
         unseen = measurement.known & (folds == fold)
         if not unseen.any():
             continue

@@ -8,12 +8,13 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
-from model.identification.held_out import HeldOutPaths, hold_out
+from model.identification.held_out import SHARE, HeldOutPaths, hold_out
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space
 from model.identification.posterior import Posterior
 from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages
 from model.identification.values import Values, rig_with
+from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
@@ -57,9 +58,12 @@ class Identification:
         return self.chi2 <= MAX_CHI2
 
 
-def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identification:
+def identify(
+    rig: Rig, measurement: Measurement, *, seed: int = 0, progress: Progress = unseen
+) -> Identification:
     """Identify a rig by a measurement on it; the same for the same data and seed.
 
+    progress: called with the fits done and all, one of everything and one of each held-out share.
     Raises InputError for a rig with a part that does not scale, for a plate that was not linear or
     has changed during the measurement, for gains that no drive or sensor has (another unit, a wrong
     sign), and where it leaves unknown what answers depend on, with the tone and the sensor that
@@ -77,7 +81,7 @@ def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identifica
     unknown = unknowns(setting, fitted, posterior)
     if unknown:
         raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
-    held_out, uncertainty = hold_out(fitted), rig.uncertainty
+    held_out, uncertainty = hold_out(fitted, progress=progress), rig.uncertainty
     if is_explained:
         uncertainty = posterior.uncertainty(
             uncertainty,
@@ -88,6 +92,7 @@ def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identifica
     if held_out:
         covariance = posterior.covariance + held_out.disagreement
         posterior = replace(posterior, covariance=covariance)
+    progress(1 + SHARE, 1 + SHARE)
     return Identification(
         rig,
         rig_with(rig, values, uncertainty),

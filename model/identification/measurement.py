@@ -1,6 +1,6 @@
 """Responses that were measured on a rig in place, with their errors and repetitions."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.identification.forward import Sensor
+from model.progress import Progress
 from model.rig.rig import Rig
 
 NONLINEAR = 0.02
@@ -124,7 +125,6 @@ class Measurement:
                     )
 
 
-Progress = Callable[[int, int], None]
 """Called with what is done and all."""
 
 

@@ -81,15 +81,15 @@ class Posterior:
         mean = _rows(self.space, "gain").mean(axis=0, keepdims=True)
         rms = {kind: _rms(std) for kind, std in self.stds().items()}
         damping = max(rms["damping"], rms["loss"])
-        return Uncertainty(
-            gain=min(math.hypot(rms["gain"], gain), 0.5),
-            phase_deg=min(math.hypot(math.degrees(rms["phase"]), phase_deg), 60.0),
-            thickness=min(rms["frequency"], 0.03),
-            stiffness=min(rms["stiffness"], 0.5),
-            damping=math.exp(min(damping, math.log(4.0))),
+        return Uncertainty.clipped(
+            gain=math.hypot(rms["gain"], gain),
+            phase_deg=math.hypot(math.degrees(rms["phase"]), phase_deg),
+            thickness=rms["frequency"],
+            stiffness=rms["stiffness"],
+            damping=math.exp(damping),
             fingertip=before.fingertip,
-            common_gain=min(math.hypot(before.common_gain, self.std_of(mean)[0]), 0.5),
-            field=min(field, 0.5),
+            common_gain=math.hypot(before.common_gain, self.std_of(mean)[0]),
+            field=field,
         )
 
 

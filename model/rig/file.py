@@ -45,6 +45,8 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()
+    if mesh is not None:
+        document = Document(document.source, "", document.data | {"mesh": mesh}, {})
     plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     everything = {
@@ -84,14 +86,12 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             for name, amplifier in section.amplifiers.items()
             if amplifier.full_level == "output"
         ),
+        document=document,
     )
 
 
 def example_rig_path() -> Path:
-    """The path of the commented rig of the paper's plate.
-
-    A wheel has it in the model's data, a checkout in its examples.
-    """
-    here = Path(__file__).parents[1]
+    """The path of the commented rig of the paper's plate."""
+    here = Path(__file__).parents[1]  # a wheel has it in the model's data
     installed = here / "data" / "paper_plate.yaml"
     return installed if installed.exists() else here.parent / "examples" / "paper_plate.yaml"

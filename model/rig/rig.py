@@ -6,9 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from numbers import Real
+from pkgutil import resolve_name
 from typing import Any
 
+from model.config.document import Document
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import DEFAULT_THRESHOLD
@@ -18,6 +21,9 @@ from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.suggestions import did_you_mean
+
+_REPLACED = "model.rig.from_keys:replaced"
+"""By name: it makes rigs, and so needs this file."""
 
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
@@ -40,7 +46,8 @@ class Rig:
     of which the plate is made, also where its layers are solved as a homogeneous one; uncertainty:
     of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
     threshold: name of the set of detection thresholds (`model.finger.perception`); outputs: the
-    amplifiers whose full level is an output, to which bases move by their gains, not a motion.
+    amplifiers whose full level is an output, to which bases move by their gains, not a motion;
+    document: its keys.
     """
 
     plate: Plate
@@ -56,6 +63,7 @@ class Rig:
     threshold: str = DEFAULT_THRESHOLD
     supports: tuple[str, ...] = ()
     outputs: frozenset[str] = frozenset()
+    document: Document | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""
@@ -90,6 +98,21 @@ class Rig:
             )
         return eras[name]
 
+    @cached_property
+    def strokes(self) -> dict[str, float]:
+        """Stroke of each ERA [m], by its name."""
+        return {era.name: era.stroke for era in self.eras}
+
+    def replaced(self, **changes: Any) -> "Rig":
+        """Make a rig with other keys: of its plate, as thickness=0.002, or whole sections.
+
+        What follows from them follows: damping by `damping_ratio`, a mesh `auto`, a laminate's
+        equivalent plate; ERAs and masses keep their share of the sides. None leaves a key out.
+        Raises ConfigError with all problems, InputError for `modes` identified on another plate.
+        """
+        made: Rig = resolve_name(_REPLACED)(self, changes)
+        return made
+
     @property
     def channel_counts(self) -> Counter[str]:
         """Numbers of channels that are wired, by the amplifier's name."""
@@ -108,6 +131,7 @@ MAY_DIFFER = {
     "Rig.limits": "patterns are held to those of the rig in service, whenever they are played",
     "Rig.outputs": "an amplifier that says otherwise is refused when it is opened",
     "Rig.supports": "which of the masses have a name, not what they weigh",
+    "Rig.document": "all that it says is in the other fields",
     "Rig.laminate": "all that is solved of it is in the plate",
     "Material.name": "displayed only",
 }

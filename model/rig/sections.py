@@ -3,12 +3,10 @@
 Bounds are wide: they catch values in the wrong unit.
 """
 
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -47,7 +45,7 @@ from model.rig.key_types import (
     check_threshold,
     check_url,
 )
-from model.rig.uncertainty import Uncertainty
+from model.rig.uncertainty import BOUNDS, Uncertainty
 from model.structure.materials import material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 
@@ -275,43 +273,39 @@ class AmplifierSection(Section):
     """What it plays at level 1."""
 
 
-class UncertaintySection(Section):
-    """Standard deviations of a rig's parameters, see `Uncertainty`; a key left out means none."""
+def _within(key: str) -> Quantity:
+    """The bounds of a parameter of an `Uncertainty`."""
+    return Quantity(RATIO, at_least=BOUNDS[key][0], at_most=BOUNDS[key][1])
 
-    gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+
+class UncertaintySection(Section):
+    """Standard deviations of a rig's parameters, with the defaults and bounds of `Uncertainty`."""
+
+    gain: Annotated[float, _within("gain")] = Uncertainty.gain
     """Gain of each channel, relative."""
 
-    phase_deg: Annotated[float, Quantity(RATIO, at_least=0, at_most=60)] = 0.0
+    phase_deg: Annotated[float, _within("phase_deg")] = Uncertainty.phase_deg
     """Phase of each channel, in degrees."""
 
-    thickness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.03)] = 0.0
+    thickness: Annotated[float, _within("thickness")] = Uncertainty.thickness
     """Of the plate, relative."""
 
-    stiffness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    stiffness: Annotated[float, _within("stiffness")] = Uncertainty.stiffness
     """Of each ERA, relative."""
 
-    damping: Annotated[float, Quantity(RATIO, at_least=1, at_most=4)] = 1.0
+    damping: Annotated[float, _within("damping")] = Uncertainty.damping
     """A factor, of the ERAs' damping and, independently, of the plate's loss factor."""
 
-    fingertip: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 0.0
+    fingertip: Annotated[float, _within("fingertip")] = Uncertainty.fingertip
     """Of the natural logarithm of each finger's load."""
 
-    common_gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    common_gain: Annotated[float, _within("common_gain")] = Uncertainty.common_gain
     """Gain of all channels together, relative: of levels only."""
 
-    field: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    field: Annotated[float, _within("field")] = Uncertainty.field
     """Of the acceleration at a finger by each ERA, relative to its root mean square over the plate:
     what no other key says of the plate.
     """
-
-
-def _mapping(value: object) -> object:
-    if value is None:
-        raise ValueError(
-            "must be a mapping of `key: value` lines, got null; remove the key for a rig that was "
-            "not measured, or write {} for one that is known exactly"
-        )
-    return value
 
 
 class FingertipSection(Section):
@@ -410,9 +404,7 @@ class RigSection(Section):
     limits: LimitsSection = LimitsSection()
     """Limits of commands, see [limits](#limits)."""
 
-    uncertainty: Annotated[UncertaintySection, BeforeValidator(_mapping)] = UncertaintySection(
-        **asdict(Uncertainty())
-    )  # of a rig that was not measured
+    uncertainty: UncertaintySection = UncertaintySection()
     """How well the rig is known, see [uncertainty](#uncertainty)."""
 
     fingertip: FingertipSection | Literal["none"] = FingertipSection()

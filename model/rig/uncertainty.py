@@ -1,12 +1,24 @@
 """How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it."""
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 
 from model.arguments import expect_between
 
+BOUNDS = {
+    "gain": (0.0, 0.5),
+    "phase_deg": (0.0, 60.0),
+    "thickness": (0.0, 0.03),
+    "stiffness": (0.0, 0.5),
+    "damping": (1.0, 4.0),
+    "fingertip": (0.0, 1.0),
+    "common_gain": (0.0, 0.5),
+    "field": (0.0, 0.5),
+}
+"""What a rig may state of each parameter: exactly known, and the most."""
+
 MAX_UNCERTAINTY = 1000.0
-"""Of any of them; what a rig file may state is less."""
+"""Of any of them, also in a study of plates beyond BOUNDS."""
 
 
 @dataclass(frozen=True)
@@ -32,24 +44,31 @@ class Uncertainty:
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
-        for key in (each.name for each in fields(self)):
-            least = 1.0 if key == "damping" else 0.0
-            value = getattr(self, key)
-            expect_between(value, least, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
+        for key, (exact, _) in BOUNDS.items():
+            expect_between(getattr(self, key), exact, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
 
     @classmethod
     def none(cls) -> "Uncertainty":
         """A rig whose every parameter is known exactly."""
-        return cls(0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+        return cls(**{key: exact for key, (exact, _) in BOUNDS.items()})
+
+    @classmethod
+    def clipped(cls, **estimates: float) -> "Uncertainty":
+        """An uncertainty by estimates, each brought within BOUNDS."""
+        return cls(
+            **{
+                key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])
+                for key, value in estimates.items()
+            }
+        )
 
     @property
     def exactly_known(self) -> tuple[str, ...]:
         """Keys of the parameters that are taken as none, though a plate that is built has some."""
-        none, built = Uncertainty.none(), Uncertainty()
         return tuple(
             key
-            for key, value in asdict(self).items()
-            if value == getattr(none, key) != getattr(built, key)
+            for key, (exact, _) in BOUNDS.items()
+            if getattr(self, key) == exact != getattr(Uncertainty, key)
         )
 
     @property

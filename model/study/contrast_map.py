@@ -1,7 +1,7 @@
 """Contrast from every place of the plate to given quiet fingers."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from model.files.csv_file import Columns, as_frame
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
+from model.progress import Progress, unseen
 from model.study.weak_cells import contrasts_of
 from model.table.table import LocalizationTable
 
@@ -71,7 +72,7 @@ def map_contrast(
     drive_modes: Sequence[str] = (),
     level_db_sl: float = STRONG_DB_SL,
     grid: Grid | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Progress = unseen,
 ) -> ContrastMap:
     """Ask a table for a finger at every place of a grid, by default its cells.
 

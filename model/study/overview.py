@@ -1,6 +1,6 @@
 """What a table reaches: cells of its map, felt contrast of random contacts, their summary."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +11,7 @@ from model.answer.fingers import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, highest_measured
+from model.progress import Progress, unseen
 from model.study.random_contacts import random_contacts
 from model.study.weak_cells import (
     Contrasts,
@@ -41,7 +42,7 @@ class Overview:
 def find_overview(
     table: LocalizationTable,
     *,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Progress = unseen,
 ) -> Overview:
     """Query a table for its map and its contact sets; takes a second, five with sixteen ERAs.
 

@@ -1,11 +1,11 @@
 """The check of a table by what is measured, by the package that knows sound cards."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Protocol
 
+from model.progress import Progress
 from model.rig.rig import Channel, Rig
 from model.study.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable
@@ -38,7 +38,7 @@ class TableCheck(Protocol):
         rig: Rig,
         settings: CheckSettings,
         *,
-        progress: Callable[[int, int], None],
+        progress: Progress,
     ) -> MeasuredVerification:
         """Raises InputError, LinkError."""
 
@@ -52,7 +52,7 @@ def check_by_measuring(
     rig: Rig,
     settings: CheckSettings,
     *,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> MeasuredVerification:
     """Measure promises by the sound card's check."""
     check: TableCheck = resolve_name(_CHECK)

@@ -12,7 +12,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,6 +28,7 @@ from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.finger.perception import contrast_db, decibels, detection_threshold
+from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
@@ -221,7 +222,7 @@ def verify_table(
     *,
     samples: int = 12,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Progress = unseen,
 ) -> Verification:
     """Recompute content and answers to random contacts, with 1, 2, 3 quiet ones in turn.
 

@@ -24,6 +24,7 @@ from model.files.array_file import Arrays
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.processes import on_processes
+from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json
@@ -107,6 +108,7 @@ def build_table(
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Build the localization table of a rig.
 
@@ -115,7 +117,8 @@ def build_table(
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
-    return solve_table(TableProblem(rig, frequencies, grid), drive_mode=drive_mode)
+    problem = TableProblem(rig, frequencies, grid)
+    return solve_table(problem, drive_mode=drive_mode, progress=progress)
 
 
 def solve_table(
@@ -123,7 +126,7 @@ def solve_table(
     *,
     drive_mode: str,
     workers: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> LocalizationTable:
     """Solve modes and discretisation error by several processes.
 
@@ -210,6 +213,7 @@ def cached_table(
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
+    progress: Progress = unseen,
 ) -> tuple[LocalizationTable, Path | None]:
     """Return a rig's table from the user's cache folder, built if it is not there, and its file.
 
@@ -223,7 +227,7 @@ def cached_table(
         folder = cache_folder()
     except OSError as error:
         _logger.warning("table cache: table not kept for the next run: %s", error)
-        return solve_table(problem, drive_mode=drive_mode), None
+        return solve_table(problem, drive_mode=drive_mode, progress=progress), None
     path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
     try:
         table = load_table(path, rig=rig)
@@ -234,7 +238,7 @@ def cached_table(
         with suppress(OSError):
             os.utime(path)
         return table, path
-    table = solve_table(problem, drive_mode=drive_mode)
+    table = solve_table(problem, drive_mode=drive_mode, progress=progress)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         save_table(table, path)

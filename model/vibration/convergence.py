@@ -8,7 +8,7 @@ plate, which are solved in a tenth of the time of elements as accurate or less (
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
 from model.fem.mesh import Mesh
+from model.progress import Progress, unseen
 from model.reduction.free_modes import SpectralModes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
@@ -112,7 +113,7 @@ def study_convergence(
     meshes: Sequence[PlateMesh],
     *,
     frequencies: Sequence[float] | FloatArray,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Progress = unseen,
 ) -> Convergence:
     """Solve a rig on each mesh and on the reference.
 

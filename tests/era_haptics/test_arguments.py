@@ -14,12 +14,24 @@ RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
 PLATE, DRIVE, TARGET = era.SolvedPlate(RIG), {"SW": 110}, (0.08, 0.06)
 ANSWER = era.query(small_table(), TARGET)
 
+SHEET = era.Plate(length=0.3, width=0.2, thickness="2 mm", material="aluminium")
+SPRING = era.Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)
+
 GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.load_rig: {"path": era.example_rig_path(), "mesh": "12x9"},
     era.example_rig_path: {},
+    era.rig: {
+        "plate": SHEET, "eras": {"SW": SPRING}, "amplifiers": {"main": {"url": "sim://"}},
+        "masses": {}, "mesh": "auto", "limits": {}, "uncertainty": era.Uncertainty(),
+        "fingertip": era.Fingertip(), "threshold": "vibrotactile-probe",
+    },
+    era.save_rig: {"rig": RIG, "path": "rig.yaml"},
     era.load_table: {"path": "t.npz", "rig": RIG},
     era.save_table: {"table": None, "path": "t.npz"},
-    era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
+    era.table: {
+        "rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3),
+        "progress": print,
+    },
     era.query: {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "phased",
         "duration": 0.04,
@@ -27,17 +39,18 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.measures: {"table": None, "answer": ANSWER},
     era.contrast_map: {
         "table": None, "quiet": TARGET, "drive_modes": ["phased"], "level_db_sl": 20.0,
-        "grid": era.Grid(2, 2),
+        "grid": era.Grid(2, 2), "progress": print,
     },
     era.answer: {
         "table": None, "fingers": [era.Finger(TARGET, era.Stimulus())],
         "quiet": [era.Finger((0.2, 0.1))], "drive_mode": "phased", "apart_hz": 30.0,
     },
-    era.calibrate: {"rig": RIG, "measured": "measured.csv"},
+    era.calibrate: {"rig": RIG, "measured": "measured.csv", "progress": print},
     era.design: {
-        "rig": RIG, "eras": 4, "layouts": "random:3", "where": "edge",
-        "contacts": "contacts.yaml", "contents": 1, "apart": 0.03, "lowest": 20.0, "finalists": 1,
-        "starts": 1, "seed": 0, "workers": 1,
+        "rig": RIG, "eras": [4], "layouts": "random:3", "keep": ["SW"], "where": "edge",
+        "contacts": "contacts.yaml", "contents": 1, "apart": 0.03, "lowest": 20.0,
+        "stiffness": [17e3], "finalists": 1, "starts": 1, "seed": 0, "workers": 1,
+        "cluster": "tcp://127.0.0.1:1", "progress": print,
     },
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},

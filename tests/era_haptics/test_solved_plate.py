@@ -260,7 +260,7 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     """Judged ones first, in the order of their contrast, then by score, unsupported ones last."""
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
-    found = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2)
+    found = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2).layouts
     assert len(found) == 8
     contrasts = [each.contrast for each in found]
     assert contrasts[2:] == [None] * 6

@@ -48,7 +48,7 @@ def test_calibration_finds_the_true_parameters(rig: Rig, measured: Path, tmp_pat
     files = (example_rig_path(), measured / "measured.csv", "-o", new)
     result = CliRunner().invoke(app, ["calibrate", *map(str, files), "--mesh", MESH, "--json"])
     assert result.exit_code == 0, result.output
-    told = json.loads(result.output)
+    told = json.loads(result.stdout)
     truth = perturbed(rig)
     wanted = [truth.plate.material.E, truth.plate.loss_factor]
     wanted += [v for era in truth.eras for v in (era.stiffness, era.damping, era.bolt_mass)]

@@ -252,8 +252,8 @@ async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
 
 @beside_a_process
 async def test_plate_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
-    """With a thickness to 2 % answers stay as built, and the cause says so."""
-    async with learning_bench(tmp_path, uncertainty="uncertainty: {thickness: 2 %}\n") as bench:
+    """With the thickness of a drawing, to 2 %, answers stay as built, and the cause says so."""
+    async with learning_bench(tmp_path, uncertainty="uncertainty: {}\n") as bench:
         found = await bench.until("only_alarms")
         assert "thickness" in found.cause
         found = await bench.patterns(1)

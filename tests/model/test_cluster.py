@@ -11,7 +11,7 @@ import pytest
 
 from model import cluster
 from model.choice import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
-from model.cluster import check_address, on_cluster
+from model.cluster import on_cluster
 from model.errors import InputError
 from model.quantities import in_display_unit, percent, with_error
 
@@ -93,7 +93,7 @@ def test_cluster_without_scheduler_is_refused(monkeypatch) -> None:
 def test_address_that_dask_would_hang_over_is_refused(text: str) -> None:
     """It never reaches Dask."""
     with pytest.raises(InputError, match="dask scheduler"):
-        check_address(text)
+        dict(on_cluster(text, divmod, 1, TASKS))
 
 
 def test_every_worker_checks_its_code() -> None:

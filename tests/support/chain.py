@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self, cast
 
 from controller.play.loop import Controller
-from controller.play.observer import Observer, PlayReport, SilenceReport
+from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values
@@ -82,17 +82,15 @@ class Chain:
         """Make a control loop in place of the one before, if any; more: as a `Controller` takes."""
         controller = self.controller = self.make_controller(**more)
         self.witness.follow(controller)
-        controller.step = partial(self._turn, controller.step)  # type: ignore[method-assign]
+        cycle = controller.cycle
+        cycle.step = partial(self._turn, cycle.step)  # type: ignore[method-assign]
         self.turning.set()
-        controller.observers.append(
-            Observer(
-                contacts_changed=lambda contacts, change: self.contacts.append(len(contacts)),
-                pattern_applied=self.applied.append,
-                silenced=self.silenced.append,
-                refused=self.refused.append,
-                link_lost=self.lost.append,
-            )
-        )
+        loop = cycle.observers
+        loop.contacts_changed.append(lambda contacts, change: self.contacts.append(len(contacts)))
+        loop.pattern_applied.append(self.applied.append)
+        loop.silenced.append(self.silenced.append)
+        loop.refused.append(self.refused.append)
+        loop.link_lost.append(self.lost.append)
 
     async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
         """Turn the control loop once, unless it stalls."""
@@ -124,6 +122,7 @@ class Chain:
         sensed_every: float = STEP,
         capabilities: Mapping[str, int] = MappingProxyType({}),
         seed: int = 1,
+        observe: Callable[[Observers], None] = lambda loop: None,
         **options: Any,
     ) -> AsyncIterator[Self]:
         """A chain whose wires are not open yet; wires: of all amplifiers, or of each by name.
@@ -131,7 +130,8 @@ class Chain:
         passing [s]: shortest and longest time of bytes on serial lines, None for those of machines;
         plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
         `witness_config`; sensed_every [s]: while a channel vibrates; capabilities: what each
-        amplifier has in place of its own; seed: of faults; options: as a `Controller` takes them.
+        amplifier has in place of its own; seed: of faults; observe: adds the first observers of
+        the control loop; options: as a `Controller` takes them.
         """
         far_end = far_side(wires, plate or rig, seed=seed, imperfections=imperfections)
         async with far_end as far:
@@ -144,7 +144,9 @@ class Chain:
 
             def make(**more: Any) -> Controller:
                 own = {"intent_source": BuzzNewestContact(), **given, **more}
-                return Controller(rig, table, lines=Lines, urls=far.urls, **own)
+                controller = Controller(rig, table, lines=Lines, urls=far.urls, **own)
+                observe(controller.cycle.observers)
+                return controller
 
             assert far.machine is not None
             far.machine.passing = passing or far.machine.passing
@@ -189,7 +191,7 @@ class Chain:
 
     def run(self) -> None:
         """Start the control loop."""
-        self.running = asyncio.create_task(self.controller.run())
+        self.running = asyncio.create_task(self.controller.cycle.run())
 
     async def operate(self, command: OperatorCommand) -> Any:
         """Carry out an operator's command; returns what the control loop says of it."""
@@ -209,7 +211,7 @@ class Chain:
     def deliver(self, frame: TouchFrame, *, must_be_felt: bool = False) -> None:
         """Deliver a frame to the judges, then to the control loop."""
         self.plate_judge.touched(frame, must_be_felt=must_be_felt)
-        self.controller.deliver(frame)
+        self.controller.cycle.deliver(frame)
 
     def put(self, *fingers: Finger, ago: float = 0.0) -> None:
         """Have these fingers in place of all that are down, and report them."""

@@ -193,19 +193,22 @@ class Acted(Taken, Chain):
         self.table.excitation = {era: Tone(*tone) for era, tone in tones.items()}
 
     def fails(self, *methods: str) -> None:
-        """Let methods of the control loop fail from now on."""
+        """Let methods of the controller, or of its cycle, fail from now on."""
 
         def fail(*_: object) -> None:
             raise Planted(*methods)
 
         for method in methods:
-            self.whole[method] = getattr(self.controller, method)
-            setattr(self.controller, method, fail)
+            self.whole[method] = getattr(self._owner(method), method)
+            setattr(self._owner(method), method, fail)
 
     def works(self, *methods: str) -> None:
         """Let methods that fail work again."""
         for method in methods:
-            setattr(self.controller, method, self.whole.pop(method))
+            setattr(self._owner(method), method, self.whole.pop(method))
+
+    def _owner(self, method: str) -> object:
+        return self.controller.cycle if method == "step" else self.controller
 
     async def is_late_for(self, kind: str, seconds: float) -> None:
         """Wait for a request of a kind; its reply, and those after it, leave so much later."""

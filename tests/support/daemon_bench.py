@@ -173,7 +173,7 @@ def chain_of(daemon: Daemon, far: FarSide) -> Chain:
     witness = LoopWitness(far.urls)
     chain = Chain(far, far.machine, witness, PlateJudge(far, witness), lambda: daemon._controller)
     touched = partial(chain.plate_judge.touched, must_be_felt=False)
-    for owner, method in ((daemon._controller, "deliver"), (daemon._inputs, "_deliver")):
+    for owner, method in ((daemon._controller.cycle, "deliver"), (daemon._inputs, "_deliver")):
         tell_first(owner, method, touched)
     for device in far.devices.values():
         tell_first(device, "inject_fault", lambda *_: witness.disturb())

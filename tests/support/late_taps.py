@@ -68,8 +68,7 @@ class Clicks:
             if pulse is None or now < pulse.end:
                 targets.append(Target(contact.key, pulse=pulse))
                 ends.append(math.inf if pulse is None else pulse.end)
-        until = min(ends, default=math.inf)
-        return HapticIntent(tuple(targets), until=None if until == math.inf else until)
+        return HapticIntent(tuple(targets), until=min(ends, default=math.inf))
 
 
 def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counter[str]:
@@ -113,7 +112,7 @@ def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counte
                     counts[f"{wire}, {amplifiers}, seed {seed}: {name} is not silent"] += 1
             counts["clicks"] = len(clicks.pulses)
             counts["played"] = sum(each.started_at is not None for each in clicks.pulses)
-            counts["too late"] = chain.controller.clicks_too_late
+            counts["too late"] = chain.controller.cycle.clicks_too_late
             await chain.close()
             found = chain.plate_judge.violations
             counts.update(f"{wire}, {amplifiers}, seed {seed}: {one}" for one in found)

@@ -24,6 +24,7 @@ from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.playing.contents import Layer
+from model.answer.answer import Limits
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
@@ -93,8 +94,7 @@ def playable(layers: int = 8) -> PlaybackCapabilities:
     return PlaybackCapabilities(
         "phased",
         ("phased",),
-        (40.0, 320.0),
-        {era.name: era.stroke for era in table().eras},
+        Limits((40.0, 320.0), table().strokes),
         RAMPS_ONLY,
         layers=layers,
     )
@@ -124,11 +124,11 @@ class Fingers(Chain):
         """Play an effect at a finger, as a client does."""
         (contact,) = [each for each in self.applied[-1].contacts if each.key.id == id]
         self.player.play(effect, contact, clock.now(), level_db_sl=None)
-        self.controller.request_update()
+        self.controller.cycle.request_update()
 
     def refuse(self, why: str, is_refused: Callable[[Sequence[Layer]], bool]) -> list[float]:
         """Let the ledger refuse some layers for a reason; returns when [s] it does."""
-        layers, refused = self.controller._planner.layers, list[float]()
+        layers, refused = self.controller.cycle.planner.layers, list[float]()
         check = layers.check
 
         def refuse(asked: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:

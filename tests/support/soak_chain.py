@@ -15,7 +15,7 @@ from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Trigger
-from controller.play.observer import Observer, PlayReport
+from controller.play.observer import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.judge.watching.config import TimeLimits
@@ -202,13 +202,11 @@ class Soak(Chain):
             link_changed=self._link_changed,
             alive=lambda: None,
         )
-        super().make_host(connected=supervisor.connected, observer=supervisor.observer())
-        self.controller.observers.append(
-            Observer(
-                pattern_applied=self._applied,
-                refused=lambda why: self.note("observer refused", why),
-            )
-        )
+        super().make_host(connected=supervisor.connected)
+        loop = self.controller.cycle.observers
+        supervisor.observe(loop)
+        loop.pattern_applied.append(self._applied)
+        loop.refused.append(lambda why: self.note("observer refused", why))
         supervisor.controller = self.controller
 
     async def open(self) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Lease, Trigger
-from controller.play.observer import Observer
 from courses import Acted, Planted, Step
 from drivers.errors import LinkError
 from registry import clock
@@ -132,15 +131,12 @@ async def watched(
         link_changed=lambda event, lost, message: heard("links", event),
         alive=lambda: heard("alive", clock.now()),
     )
-    options = {"connected": supervisor.connected, "observer": supervisor.observer(), **options}
+    options = {"connected": supervisor.connected, "observe": supervisor.observe, **options}
     async with set_chain(*amplifiers, of=Watched, **options) as daemon:
         daemon.supervisor, supervisor.controller = supervisor, daemon.controller
-        daemon.controller.observers.append(
-            Observer(
-                cycle_completed=lambda: heard("cycles", clock.now()),
-                refused=lambda reason: heard("refused", reason),
-            )
-        )
+        loop = daemon.controller.cycle.observers
+        loop.cycle_completed.append(lambda: heard("cycles", clock.now()))
+        loop.refused.append(lambda reason: heard("refused", reason))
         if refuses:
             daemon.refuse("GetCaps")
         if unplugged:

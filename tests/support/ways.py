@@ -21,7 +21,6 @@ from typing import Any
 
 import pytest
 
-from controller.play.observer import Observer
 from controller.sources import tuio
 from controller.sources.touch import Touch, TouchFrame
 from daemon_bench import daemon_table, ready_daemon
@@ -83,8 +82,7 @@ async def _touched(folder: Path) -> Way:
                 loop.seen = seen
                 played.set()
 
-            observer = Observer(pattern_applied=applied)
-            bench.daemon._controller.observers.append(observer)
+            bench.daemon._controller.cycle.observers.pattern_applied.append(applied)
             coming = datagram(_RESTING, _COMING)
             with recorder:
                 loop.call_soon(received[0], *coming)

@@ -65,7 +65,7 @@ class Scene(Chain):
         """Start the control loop, or let it go on."""
         self.turning.set()
         if self.running is None:
-            self.running = asyncio.create_task(self.tried(self.controller.run()))
+            self.running = asyncio.create_task(self.tried(self.controller.cycle.run()))
 
     def hang(self) -> None:
         """Stall the control loop."""

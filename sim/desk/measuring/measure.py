@@ -10,6 +10,7 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
+from model.progress import Progress, unseen
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import (
@@ -221,7 +222,7 @@ def check_by_steps(
     measured: Measured,
     *,
     level: float,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = unseen,
 ) -> Stepped:
     """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks."""
     known = measured.responses

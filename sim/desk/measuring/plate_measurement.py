@@ -13,9 +13,9 @@ from model.identification.measurement import (
     DeviceSettings,
     MeasuredPlate,
     Measurement,
-    Progress,
     Repeat,
 )
+from model.progress import Progress
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import converters

@@ -11,6 +11,7 @@ from drivers.errors import DriverError, LinkError
 from drivers.playing import contents
 from model.answer.answer import Layer
 from model.arrays import FloatArray
+from model.progress import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
     MeasuredVerification,
@@ -44,7 +45,7 @@ def check_table(
     rig: Rig,
     settings: CheckSettings,
     *,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> MeasuredVerification:
     """Play promises and compare what accelerometers measured.
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.check import layout_check
+from controller.check import layout_check, layout_together
 from controller.check.layout_check import CheckedEffect, check_layout
 from controller.check.representative import strongest_target
 from controller.cli.commands import app
+from controller.cli.main import run as run_era
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
@@ -28,6 +29,7 @@ from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.texture import Texture
 from long_form import in_turn
+from model.config.kinds import KINDS
 from model.config.shapes import Circle, Rectangle
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
@@ -210,6 +212,27 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     assert both["promised_worst_db"] <= min(both["promised_contrast_db"])
     assert {*both["promised_verdicts"]} <= {"own", "mixed", "shared", "held back"}
     assert len(both["at_m"]) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_that_config_init_writes_fit_each_other(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each beside the rig; fingers in any two regions of the layout are promised 8 dB at once."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(layout_check, "MAX_TOUCHES", 20)
+    monkeypatch.setattr(layout_together, "MAX_TRIPLES", 0)
+    assert run_era(["config", "init", "rig.yaml"]) == 0
+    if kind != "rig":
+        assert run_era(["config", "init", f"{kind}.yaml", "--kind", kind]) == 0
+    assert run_era(["config", "check", f"{kind}.yaml"]) == 0
+    if kind == "layout":
+        assert run_era(["table", "build", "rig.yaml", "-o", "table.npz"]) == 0
+        capsys.readouterr()
+        assert run_era(["layout", "check", "layout.yaml", "table.npz", "--json"]) == 0
+        together = json.loads(capsys.readouterr().out)["promised_together"]
+        assert len(together) == 10
+        assert min(each["promised_worst_db"] for each in together) >= 8
 
 
 def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:

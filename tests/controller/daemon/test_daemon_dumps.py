@@ -33,10 +33,10 @@ async def fails_in_the_loop(bench: DaemonBench, era: AsyncClient) -> None:
     """Let a turn of the control loop fail once."""
 
     def fail() -> bool:
-        del vars(bench.daemon._controller._wake)["clear"]
+        del vars(bench.daemon._controller.cycle._wake)["clear"]
         raise Planted("in the loop")
 
-    vars(bench.daemon._controller._wake)["clear"] = fail
+    vars(bench.daemon._controller.cycle._wake)["clear"] = fail
 
 
 async def reports_a_fault(bench: DaemonBench, era: AsyncClient) -> None:

@@ -157,7 +157,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
     async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
         asked = answers_take(monkeypatch, 1e6)
         async with holding(era, LEFT, RIGHT):
-            await until(lambda: bench.daemon._controller._tracker.contacts)
+            await until(lambda: bench.daemon._controller.cycle.tracker.contacts)
             assert await said(era) == {"ready: arm first (era arm)"}
             await era.arm("test", lease_s=60)
             await until(lambda: asked)
@@ -176,7 +176,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
             await until_state(era, READY)
             await era.arm("test", lease_s=60)
             assert len(asked) == 1
-        await until(lambda: not bench.daemon._controller._tracker.contacts)
+        await until(lambda: not bench.daemon._controller.cycle.tracker.contacts)
         await until(lambda: not any(bench.far.summary().levels))
         assert (await era.status()).silence_reason == NO_CONTACTS
         async with holding(era, LEFT, far=bench.far):  # one alone needs no thread

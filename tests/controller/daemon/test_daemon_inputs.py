@@ -36,7 +36,7 @@ async def test_touches_of_clients_are_delivered_in_places_of_the_sensor(tmp_path
     """Shares of a plate of 0.3048 by 0.2286 m, from its north-west corner, by client and source."""
     frames: list[TouchFrame] = []
     async with ready_daemon(tmp_path) as (bench, one), await bench.client() as other:
-        tell_first(bench.daemon._controller, "deliver", frames.append)
+        tell_first(bench.daemon._controller.cycle, "deliver", frames.append)
         await one.touch([(0.0762, 0.1143), (0.2286, 0.05715)], source="me")
         await other.touch([(0.1, 0.1)], source="me")
         touched, second = frames
@@ -54,7 +54,7 @@ async def test_fingers_of_a_leaving_client_are_lifted(
 ) -> None:
     """At once, of every source but one where that fails, which times out; others' stay."""
     async with ready_daemon(tmp_path) as (bench, era):
-        tracker = bench.daemon._controller._tracker
+        tracker = bench.daemon._controller.cycle.tracker
         update = tracker.update
 
         def failing(frame: TouchFrame, **options: bool) -> Change:
@@ -289,7 +289,7 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
         await era.arm("me", lease_s=60)
         begin = clock.now()
         for ago, touches in ((0.12, (Touch(1, 0.4, 0.5),)), (0.06, ())):
-            bench.daemon._controller.deliver(TouchFrame("brief", begin - ago, touches))
+            bench.daemon._controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)
 

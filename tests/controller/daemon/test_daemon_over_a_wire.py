@@ -246,9 +246,9 @@ async def test_daemon_plays_effects_by_region_and_by_name(
                 refused = era.play(effect, place, level_db_sl=level)
                 assert await error_code(refused) is ErrorCode.REFUSED
             decided: list[bool] = []
-            request_update = bench.daemon._controller.request_update
+            request_update = bench.daemon._controller.cycle.request_update
             monkeypatch.setattr(
-                bench.daemon._controller,
+                bench.daemon._controller.cycle,
                 "request_update",
                 lambda: (decided.append(True), request_update()),
             )

@@ -23,7 +23,7 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.play.content import Prediction, not_served
-from controller.play.observer import PlayReport, SilenceReport
+from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
@@ -170,21 +170,23 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
     rows: list[TouchRow] = []
     near, down, later, last = (contact(number) for number in range(4))
     async with recorder_of(rows) as recorder:
-        observer = recorder.observer
-        observer.contacts_changed((near,), Change(down=(near,)))
+        loop = Observers()
+        recorder.observe(loop)
+        (changed,), (silence,) = loop.contacts_changed, loop.silenced
+        changed((near,), Change(down=(near,)))
         reason = "too close to an edge"
         silenced = SilenceReport((near,), (not_served(near, reason),), reason, None, clock.now())
-        observer.silenced(silenced)
-        observer.contacts_changed((), Change(up=(near,)))
-        observer.contacts_changed((down,), Change(down=(down,)))
+        silence(silenced)
+        changed((), Change(up=(near,)))
+        changed((down,), Change(down=(down,)))
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
-        observer.contacts_changed((), Change(up=(down,)))
-        observer.contacts_changed((later,), Change(down=(later,)))
-        observer.contacts_changed((), Change(up=(later,)))
+        changed((), Change(up=(down,)))
+        changed((later,), Change(down=(later,)))
+        changed((), Change(up=(later,)))
         assert recorder.fault == FAULT
         recorder.armed()
-        observer.contacts_changed((last,), Change(down=(last,)))
-        observer.contacts_changed((), Change(up=(last,)))
+        changed((last,), Change(down=(last,)))
+        changed((), Change(up=(last,)))
     reasons = [row.reason for row in rows]
     assert reasons[:3] == ["too close to an edge", FAULT, FAULT]
     assert reasons[3] != FAULT
@@ -205,9 +207,11 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
         return {}
 
     async with recorder_of([], vibration) as recorder:
-        observer, start = recorder.observer, clock.now()
+        start, loop = clock.now(), Observers()
+        recorder.observe(loop)
+        (changed,), (applied_now,) = loop.contacts_changed, loop.pattern_applied
         finger = contact(1)
-        observer.contacts_changed((finger,), Change(down=(finger,)))
+        changed((finger,), Change(down=(finger,)))
         for quiet in ((), (contact(2),), (contact(2),)):
             applied = SimpleNamespace(
                 time=clock.now(),
@@ -216,11 +220,11 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
                 quiet=quiet,
                 from_rest=True,
             )
-            observer.pattern_applied(cast(PlayReport, applied))
+            applied_now(cast(PlayReport, applied))
             await asyncio.sleep(1.0)
             for _ in range(8):
                 finger = replace(finger, x=finger.x + 0.004)
-                observer.contacts_changed((finger,), Change(moved=(finger,)))
+                changed((finger,), Change(moved=(finger,)))
                 await asyncio.sleep(0.1)
     assert windows == [
         pytest.approx((start + since, start + until))

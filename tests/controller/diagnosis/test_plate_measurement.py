@@ -93,12 +93,12 @@ async def measured(
     far: FarSide,
     *,
     is_quick: bool = True,
-    on_step: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> MeasuredPlate:
     """Measure a rig at a far side; then all its amplifiers are silent and disarmed."""
     try:
         return await PlateSelfMeasurement(
-            rig, Lines, far.urls, is_quick=is_quick, on_step=on_step
+            rig, Lines, far.urls, is_quick=is_quick, progress=progress
         ).run()
     finally:
         far.summary()
@@ -159,7 +159,7 @@ def test_interrupted_measurement_ends_silent(is_cancelled: bool, rig: Rig, truth
                 if done == 2:
                     task.cancel()
 
-            task = asyncio.create_task(measured(rig, far, on_step=interrupt))
+            task = asyncio.create_task(measured(rig, far, progress=interrupt))
             with pytest.raises(asyncio.CancelledError if is_cancelled else ZeroDivisionError):
                 await task
 

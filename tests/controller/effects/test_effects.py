@@ -1,6 +1,7 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
 import inspect
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ class At:
     """What fingers feel at a time [s]: levels [dB SL] by their ids.
 
     played: an effect that is requested by name before, and its finger; level: the requested one.
-    until: when the intent expires, None for never, if it is looked at. starts: whether what is
+    until: when the intent expires, infinite for never, if it is looked at. starts: whether what is
     short starts to play. layouts: how often the layout is replaced by itself before. says: what
     is found in the reason for what is not felt.
     """
@@ -52,7 +53,7 @@ class At:
     fingers: Sequence[Contact]
     played: tuple[str, Contact] | None = None
     level: float | None = None
-    until: float | EllipsisType | None = ...
+    until: float | EllipsisType = ...
     starts: bool = True
     layouts: int = 0
     says: str = ""
@@ -99,7 +100,7 @@ SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
             At(10.06, {1: 18.0}, [ONE], until=10.09),
             At(10.089, {1: 18.0}, [ONE]),
             At(10.0901, {}, [ONE]),
-            At(10.1, {}, [ONE], until=None, says="click"),
+            At(10.1, {}, [ONE], until=math.inf, says="click"),
             At(10.2, {2: 18.0}, [finger(2)], says="^(?!.*click)"),
         ],
     ),
@@ -127,7 +128,7 @@ SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
         SurfaceLayout(),
         [
             At(0.0, {1: 20.0}, [ONE]),
-            At(100.0, {1: 20.0}, [ONE], until=None),
+            At(100.0, {1: 20.0}, [ONE], until=math.inf),
             At(101.0, {}, []),
             At(102.0, {1: 20.0}, [ONE]),
         ],
@@ -185,7 +186,7 @@ SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
             At(1.03, {}, [finger(1, 0.056), TWO], until=1.06),
             At(1.0601, {2: 20.0}, [finger(1, 0.056), TWO]),
             At(1.07, {2: 20.0}, [finger(1, 0.056), TWO], until=1.1001),
-            At(1.1002, {}, [finger(1, 0.056), TWO], until=None),
+            At(1.1002, {}, [finger(1, 0.056), TWO], until=math.inf),
         ],
     ),
     # The second and the third wait, and play for their whole duration.
@@ -474,7 +475,7 @@ def test_player_invariants_for_any_movement(
         assert first == again
         assert {target.key for target in first.targets} <= {each.key for each in contacts}
         assert len({target.key for target in first.targets}) == len(first.targets)
-        assert first.until is None or first.until > now
+        assert first.until > now
 
 
 @pytest.mark.parametrize(

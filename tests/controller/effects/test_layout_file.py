@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.effects.band import TunedSection
 from controller.effects.click import Click
 from controller.effects.detents import Detents
-from controller.effects.effect import Effect
+from controller.effects.effect import Effect, TunedSection
 from controller.effects.layout_file import LayoutSection, RegionSection, load_layout
 from key_tables import key_rows
 from model.config.document import ConfigError
@@ -27,14 +26,14 @@ def test_load_layout_reads_the_example() -> None:
         "tuner",
         "patch",
     ]
-    keypad, slider, _, _, patch = layout.regions
+    keypad, slider, _, tuner, patch = layout.regions
     shape = keypad.shape
     assert isinstance(shape, Rectangle)
-    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.02, 0.02, 0.1, 0.08))
+    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.23, 0.12, 0.04, 0.03))
     assert (keypad.on_press, keypad.on_release, keypad.has_level) == ("click", "soft", False)
     assert (patch.has_level, patch.level_db_sl) == (True, None)
-    assert (slider.priority, slider.band) == (1, (160.0, 260.0))
-    assert layout.effects["turn"].tuned_band == (200.0, 200.0)
+    assert (slider.priority, slider.band) == (1, (100.0, 400.0))
+    assert tuner.band == (60.0, 300.0)
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None

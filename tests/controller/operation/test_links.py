@@ -74,7 +74,8 @@ async def test_loss_is_handled_before_reopening_when_found_twice() -> None:
     """By a command and by the control loop, while the command still stops other amplifiers."""
     async with watched() as daemon:
         controller, opened = daemon.controller, list[bool]()
-        release, open_again, step = controller.release, controller.open, controller.step
+        release, open_again, cycle = controller.release, controller.open, controller.cycle
+        step = cycle.step
 
         async def early_release() -> None:
             assert not opened, "closed after it was reopened"
@@ -85,17 +86,17 @@ async def test_loss_is_handled_before_reopening_when_found_twice() -> None:
             opened.append(True)
 
         async def lost_step() -> None:
-            controller.step = step
-            for each in controller.observers:
-                each.link_lost("wire cut")
+            cycle.step = step
+            for lost in cycle.observers.link_lost:
+                lost("wire cut")
 
         slow_down(controller, stop=0.3)
         controller.release, controller.open = early_release, noted_open
         daemon.fault("unplug")
         stopping = asyncio.create_task(daemon.handle(STOP))
         await asyncio.sleep(0.01)
-        controller.step = lost_step
-        controller.request_update()
+        cycle.step = lost_step
+        cycle.request_update()
         await asyncio.sleep(0.7)  # it stops the others again because of the loss
         daemon.obey()
         await stopping

@@ -109,8 +109,8 @@ def test_capabilities_are_the_tightest_limits() -> None:
     """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
     left = Opened(frequency_min=1000, level_max=5000)
     found = playback_capabilities(rig(), both(left, Opened(frequency_max=6000)))
-    assert found.frequencies == (50.0, 300.0)
-    assert found.max_amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
+    assert found.limits.frequencies == (50.0, 300.0)
+    assert found.limits.amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
 
 
 @pytest.mark.parametrize(

@@ -432,7 +432,7 @@ async def test_an_answer_of_a_former_layout_is_not_played(
         count = len(fingers.applied)
         bands = [replace(region, band=(200.0, 320.0)) for region in LAYOUT.regions]
         fingers.player.replace(replace(LAYOUT, regions=tuple(bands)))
-        fingers.controller.request_update()
+        fingers.controller.cycle.request_update()
         await fingers.hold(0.3)
         (applied,) = fingers.applied[count:]
         assert len(applied.contents) == 2

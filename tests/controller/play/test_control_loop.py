@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.play.observer import Observer
+from controller.play.observer import Observers
 from controller.sources.touch import Touch, TouchFrame
 from courses import Acted, courses, follow
 from drivers.protocol.records import Values
@@ -79,8 +79,11 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
     def fail(*_: object) -> None:
         raise RuntimeError("no disk space for this row")
 
-    observer = Observer(contacts_changed=fail, pattern_applied=fail, silenced=fail)
-    async with set_running(observer=observer) as chain:
+    def observe(loop: Observers) -> None:
+        for callbacks in (loop.contacts_changed, loop.pattern_applied, loop.silenced):
+            callbacks.append(fail)
+
+    async with set_running(observe=observe) as chain:
         await chain.leave(0.01, FINGER)
         await chain.leave(0.2)
         assert [each.is_silent for each in chain.far_end.sent()] == [True, False, True]

@@ -25,7 +25,7 @@ def said(fingers: Fingers) -> dict[int, str | None]:
     silenced = fingers.silenced[-1] if fingers.silenced else None
     if applied and silenced and silenced.time > applied.time:
         applied = None
-    contacts = fingers.controller._tracker.contacts
+    contacts = fingers.controller.cycle.tracker.contacts
     view = PlateView(lambda key: None, contacts, applied or silenced)
     return {each.id: each.held_back for each in view.contact_statuses()}
 
@@ -110,7 +110,7 @@ async def test_all_fingers_of_a_region_feel_its_effect(count: int) -> None:
             fingers.must_be_felt = False
             fingers.at[21] = (0.15, 0.21)
             await fingers.hold(0.1)
-            assert fingers.controller.rejects.counts["too_many"] >= 1
+            assert fingers.controller.cycle.rejects.counts["too_many"] >= 1
             assert len(fingers.applied[-1].contacts) == 20
 
 

@@ -38,27 +38,29 @@ def sums(found: Selection) -> np.ndarray:
     )
 
 
+def within(*, most: float = 1.0, power: float = np.inf) -> PlaybackCapabilities:
+    """Amplifiers that play so much of each stroke, and of the power."""
+    amplitudes = {era.name: most * era.stroke for era in table().eras}
+    return replace(FREE, limits=replace(FREE.limits, amplitudes=amplitudes, power=power))
+
+
 def limited(found: Selection, what: str) -> PlaybackCapabilities:
     """Amplifiers with 80 % of the level, or of the power's root, that contents take.
 
     Those of power play up to half of the level, too.
     """
     if what == "power":
-        half = {name: 0.5 * each for name, each in FREE.max_amplitudes.items()}
         power = float((sums(found) ** 2).sum()) * 0.8**2  # of levels of full stroke
-        return replace(FREE, max_amplitudes=half, max_power=power)
-    most = 0.8 * sums(found).max()
-    return replace(
-        FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}
-    )
+        return within(most=0.5, power=power)
+    return within(most=0.8 * sums(found).max())
 
 
 def is_used(found: Selection, capabilities: PlaybackCapabilities) -> bool:
     """Whether contents are within a limit, and take nearly all of it."""
-    (share,) = {capabilities.max_amplitudes[each.name] / each.stroke for each in table().eras}
-    of_limit = max(
-        sums(found).max() / share, np.linalg.norm(sums(found)) / np.sqrt(capabilities.max_power)
-    )
+    limits = capabilities.limits
+    assert limits.amplitudes is not None
+    (share,) = {limits.amplitudes[each.name] / each.stroke for each in table().eras}
+    of_limit = max(sums(found).max() / share, np.linalg.norm(sums(found)) / np.sqrt(limits.power))
     return bool(0.95 < of_limit < 1.0 + 1e-6)
 
 
@@ -90,8 +92,7 @@ def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
     first, second = Target(CONTACTS[0].key, 14.0, priority=1), Target(CONTACTS[1].key, 14.0)
     content, _ = chosen(FREE, first, second).contents
     most = max(content.layer.excitation[each.name].amplitude / each.stroke for each in table().eras)
-    amplitudes = {name: 1.02 * most * each for name, each in FREE.max_amplitudes.items()}
-    found = chosen(replace(FREE, max_amplitudes=amplitudes), first, second)
+    found = chosen(within(most=1.02 * most), first, second)
     kept, held_back = found.predictions
     assert kept.level_db_sl == pytest.approx(14.0, abs=0.3)
     assert held_back.verdict == "held back"
@@ -102,8 +103,7 @@ def test_contents_that_a_limit_leaves_unfelt_are_held_back() -> None:
     """With 40 dB less than 14 dB SL takes; a level below 0 dB SL from the start is kept."""
     wanted = [Target(each.key, 14.0) for each in CONTACTS]
     most = 0.01 * sums(chosen(FREE, *wanted)).max()
-    amplitudes = {name: most * each for name, each in FREE.max_amplitudes.items()}
-    found = chosen(replace(FREE, max_amplitudes=amplitudes), *wanted)
+    found = chosen(within(most=most), *wanted)
     assert found.contents == ()
     assert all(
         "the limits of the amplifiers" in (each.held_back or "") for each in found.not_served
@@ -134,7 +134,7 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
     free = selector.select(CONTACTS, intent, FREE)
     lasting = np.linalg.norm(sums(replace(free, contents=free.contents[:1])))
     for share, count in ((1.3, 2), (1.001, 1)):
-        capabilities = replace(FREE, max_power=(share * lasting) ** 2)
+        capabilities = within(power=(share * lasting) ** 2)
         found = a_selector().select(CONTACTS, intent, capabilities)
         assert len(found.contents) == count
         assert (
@@ -149,7 +149,7 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
     click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
     lasting = Target(CONTACTS[0].key, 20.0)
     alone = a_selector().select(CONTACTS, HapticIntent((click,)), FREE)
-    hardly = replace(FREE, max_power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
+    hardly = within(power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
     selector = a_selector()
     selector.select(CONTACTS, HapticIntent((click,)), hardly, now=0.0)
     both = HapticIntent((lasting, click))
@@ -168,11 +168,9 @@ def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
     intent = HapticIntent((target,))
     free = a_selector().select(CONTACTS, intent, FREE)
     most = 0.8 * sums(free).max()
-    capabilities = replace(FREE, max_power=0.8**2 * float((sums(free) ** 2).sum()))
+    capabilities = within(power=0.8**2 * float((sums(free) ** 2).sum()))
     if what == "level":
-        capabilities = replace(
-            FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}
-        )
+        capabilities = within(most=most)
     found = a_selector().select(CONTACTS, intent, capabilities)
     assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
     (before,), (after,) = free.predictions, found.predictions

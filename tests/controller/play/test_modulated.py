@@ -160,7 +160,7 @@ def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() 
 
     def content(targets: Targets, frequency: float, voice: int = 0) -> Content:
         pattern = Layer({"SW": Tone(frequency, 1e-6)})
-        return Content(targets, Placement((LEFT,)), pattern, voice=voice)
+        return Content((targets[0][0].key, voice), targets, Placement((LEFT,)), pattern)
 
     voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
     playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
@@ -176,8 +176,9 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
     click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
     pattern = Layer({"SW": Tone(100.0, 1e-6)})
-    lasting = Content(shared, Placement((LEFT,)), pattern)
-    clicking = Content(((contacts[0], click),), Placement((LEFT,)), pattern)
+    lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
+    alone = ((contacts[0], click),)
+    clicking = Content((contacts[0].key, 0), alone, Placement((LEFT,)), pattern)
     playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     contents = {
         number: LayerContent(one, pattern, drive={})

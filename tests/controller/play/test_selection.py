@@ -14,7 +14,7 @@ from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import Answer
+from model.answer.answer import Answer, Limits
 from model.answer.fingers import Finger, Stimulus
 from model.errors import InputError
 from model.structure.plate import Material, Plate
@@ -24,7 +24,7 @@ from set_table import set_answer
 from small_table import small_table
 
 CAPABILITIES = PlaybackCapabilities(
-    "phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, RAMPS_ONLY
+    "phased", ("switched", "phased"), Limits((45.0, 300.0), {"SW": 1e-4}), RAMPS_ONLY
 )
 
 
@@ -139,7 +139,9 @@ def test_selector_asks_for_what_the_neighbours_allow(table: Table) -> None:
 def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
-    capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
+    capabilities = PlaybackCapabilities(
+        "switched", ("switched",), Limits((40.0, 500.0), full), RAMPS_ONLY
+    )
     selection = selector_of(table).select((at(1, 0.1),), wanting(c1=60.0), capabilities)
     (content,) = selection.contents
     assert 12 < selection.predictions[0].level_db_sl < 60
@@ -265,7 +267,7 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) ->
     """Beside 1 µm of 1 µm nothing is left of its stroke: it is said, not played at level zero."""
     pulse = Target(ContactKey("a", 2), 12.0, pulse=Pulse(0.03, requested_at=0.0))
     intent = HapticIntent((Target(ContactKey("a", 1), 12.0), pulse))
-    full = replace(CAPABILITIES, max_amplitudes={"SW": 1e-6}, layers=2)
+    full = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1e-6}), layers=2)
     selection = selector_of(table).select((at(1, 0.1), at(2, 0.2)), intent, full)
     assert [each.targets[0][0].key.id for each in selection.contents] == [1]
     (held,) = selection.not_served
@@ -277,7 +279,7 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
     table: Table, since: float, left: float
 ) -> None:
     """Of 1.6 µm, of which each would take 1 µm: at once, while the first plays, and after it."""
-    limits = replace(CAPABILITIES, max_amplitudes={"SW": 1.6e-6}, layers=2)
+    limits = replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": 1.6e-6}), layers=2)
     selector, contacts = selector_of(table), (at(1, 0.1), at(2, 0.2))
     first, second = (
         Target(ContactKey("a", id), 12.0, pulse=Pulse(0.03, requested_at=requested_at))
@@ -293,8 +295,8 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
 
 
 @pytest.mark.parametrize(
-    ("until", "due"), [(None, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+    ("until", "due"), [(math.inf, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )
-def test_due_of_an_expired_intent_is_later(until: float | None, due: float) -> None:
+def test_due_of_an_expired_intent_is_later(until: float, due: float) -> None:
     """So that it does not keep the loop busy."""
     assert HapticIntent((), until=until).due(5.0) == due

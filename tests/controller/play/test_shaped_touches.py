@@ -298,14 +298,14 @@ async def test_vibration_of_a_finger_that_moves_whenever_the_loop_turns_is_renew
     """By half a millimetre, which changes nothing else: there is no gap."""
     async with set_running() as chain:
         number, x, y = FINGER
-        step, chain.at = chain.controller.step, {number: (x, y)}
+        step, chain.at = chain.controller.cycle.step, {number: (x, y)}
 
         async def turn() -> None:
             await asyncio.sleep(0.002)
             chain.put((number, x + 0.0005 * (chain.at[number][0] == x), y))
             await step()
 
-        chain.controller.step = turn  # type: ignore[method-assign]
+        chain.controller.cycle.step = turn  # type: ignore[method-assign]
         await asyncio.sleep(6.0)
         sent = vibrations(chain)
         assert len(sent) > 3

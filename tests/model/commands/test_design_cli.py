@@ -8,6 +8,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+import era_haptics as era
 from model.cli import app
 from model.config.document import read_document
 from model.design import problem, search
@@ -181,3 +182,17 @@ def test_a_plate_that_sags_is_no_design(small, tmp_path: Path) -> None:
     """No layout has its lowest rigid-body frequency above a bound out of reach."""
     result = design("--eras", "4", "--lowest", "5000", "--starts", "1", "-o", str(tmp_path))
     assert isinstance(result.exception, InputError)
+
+
+def test_design_of_python_is_that_of_the_command(small, tmp_path: Path) -> None:
+    """The best of ten layouts and two stiffnesses with a kept ERA, saved; what is done is all."""
+    names = ("--layouts", "random:10", "--finalists", "1", "--keep", "NE")
+    assert design(*names, "--stiffness", "8 kN/m,30 kN/m", "-o", str(tmp_path)).exit_code == 0
+    steps: list[tuple[int, int]] = []
+    found = era.design(
+        load_rig(RIG), layouts="random:10", finalists=1, keep=["NE"], stiffness=[8e3, 30e3],
+        progress=lambda *done: steps.append(done),
+    )  # fmt: skip
+    era.save_rig(found.best.rig, tmp_path / "best.yaml")
+    assert load_rig(tmp_path / "best.yaml") == load_rig(tmp_path / "rig.yaml")
+    assert steps[-1][0] == steps[-1][1] > 0

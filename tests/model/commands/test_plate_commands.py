@@ -210,7 +210,7 @@ def check(path: Path, text: str | None = None) -> tuple[int, list[dict[str, str]
 
 
 def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
-    """The example has none; two links have one, and so has a section of uncertainty in part."""
+    """The example has none; two links have one, and so has a thickness that is known exactly."""
     assert check(example_rig_path()) == (0, [], [])
     links = EXAMPLE.replace(
         'main: {url: "sim://"}',
@@ -218,8 +218,8 @@ def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
     ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
     status, errors, warnings = check(tmp_path / "rig.yaml", links)
     assert (status, errors, len(warnings)) == (0, [], 1)
-    partial = EXAMPLE + "\nuncertainty: {fingertip: 0.5}\n"
-    status, errors, (warning,) = check(tmp_path / "rig.yaml", partial)
+    exact = EXAMPLE + "\nuncertainty: {thickness: 0}\n"
+    status, errors, (warning,) = check(tmp_path / "rig.yaml", exact)
     assert (status, errors) == (0, [])
     assert "thickness" in warning
 

@@ -74,10 +74,10 @@ def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
 
 
 def test_build_notes_a_coarse_mesh_and_what_is_taken_as_none(tmp_path: Path) -> None:
-    """A warning of the error on standard error, and the uncertainties that the rig leaves out."""
+    """A warning of the error on standard error, and what the rig says is known exactly."""
     rig = tmp_path / "rig.yaml"
     text = Path(RIG).read_text(encoding="utf-8")
-    rig.write_text(text + "\nuncertainty: {fingertip: 0.5}\n", encoding="utf-8")
+    rig.write_text(text + "\nuncertainty: {thickness: 0}\n", encoding="utf-8")
     path = tmp_path / "t.npz"
     coarse = table("build", rig, "-o", path, *QUICK)
     assert "warning: mesh 12x9" in coarse.stderr

@@ -333,12 +333,15 @@ def test_load_rig_reads_masses_and_fingerprints_them(tmp_path: Path) -> None:
 
 
 def test_load_rig_reads_uncertainty(tmp_path: Path) -> None:
-    """Without the section a plate that was not measured; in it, a key left out means none."""
-    assert load_rig(write(tmp_path, GOOD)).uncertainty == Uncertainty(
+    """A key left out has the value of a plate that was not measured; 0, or a factor 1, is exact."""
+    built = Uncertainty(
         gain=0.05, phase_deg=5, thickness=0.02, stiffness=0.1, damping=1.5, fingertip=0.5
     )
-    known = load_rig(write(tmp_path, GOOD + "uncertainty: {gain: 1 %, phase_deg: 1}\n"))
-    assert known.uncertainty == Uncertainty(0.01, 1.0, 0.0, 0.0, 1.0, 0.0)
+    for empty in ("", "uncertainty: {}\n"):
+        assert load_rig(write(tmp_path, GOOD + empty)).uncertainty == built
+    known = load_rig(write(tmp_path, GOOD + "uncertainty: {gain: 1 %, damping: 1, thickness: 0}\n"))
+    assert known.uncertainty == Uncertainty(0.01, 5.0, 0.0, 0.1, 1.0, 0.5)
+    assert known.uncertainty.exactly_known == ("thickness", "damping")
     for wrong in ("damping: 0.5", "thickness: 0.1", "gain: -0.1", "mass: 1"):
         with pytest.raises(ConfigError):
             load_rig(write(tmp_path, GOOD + f"uncertainty: {{{wrong}}}\n"))
@@ -352,7 +355,7 @@ def test_load_rig_reads_fingertip_and_threshold(tmp_path: Path) -> None:
     assert firm.fingertip == Fingertip(2000, 2, 0.0003, 0.005, 500, 2)
     none = load_rig(write(tmp_path, GOOD + "fingertip: none\n"))
     assert none.fingertip is None
-    known = load_rig(write(tmp_path, GOOD + "uncertainty: {}\n"))
+    known = load_rig(write(tmp_path, GOOD + "uncertainty: {field: 0.1}\n"))
     assert len({rig.fingerprint for rig in (light, firm, none, known)}) == 4
     for wrong in ("fingertip: heavy", "fingertip: {damping: 0}", "threshold: loud"):
         with pytest.raises(ConfigError):

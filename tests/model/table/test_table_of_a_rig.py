@@ -125,7 +125,7 @@ OTHERS: dict[str, Any] = {
     "name": "another",
     "limits": {"level": 0.5},
     "frequency": [50, 400],
-    "uncertainty": {},
+    "uncertainty": {"gain": 0},
     "fingertip": "none",
     "threshold": "pressing-fingertip",
 }

@@ -1,0 +1,27 @@
+"""Plates and ERAs by the keys of a rig file."""
+
+from typing import Any
+
+from model.rig.from_keys import checked_keys
+from model.rig.sections import EraSection, PlateSection
+
+
+class Plate(dict[str, Any]):
+    """A plate by the keys of `plate` in a rig file.
+
+    `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
+    ConfigError, an InputError, with all problems.
+    """
+
+    def __init__(self, **keys: Any) -> None:
+        super().__init__(checked_keys("era.Plate", PlateSection, keys))
+
+
+class Era(dict[str, Any]):
+    """An ERA by the keys below `eras` in a rig file.
+
+    `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
+    """
+
+    def __init__(self, **keys: Any) -> None:
+        super().__init__(checked_keys("era.Era", EraSection, keys))

@@ -75,7 +75,7 @@ async def daemon_session(
                 length, width = rig.plate.length, rig.plate.width
                 text = _TWO_HALVES.format(middle=length / 2, length=length, width=width)
                 (folder / "layout.yaml").write_text(text, "utf-8")
-                more = "layout: layout.yaml\n"
+                more = "layouts: {panel: layout.yaml}\n"
             path, config = folder / "socket", folder / "daemon.yaml"
             config.write_text(
                 f"rig: rig.yaml\nsocket: socket\n{more}"

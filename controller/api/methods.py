@@ -113,6 +113,8 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     learning: LearningSummary | None = Field(
         None, description="of the plate while it plays; null where nothing is to be learned"
     )
+    layout: str | None = Field(None, description="name of the layout in use; null without any")
+    layouts: list[str] = Field(default=[], description="names that `layout` accepts")
     slow_reason: str | None = Field(None, description="why answers take longer than they need")
     uptime_s: float
 
@@ -176,6 +178,26 @@ class TouchParams(Message):
 
     source: Name
     touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES), FailFast()]
+
+
+class LayoutParams(Message):
+    """The layout to use."""
+
+    name: Name = Field(description="one of `layouts` in the status")
+
+
+class LayoutResult(Message):
+    """The layout in use, and all that may be used."""
+
+    layout: str
+    layouts: list[str]
+
+
+class ReloadResult(Message):
+    """What came of reading the daemon's files again."""
+
+    reloaded: bool = Field(description="whether they are in use now; else all is as before")
+    reasons: list[str] = Field(description="what has changed; if refused, why")
 
 
 class EffectsResult(Message):

@@ -15,6 +15,8 @@ SUMMARIES = {
     "clear": "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.",
     "forget": "Discard what was learned of the plate, and learn anew. Answers are those of the table at once.",
     "touch": "Report all fingers of a touch source of this client.",
+    "layout": "Use one of the daemon's layouts for all fingers that come from now on. What plays goes on as after a reload.",
+    "reload": "Read the daemon's files again, and apply their layouts if nothing else has changed.",
     "effects": "List the effects.",
     "play": "Play an effect at a finger; only while armed.",
     "strength": "Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms.",

@@ -101,8 +101,9 @@ class LinkEvent(Message):
 
 
 class LayoutEvent(Message):
-    """The surface layout was replaced; `effects` may have changed with it."""
+    """Another surface layout is in use, or it was replaced; `effects` may have changed with it."""
 
+    name: str | None = Field(None, description="of the layout in use; null without one")
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
@@ -136,7 +137,7 @@ TOPICS: dict[Topic, TopicData] = {
     "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
     "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
     "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
-    "layout": TopicData(LayoutEvent, "the surface layout was replaced"),
+    "layout": TopicData(LayoutEvent, "another surface layout is in use, or it was replaced"),
     "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
     "inputs": TopicData(
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"

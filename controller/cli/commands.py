@@ -13,6 +13,7 @@ from controller.cli.daemon import (
     arm,
     daemon,
     of_method,
+    reload,
     status,
     strength,
     touch,
@@ -131,7 +132,7 @@ for _command in (demo, gateway, report, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))
-for _more in (arm, status, strength):
+for _more in (arm, reload, status, strength):
     app.command(
         help=f"{SUMMARIES[_more.__name__]} {_more.__doc__}",
         context_settings={"ignore_unknown_options": _more is strength},  # -6 is a number

@@ -1,5 +1,5 @@
 """`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`,
-`strength`, `touch`, `watch`.
+`reload`, `strength`, `touch`, `watch`.
 """
 
 import json
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from drivers.by_hand.cli import EXIT_STATUS
 from drivers.errors import CommandRefused, LinkError
 from model.commands.options import JsonOption, print_report
 from model.errors import InputError
@@ -35,6 +36,7 @@ DASHBOARD = "127.0.0.1:8137"
 _DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate", "inputs"]
 """Topics of `era watch`: all but amplifiers and latency, which are published without end."""
 
+_RELOAD_TIMEOUT = 130.0  # s; the daemon gives up after 60 s, and another may be reloading
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
@@ -91,7 +93,7 @@ def status(socket: Socket = None, as_json: JsonOption = False) -> None:
     """Exit status 0 in a fault, too."""
     from controller.cli.shown import show_status
 
-    with _client(socket) as era:
+    with connected(socket) as era:
         status = era.status()
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 
@@ -108,7 +110,7 @@ def arm(
     as_json: JsonOption = False,
 ) -> None:
     """Stays and renews the lease; Ctrl-C disarms."""
-    with _client(socket) as era:
+    with connected(socket) as era:
         if once:
             granted = era.arm(owner, lease_s=lease)
             _print_lease(granted, f"for {granted.lease_s:g} s", as_json=as_json)
@@ -127,7 +129,7 @@ def of_method(method: str) -> Callable[..., None]:
     """The command of a method of the API, which shows the state after it."""
 
     def call(socket: Socket = None, as_json: JsonOption = False) -> None:
-        with _client(socket) as era:
+        with connected(socket) as era:
             getattr(era, method)()
             _print_state(era, as_json=as_json)
 
@@ -145,7 +147,7 @@ def strength(
     as_json: JsonOption = False,
 ) -> None:
     """It is kept by this name; what layout and limits allow is 0."""
-    with _client(socket) as era:
+    with connected(socket) as era:
         found = era.strength(name, gain_db=gain_db)
     print_report(
         [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()],
@@ -187,7 +189,7 @@ def touch(
         asyncio.run(replay_capture(read_capture(replay), "127.0.0.1", port))
         return
     positions = [parse_point(text, what="era touch") for text in at or ()]
-    with _client(socket) as era:
+    with connected(socket) as era:
         _check_positions(positions, era.hello("era").rig)
         started_at = time.monotonic()
         _hold(era, positions, started_at + duration / 2)
@@ -237,7 +239,7 @@ def watch(
             f"unknown topic {unknown[0]!r}; {did_you_mean(unknown[0], TOPICS)}"
             f"choose from {', '.join(TOPICS)}"
         )
-    with _client(socket) as era:
+    with connected(socket) as era:
         era.subscribe(*cast("list[Topic]", selected), rate_hz=rate)
         now = era.status()
         for event in era.events():
@@ -248,13 +250,28 @@ def watch(
                 typer.echo(show_event(event, ahead=now.unix_time_s - now.time_s))
 
 
+def reload(socket: Socket = None, as_json: JsonOption = False) -> None:
+    """Exit status 1 if they are refused; all is as before then."""
+    with connected(socket, timeout=_RELOAD_TIMEOUT) as era:
+        done = era.reload()
+    outcome = "reloaded" if done.reloaded else "refused; all is as before"
+    rows = [outcome, *(f"  {reason}" for reason in done.reasons)]
+    print_report(rows, done.model_dump(), as_json=as_json)
+    if not done.reloaded:
+        raise typer.Exit(EXIT_STATUS[CommandRefused])
+
+
 @contextmanager
-def _client(socket: Path | None) -> "Iterator[Client]":
-    """Connect; translate refusals of the daemon to errors with their exit status."""
+def connected(socket: Path | None, *, timeout: float | None = None) -> "Iterator[Client]":
+    """Connect; translate refusals of the daemon to errors with their exit status.
+
+    timeout [s]: for each call, the client's own if None.
+    """
     from controller.api.client import Client
+    from controller.api.client_protocol import RESPONSE_TIMEOUT
     from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 
-    with Client.connect(socket, name="era") as era:
+    with Client.connect(socket, name="era", timeout=timeout or RESPONSE_TIMEOUT) as era:
         try:
             yield era
         except RpcError as error:

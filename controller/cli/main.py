@@ -33,7 +33,7 @@ SECTIONS = {
     "Plate": ("config", "plate", "table", "layout", "calibrate", "rig", "design", "measure"),
     "Run": (
         *("daemon", "status", "arm", "disarm", "stop", "clear", "touch", "watch", "gateway"),
-        *("forget", "report"),
+        *("forget", "reload", "report"),
     ),
     "Amplifier": ("amp", "soft-amp", "witness"),
 }

@@ -32,6 +32,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
         *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
+        *_given(("  layout {}", status.layout if len(status.layouts) > 1 else None)),
         *map(_contact, status.contacts),
         *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),

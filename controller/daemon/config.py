@@ -1,11 +1,16 @@
-"""Loads and validates a daemon's configuration and the files that it names; what may change."""
+"""Loads and validates a daemon's configuration and the files that it names."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
-from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
+from controller.daemon.config_sections import (
+    MAX_LAYOUTS,
+    CalibrationSection,
+    DaemonSection,
+    TouchSection,
+)
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.effects.strengths import read_strengths
@@ -32,8 +37,6 @@ from model.structure.support import check_supported
 API_SOURCES = "api"
 """Prefix of the touch sources of API clients, reserved for them."""
 
-_OF_LAYOUT = ("layout", "level_db_sl")  # keys that a running daemon can apply
-
 
 @dataclass(frozen=True)
 class TouchInput:
@@ -54,8 +57,8 @@ class DaemonConfig:
 
     rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
     it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
-    layout: None for the same effect everywhere; strengths: file in which they are kept, None for as
-    long as the daemon runs.
+    layouts: by name, in their order; without any one that buzzes at every touch, by None;
+    strengths: file in which they are kept, None for as long as the daemon runs.
     """
 
     source: Path
@@ -65,21 +68,16 @@ class DaemonConfig:
     urls: Mapping[str, str]
     table: Path | None
     learn: Path | None
-    layout: SurfaceLayout | None
+    layouts: Mapping[str | None, SurfaceLayout]
     strengths: Path | None
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
 
-    @cached_property
-    def effective_layout(self) -> SurfaceLayout:
-        """The layout, or one that buzzes at every touch if none is configured."""
-        return self.layout or SurfaceLayout(effects=default_effects(self.section.level_db_sl))
-
 
 def load_daemon_config(path: Path) -> DaemonConfig:
-    """Load a daemon's file with its rig and layout; raises ConfigError with all problems."""
+    """Load a daemon's file with its rig and layouts; raises ConfigError with all problems."""
     return daemon_config_of(read_document(path))
 
 
@@ -96,7 +94,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     table = file_of(document, "table")
     if table is not None and not table.is_file():
         validation.add(("table",), f"file not found: {table}; check name and folder")
-    layout = _layout(validation, document, rig)
+    layouts = _layouts(validation, document, rig)
     _check_serial_numbers(validation, rig)
     log_file = file_of(document, "log", "file")
     dump_folder = file_of(document, "dumps", "folder")
@@ -123,37 +121,13 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         urls=urls,
         table=table,
         learn=learn,
-        layout=layout,
+        layouts=layouts,
         strengths=strengths,
         touch=touch,
         socket=socket,
         log_file=log_file,
         dump_folder=dump_folder,
     )
-
-
-def reload_problem(
-    old: DaemonConfig, new: DaemonConfig, changed: Sequence[str], *, is_armed: bool
-) -> str | None:
-    """Why nothing of a valid configuration with these `changed_keys` can be applied, or None."""
-    if changed:
-        return f"{', '.join(changed)} changed, which needs a restart"
-    before, after = old.effective_layout.max_db_sl, new.effective_layout.max_db_sl
-    if is_armed and after > before:
-        return (
-            f"maximum level must not increase while armed, got {after:g} dB SL (was {before:g}); "
-            "disarm, then reload"
-        )
-    return None
-
-
-def changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
-    """Compare all keys but those of the layout, and the content of the rig's file."""
-    before, after = old.section.model_dump(), new.section.model_dump()
-    keys = [key for key in before if before[key] != after[key] and key not in _OF_LAYOUT]
-    if old.rig_text != new.rig_text and "rig" not in keys:
-        keys.append("rig")
-    return keys
 
 
 def is_daemon_document(document: Document) -> bool:
@@ -171,7 +145,8 @@ def _check_kind(document: Document) -> None:
         raise InputError(
             f"{document.source}: must be a daemon's file, got a "
             f"{'surface layout' if is_layout else 'rig'}; name it in one with "
-            f"{'layout' if is_layout else 'rig'}: FILE (era config init daemon.yaml --kind daemon)"
+            f"{'layouts: {NAME: FILE}' if is_layout else 'rig: FILE'} "
+            "(era config init daemon.yaml --kind daemon)"
         )
 
 
@@ -201,24 +176,23 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
     return None, ""
 
 
-def _layout(
+def _layouts(
     validation: Validation[DaemonSection], document: Document, rig: Rig | None
-) -> SurfaceLayout | None:
-    """Load the surface layout; problems are reported at the key that names it."""
-    file = file_of(document, "layout")
-    if file is None:
-        return None
+) -> dict[str | None, SurfaceLayout]:
+    """Load the surface layouts; problems are reported at the keys that name them."""
     level = validation.field(("level_db_sl",), DaemonSection)
-    try:
-        return load_layout(
-            file,
-            None if rig is None else rig.plate,
-            level_db_sl=STRONG_DB_SL if level is None else level,
-        )
-    except InputError as error:
-        indented = str(error).replace("\n", "\n  ")
-        validation.add(("layout",), f"invalid layout:\n    {indented}")
-    return None
+    level = STRONG_DB_SL if level is None else level
+    layouts: dict[str | None, SurfaceLayout] = {}
+    for name in islice(validation.mapping(("layouts",)), MAX_LAYOUTS):
+        file = file_of(document, "layouts", name)
+        try:
+            if file is not None:
+                plate = None if rig is None else rig.plate
+                layouts[name] = load_layout(file, plate, level_db_sl=level)
+        except InputError as error:
+            indented = str(error).replace("\n", "\n  ")
+            validation.add(("layouts", name), f"invalid layout:\n    {indented}")
+    return layouts or {None: SurfaceLayout(effects=default_effects(level))}
 
 
 def _urls(

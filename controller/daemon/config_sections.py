@@ -11,6 +11,8 @@ from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
 from model.rig.key_types import Identifier
 
+MAX_LAYOUTS = 64
+
 _LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
 _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
 
@@ -86,7 +88,7 @@ class DaemonSection(Section):
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     learn: File | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    layout: File | None = None
+    layouts: Annotated[dict[Identifier, File], Field(max_length=MAX_LAYOUTS, default_factory=dict)]
     strengths: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]

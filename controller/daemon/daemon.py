@@ -7,16 +7,17 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 
+from controller.api.methods import ReloadResult
 from controller.api.schema import headline
 from controller.api.server import ApiServer
-from controller.daemon.children import gateway_options, keep_gateway, read_in_child
-from controller.daemon.config import DaemonConfig, changed_keys, reload_problem
+from controller.daemon.children import gateway_options, keep_gateway
+from controller.daemon.config import DaemonConfig
 from controller.daemon.inputs import TouchInputs
+from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import amplifier_statuses
 from controller.daemon.methods import ApiService
 from controller.daemon.publisher import EventPublisher
-from controller.effects.player import EffectPlayer
-from controller.effects.strengths import Strengths, read_strengths
+from controller.daemon.reload import read_again
 from controller.learning.learning import Learning
 from controller.operation.dumps import FaultDumps
 from controller.operation.links import Supervisor
@@ -32,7 +33,7 @@ from model.answer.timing import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from registry import clock
-from registry.garbage_collection import no_long_collections, without_collections
+from registry.garbage_collection import no_long_collections
 from registry.threads import DaemonThreads, in_thread
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
@@ -65,6 +66,7 @@ class Daemon:
         self._manager = manager
         self._dashboard = dashboard
         self._reload_requested = asyncio.Event()
+        self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
         self._dumps = FaultDumps(config.dump_folder)
@@ -80,11 +82,7 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        self._layout = EffectPlayer(
-            config.effective_layout, Strengths(read_strengths(config.strengths))
-        )
-        self._frequencies = table.frequencies
-        self._warn_of_bands(config)
+        self._layouts = LayoutChoice(config, table.frequencies, changed=self._layout_changed)
         self._publisher = EventPublisher(
             operation=lambda: self._supervisor.operation,
             amplifiers=lambda: amplifier_statuses(
@@ -95,8 +93,7 @@ class Daemon:
                 what_may_play=self._supervisor.what_may_play,
                 targets=self._publisher.view.targets,
             ),
-            player=self._layout,
-            layout=config.layout,
+            layouts=self._layouts,
             inputs=lambda: self._inputs.event,
             learning=lambda: self.learning,
             noted=self._dumps.decisions.append,
@@ -111,7 +108,7 @@ class Daemon:
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
             connected=self._connected,
-            intent_source=self._layout,
+            intent_source=self._layouts.player,
             timing=timing,
             drive_mode=config.section.mode,
             watchdog=watchdog,
@@ -143,8 +140,9 @@ class Daemon:
             self._controller,
             self._supervisor,
             publisher=self._publisher,
-            layout=self._layout,
+            layouts=self._layouts,
             learning=self.learning,
+            reload=self.reload,
         )
         self._server = ApiServer(
             self._api.handlers(),
@@ -198,42 +196,50 @@ class Daemon:
         self._shutdown_cause = cause
         self._shutdown.set()
 
-    async def reload(self) -> None:
-        """Read the configuration again and apply its layout, if nothing else has changed."""
-        self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-        try:
-            new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
-            self._apply(new, changed, differs=differs)
-        except (InputError, OSError) as error:
-            _logger.error("config: reload rejected, keeping previous: %s", error)
-        except Exception:  # systemd waits for the end of the reload
-            _logger.exception("config: reload failed")
-        self._manager.ready(self._status_line())
+    async def reload(self) -> ReloadResult:
+        """Read the configuration again and apply its layouts, if nothing else has changed.
+
+        While one is being read, all further requests are combined into one after it.
+        """
+        self._reload_requested.set()
+        return await asyncio.shield(self._next_reload)
 
     async def _reload_when_requested(self) -> None:
-        """Reload at requests; those during one are combined into one after it."""
+        loop = asyncio.get_running_loop()
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            await self.reload()
+            verdict, self._next_reload = self._next_reload, loop.create_future()
+            self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+            result = await self._reload_now()
+            reasons = "; ".join(result.reasons)
+            if result.reloaded:
+                _logger.info("config: reloaded: %s", reasons)
+            else:
+                _logger.error("config: reload rejected, keeping previous: %s", reasons)
+            self._manager.ready(self._status_line())
+            verdict.set_result(result)
 
-    def _warn_of_bands(self, config: DaemonConfig) -> None:
-        for problem in config.effective_layout.band_problems(self._frequencies):
-            _logger.warning("layout: %s", problem)
+    async def _reload_now(self) -> ReloadResult:
+        is_done = False
+        try:
+            change = await in_thread(partial(read_again, self._config), name="reload")
+            is_armed = self._supervisor.operation.state in ENERGISED
+            if reasons := change.refusals(is_armed=is_armed):
+                reasons += [f"{each}, but not applied" for each in change.changes]
+            else:
+                reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
+                self._config, is_done = change.config, True
+        except (InputError, OSError) as error:
+            reasons = [line.strip() for line in str(error).splitlines()]
+        except Exception as error:  # systemd and clients wait for the end of the reload
+            _logger.exception("config: reload failed")
+            reasons = [f"a bug in the daemon ({type(error).__name__}); its log has the details"]
+        return ReloadResult(reloaded=is_done, reasons=reasons)
 
-    def _apply(self, new: DaemonConfig, changed: list[str], *, differs: bool) -> None:
-        is_armed = self._supervisor.operation.state in ENERGISED
-        problem = reload_problem(self._config, new, changed, is_armed=is_armed)
-        if problem is not None:
-            _logger.error("config: reload rejected, keeping previous: %s", problem)
-            return
-        if differs:
-            self._layout.replace(new.effective_layout)
-            self._warn_of_bands(new)
-            self._publisher.layout_changed(new.layout)
-            self._controller.cycle.request_update()
-        self._config = new
-        _logger.info("config: reloaded, applied %s", "layout" if differs else "no change")
+    def _layout_changed(self) -> None:
+        self._publisher.hub.publish("layout", self._layouts.event)
+        self._controller.cycle.request_update()
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
@@ -277,10 +283,3 @@ class Daemon:
     def _status_line(self) -> str:
         operation = self._supervisor.operation
         return headline(operation.state.value, operation.cause)
-
-
-def _read(old: DaemonConfig) -> tuple[DaemonConfig, list[str], bool]:
-    """Read the configuration again; also its changed keys, and whether its layout differs."""
-    with without_collections():  # of a large layout
-        new = read_in_child(old.source)
-    return new, changed_keys(old, new), old.effective_layout != new.effective_layout

@@ -6,7 +6,7 @@ import logging
 import math
 import secrets
 import time
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 
 from controller.api.connection import Connection
@@ -19,7 +19,10 @@ from controller.api.methods import (
     EffectsResult,
     HelloParams,
     HelloResult,
+    LayoutParams,
+    LayoutResult,
     PlayParams,
+    ReloadResult,
     RenewParams,
     RenewResult,
     RequestedBy,
@@ -36,9 +39,9 @@ from controller.api.registered import METHODS
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
 from controller.daemon.config import API_SOURCES, DaemonConfig
+from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import effects_result, hello_result, playing_of
 from controller.daemon.publisher import EventPublisher
-from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER
@@ -79,20 +82,23 @@ class ApiService:
         supervisor: Supervisor,
         *,
         publisher: EventPublisher,
-        layout: EffectPlayer,
+        layouts: LayoutChoice,
         learning: Learning | None,
+        reload: Callable[[], Awaitable[ReloadResult]],
     ) -> None:
         self._config = config
         self._table = table
         self._controller = controller
         self._supervisor = supervisor
         self._publisher = publisher
-        self._layout = layout
+        self._layouts = layouts
         self._learning = learning
+        self._reload = reload
         self._next_number = itertools.count(1)
         self._started = clock.now()
         self._clients = set[Connection]()  # that are connected and have said or done something
-        layout.strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
+        self._strengths = layouts.player.strengths
+        self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving = asyncio.Lock()
 
     def handlers(self) -> Mapping[str, Handler]:
@@ -121,7 +127,7 @@ class ApiService:
             self._table,
             self._controller.amplifiers,
             drive_mode=self._controller.drive_mode,
-            layout=self._publisher.layout_event().layout,
+            layout=self._layouts.event().layout,
         )
 
     @api_method(in_reserve=True)
@@ -153,6 +159,8 @@ class ApiService:
             inputs=self._publisher.inputs().inputs,
             clicks_too_late=self._controller.cycle.clicks_too_late,
             learning=self._publisher.learning_summary(),
+            layout=self._layouts.name,
+            layouts=self._layouts.names,
             strengths=self._publisher.strengths().strengths,
             slow_reason=why_slow(),
             uptime_s=now - self._started,
@@ -277,9 +285,23 @@ class ApiService:
         return Empty()
 
     @api_method()
+    def layout(self, client: Connection, params: LayoutParams) -> LayoutResult:
+        """Use one of the daemon's layouts for all fingers that come from now on.
+
+        What plays goes on as after a reload.
+        """
+        self._layouts.use(params.name)
+        return LayoutResult(layout=params.name, layouts=self._layouts.names)
+
+    @api_method()
+    def reload(self, client: Connection, params: Empty) -> Awaitable[ReloadResult]:
+        """Read the daemon's files again, and apply their layouts if nothing else has changed."""
+        return self._reload()
+
+    @api_method()
     def effects(self, client: Connection, params: Empty) -> EffectsResult:
         """List the effects."""
-        return effects_result(self._layout.layout)
+        return effects_result(self._layouts.player.layout)
 
     @api_method(is_repeated=False)
     def play(self, client: Connection, params: PlayParams) -> Empty:
@@ -288,7 +310,7 @@ class ApiService:
         operation = self._supervisor.operation
         if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
-        effects = self._layout.layout.effects
+        effects = self._layouts.player.layout.effects
         effect = effects.get(params.effect)
         if effect is None:
             raise RpcError(
@@ -318,7 +340,7 @@ class ApiService:
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
-        self._layout.play(
+        self._layouts.player.play(
             params.effect,
             nearest,
             clock.now(),
@@ -343,17 +365,15 @@ class ApiService:
                 remedy=f"choose one of {', '.join(known)}",
             )
         if params.gain_db is not None:
-            self._layout.strengths.set(name, params.gain_db)
+            self._strengths.set(name, params.gain_db)
             self._controller.cycle.request_update()
             if (file := self._config.strengths) is not None:
                 async with self._saving:  # the newest last
                     try:
-                        await in_thread(
-                            partial(self._layout.strengths.save, file), name="strengths"
-                        )
+                        await in_thread(partial(self._strengths.save, file), name="strengths")
                     except OSError as error:
                         _logger.error("strengths: not kept: %s", error)
-        return StrengthResult(strengths={name: self._layout.strengths.gains_db.get(name, 0.0)})
+        return StrengthResult(strengths={name: self._strengths.gains_db.get(name, 0.0)})
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

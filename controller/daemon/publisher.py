@@ -24,15 +24,13 @@ from controller.api.topics import (
     Hub,
     InputsEvent,
     LatencyEvent,
-    LayoutEvent,
     LinkEvent,
     LogEvent,
     SilenceEvent,
     StateEvent,
 )
+from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import PlateView, plate_event
-from controller.effects.layout import SurfaceLayout
-from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
@@ -48,10 +46,9 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
-    operation: of the plate; amplifiers: their statuses; player: of effects; layout: the surface
-    layout; inputs: state of the touch inputs; learning: what learns the plate, None where
-    nothing is to be learned; noted: called with a record of each change of contacts and each
-    decision.
+    operation: of the plate; amplifiers: their statuses; layouts: of the surface; inputs: state of
+    the touch inputs; learning: what learns the plate, None where nothing is to be learned; noted:
+    called with a record of each change of contacts and each decision.
     """
 
     def __init__(
@@ -59,14 +56,13 @@ class EventPublisher:
         *,
         operation: Callable[[], Operation],
         amplifiers: Callable[[], list[AmplifierStatus]],
-        player: EffectPlayer,
-        layout: SurfaceLayout | None,
+        layouts: LayoutChoice,
         inputs: Callable[[], InputsEvent],
         learning: Callable[[], Learning | None],
         noted: Callable[[Mapping[str, object]], object],
     ) -> None:
-        self.view = PlateView(player.effect_of, why_not=self._why_not)
-        self._player = player
+        self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
+        self._player = layouts.player
         self.latencies = LatencyStatistics()  # of touches alone
         self.lift_latencies = LatencyStatistics()
         self.learning_latencies = LatencyStatistics()
@@ -75,7 +71,6 @@ class EventPublisher:
         self.amplifiers = amplifiers
         self.inputs = inputs
         self._operation = operation
-        self._layout = layout
         self._last_link_message = ""
         self._loop = asyncio.get_running_loop()
         self.hub = Hub(
@@ -86,7 +81,7 @@ class EventPublisher:
                 "silence": self.view.silence_event,
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
                 "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
-                "layout": self.layout_event,
+                "layout": layouts.event,
                 "plate": self._plate_event,
                 "inputs": inputs,
                 "strength": self.strengths,
@@ -125,11 +120,6 @@ class EventPublisher:
             return f"{operation.cause}; {operation.remedy}"
         return self._player.why_not(key)
 
-    def layout_changed(self, layout: SurfaceLayout | None) -> None:
-        """Publish another surface layout; None for the same effect everywhere."""
-        self._layout = layout
-        self.hub.publish("layout", self.layout_event)
-
     def plate_changed(self, status: LearningStatus) -> None:
         """Publish what has happened to the plate, or to learning it."""
         self.hub.publish("plate", lambda: plate_event(status))
@@ -164,10 +154,6 @@ class EventPublisher:
         make = partial(LogEvent.model_validate, event)
         with contextlib.suppress(RuntimeError):  # the loop may be closed
             self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
-
-    def layout_event(self) -> LayoutEvent:
-        """The surface layout as an event."""
-        return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
 
     def strengths(self) -> StrengthResult:
         """The strengths of all touch sources and clients that are known."""

@@ -111,7 +111,6 @@ DECAY = 0.1
 RECOVERY = 30.0
 """Time [s] within which the daemon must be armed, also anew after a fault."""
 
-_LAYOUT_FILE = "layout.yaml"
 _RIG_FILE = "rig.yaml"
 _HOST = "127.0.0.1"
 _ARMED = DaemonState.OPERATION_ENABLED
@@ -131,15 +130,14 @@ async def run_demo(
     """Play scenes one after another to a daemon, over a wire, onto a simulated plate.
 
     rig_file: an absolute path; wire: one of WIRES; on_row: called with each row when complete;
-    seed: of the plate within the rig's uncertainty, None for the rig's own. The daemon reloads its
-    layout between scenes. Return all rows in order of time. Raises LinkError if the far end is
-    lost.
+    seed: of the plate within the rig's uncertainty, None for the rig's own. Each scene has a layout
+    of its own. Return all rows in order of time. Raises LinkError if the far end is lost.
     """
     port = _free_port()
     url = f"tuio:{_HOST}:{port}?timeout={CONTACT_TIMEOUT:g}"
     more = {"socket": "era.sock", "touch": [{"name": "recorded", "url": url}]}
     async with _on_simulated_plate(
-        rig_file, more, layout=scenes[0].layout, wire=wire, seed=seed
+        rig_file, more, layouts=[scene.layout for scene in scenes], wire=wire, seed=seed
     ) as (config, lock, plate):
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -155,7 +153,7 @@ async def run_demo(
                 )
                 serving = tasks.create_task(daemon.run(lock))
                 arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
-                playing = tasks.create_task(_play(scenes, port, recorder, daemon, config))
+                playing = tasks.create_task(_play(scenes, port, recorder, config.socket))
                 await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
                 if not playing.done():  # a signal has ended the daemon
                     raise KeyboardInterrupt
@@ -184,7 +182,7 @@ async def run_live(
     log = start_log(None, level="warning")
     try:
         layout = example_layout(load_rig(rig_file))
-        async with _on_simulated_plate(rig_file, {}, layout=layout, wire=wire, seed=seed) as (
+        async with _on_simulated_plate(rig_file, {}, layouts=[layout], wire=wire, seed=seed) as (
             config,
             lock,
             _,
@@ -207,18 +205,17 @@ async def _on_simulated_plate(
     rig_file: Path,
     more: Mapping[str, object],
     *,
-    layout: Mapping[str, Any],
+    layouts: Sequence[Mapping[str, Any]],
     wire: str,
     seed: int | None,
 ) -> AsyncIterator[tuple[DaemonConfig, SocketLock, SimulatedPlate]]:
     """Configuration and socket of a daemon of a rig, and the plate that it drives.
 
-    more: keys of the daemon's file besides the rig; layout: the content of `_LAYOUT_FILE`.
+    more: keys of the daemon's file besides the rig; layouts: what its layouts contain.
     """
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
-        _write_layout(folder, layout)
-        config = load_daemon_config(_daemon_file(folder, rig_file, more))
+        config = load_daemon_config(_daemon_file(folder, rig_file, more, layouts))
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
         rig = config.rig
@@ -228,11 +225,19 @@ async def _on_simulated_plate(
         yield replace(config, urls=plate.urls), lock, plate
 
 
-def _daemon_file(folder: Path, rig_file: Path, more: Mapping[str, object]) -> Path:
+def _daemon_file(
+    folder: Path,
+    rig_file: Path,
+    more: Mapping[str, object],
+    layouts: Sequence[Mapping[str, Any]],
+) -> Path:
     """Write the daemon's file; it names the rig by a link, since a path may be any bytes."""
     (folder / _RIG_FILE).symlink_to(rig_file.resolve())
     file = folder / "daemon.yaml"
-    content = {"rig": _RIG_FILE, "layout": _LAYOUT_FILE, **more}
+    named = {_layout_name(number): f"{number}.yaml" for number in range(len(layouts))}
+    for name, layout in zip(named.values(), layouts, strict=True):
+        (folder / name).write_text(json.dumps(layout), encoding="utf-8")
+    content = {"rig": _RIG_FILE, "layouts": named, **more}
     file.write_text(json.dumps(content), encoding="utf-8")
     return file
 
@@ -281,18 +286,16 @@ async def _play(
     scenes: Sequence[Scene],
     port: int,
     recorder: TouchRecorder,
-    daemon: Daemon,
-    config: DaemonConfig,
+    path: Path,
 ) -> None:
-    """Play the scenes; wait until all touches are lifted, or count as such.
+    """Play the scenes to a daemon at a socket; wait until all touches are lifted, or count as such.
 
     Raises LinkError after a fault that lasts.
     """
     await recorder.start()
-    for scene in scenes:
-        if scene.layout != scenes[0].layout:
-            _write_layout(config.source.parent, scene.layout)
-            await daemon.reload()
+    for number, scene in enumerate(scenes):
+        async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
+            await era.layout(_layout_name(number))
         await replay_capture(scene.touches, _HOST, port)
         await asyncio.sleep(DECAY)  # the last datagrams arrive
         while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
@@ -302,5 +305,6 @@ async def _play(
         raise LinkError(f"demonstration aborted: {recorder.fault}")
 
 
-def _write_layout(folder: Path, layout: Mapping[str, Any]) -> None:
-    (folder / _LAYOUT_FILE).write_text(json.dumps(layout), encoding="utf-8")
+def _layout_name(number: int) -> str:
+    """The name of the layout of a scene."""
+    return f"scene_{number}"

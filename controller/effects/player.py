@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from controller.effects.effect import EffectRun, EffectStimulus, NoStimulus
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.strengths import Strengths
@@ -34,6 +34,7 @@ class _Play:
     """
 
     name: str
+    effect: Effect
     run: EffectRun
     number: int
     priority: int
@@ -41,6 +42,12 @@ class _Play:
     region: Region | None
     is_elsewhere: bool
     player: str | None = None
+
+    @property
+    def outlasts_its_layout(self) -> bool:
+        """Whether it was requested, or is a press that ends by itself."""
+        is_press = self.effect.has_end and not self.effect.is_for_motion
+        return is_press or self.priority == REQUESTED_PRIORITY
 
 
 @dataclass
@@ -69,7 +76,7 @@ class EffectPlayer:
 
     def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
         self.layout, self.strengths = layout, strengths or Strengths()
-        self._already_pressed: dict[ContactKey, float] = {}  # since when [s], under another layout
+        self._already_pressed: dict[ContactKey, _Finger] = {}  # under another layout
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
@@ -133,7 +140,7 @@ class EffectPlayer:
             return f"{name} came too soon after those of other fingers; touch there again"
         if key in self._sensing:
             return f"{name} is felt by the newest finger outside of all regions; lift that one"
-        if name and self.layout.effects[name].is_for_motion:
+        if name and finger.plays[-1].effect.is_for_motion:
             return f"{name} is not felt at rest; move the finger"
         if name:
             return f"{name} pauses; it goes on by itself"
@@ -144,11 +151,12 @@ class EffectPlayer:
     def replace(self, layout: SurfaceLayout) -> None:
         """Play another layout from now on; fingers that rest feel no press of it.
 
-        For them only effects for motion or without an end start.
+        What was requested for them, and what ends by itself, goes on to its end. Of the layout only
+        effects for motion or without an end start.
         """
         self.layout = layout
-        self._already_pressed.update((key, one.since) for key, one in self._fingers.items())
-        self._fingers.clear()
+        self._already_pressed |= self._fingers
+        self._fingers = {}
 
     def effect_of(self, key: ContactKey) -> str | None:
         """Return the name of the effect that plays for a finger, None for none."""
@@ -228,7 +236,7 @@ class EffectPlayer:
             if since.get(key) != one.since:
                 del self._fingers[key]
         if pressed := self._already_pressed.items():
-            self._already_pressed = {key: then for key, then in pressed if since.get(key) == then}
+            self._already_pressed = {k: one for k, one in pressed if since.get(k) == one.since}
         for contact in contacts:
             finger = self._fingers.get(contact.key)
             if finger is None:
@@ -254,12 +262,10 @@ class EffectPlayer:
         self._fingers[contact.key] = finger
         self.strengths.note(contact.key.source)
         self._enter(finger, contact, now)
-        if self._already_pressed.pop(contact.key, None) is not None:
-            effects = self.layout.effects
+        if (before := self._already_pressed.pop(contact.key, None)) is not None:
             finger.plays = [
-                play
-                for play in finger.plays
-                if effects[play.name].is_for_motion or not effects[play.name].has_end
+                *(each for each in finger.plays if not each.outlasts_its_layout),
+                *(each for each in before.plays if each.outlasts_its_layout),
             ]
         return finger
 
@@ -299,7 +305,9 @@ class EffectPlayer:
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
         is_elsewhere = region is None and priority != REQUESTED_PRIORITY
-        finger.plays.append(_Play(name, run, self._number, priority, band, region, is_elsewhere))
+        finger.plays.append(
+            _Play(name, effect, run, self._number, priority, band, region, is_elsewhere)
+        )
 
     def _current_stimulus(
         self, finger: _Finger, contact: Contact, now: float, ends: list[float]

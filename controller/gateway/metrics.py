@@ -127,6 +127,12 @@ def _gauges(status: StatusResult) -> list[_Row]:
             (),
         ),
         (
+            "layout",
+            "1 for the layout in use.",
+            {(name,): name == status.layout for name in status.layouts},
+            ("layout",),
+        ),
+        (
             "touch_input_open",
             "Whether touches can come from an input.",
             {(each.name,): each.state == "open" for each in status.inputs},

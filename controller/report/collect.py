@@ -38,7 +38,6 @@ from registry.regular_file import regular_file
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
-_NAMED = ("rig", "layout")  # keys of a daemon's file; a table is large and can be built again
 _REQUIREMENT = re.compile(r"(?im)^[ \t]*([A-Z0-9](?:[A-Z0-9._-]*[A-Z0-9])?)")
 """The name of the distribution at the start of each line, a requirement of PEP 508."""
 
@@ -147,7 +146,11 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         return
     if not is_daemon_document(document):
         return
-    yield from filter(None, [file_of(document, key) for key in _NAMED])
+    layouts = document.data.get("layouts")
+    names = layouts if isinstance(layouts, dict) else ()
+    # A table is large and can be built again.
+    named = [file_of(document, "rig"), *(file_of(document, "layouts", each) for each in names)]
+    yield from filter(None, named)
     folder = file_of(document, "dumps", "folder")
     if folder is not None:
         dumps = sorted(folder.glob(DUMP_PATTERN), key=lambda file: file.name)

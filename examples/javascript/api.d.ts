@@ -20,6 +20,10 @@ export interface Methods {
   forget: { params: RequestedBy; result: Empty };
   /** Report all fingers of a touch source of this client. */
   touch: { params: TouchParams; result: Empty };
+  /** Use one of the daemon's layouts for all fingers that come from now on. What plays goes on as after a reload. */
+  layout: { params: LayoutParams; result: LayoutResult };
+  /** Read the daemon's files again, and apply their layouts if nothing else has changed. */
+  reload: { params: Empty; result: ReloadResult };
   /** List the effects. */
   effects: { params: Empty; result: EffectsResult };
   /** Play an effect at a finger; only while armed. */
@@ -51,7 +55,7 @@ export interface Topics {
   log: LogEvent;
   /** links to amplifiers that were degraded, lost or reopened */
   link: LinkEvent;
-  /** the surface layout was replaced */
+  /** another surface layout is in use, or it was replaced */
   layout: LayoutEvent;
   /** the plate has changed, or is followed otherwise */
   plate: PlateEvent;
@@ -151,6 +155,10 @@ export interface StatusResult {
   lost_events?: Record<string, number>;
   /** of the plate while it plays; null where nothing is to be learned */
   learning?: LearningSummary | null;
+  /** name of the layout in use; null without any */
+  layout?: string | null;
+  /** names that `layout` accepts */
+  layouts?: Array<string>;
   /** why answers take longer than they need */
   slow_reason?: string | null;
   uptime_s: number;
@@ -209,6 +217,26 @@ export interface ClearParams {
 export interface TouchParams {
   source: string;
   touches: Array<TouchPoint>;
+}
+
+/** The layout to use. */
+export interface LayoutParams {
+  /** one of `layouts` in the status */
+  name: string;
+}
+
+/** The layout in use, and all that may be used. */
+export interface LayoutResult {
+  layout: string;
+  layouts: Array<string>;
+}
+
+/** What came of reading the daemon's files again. */
+export interface ReloadResult {
+  /** whether they are in use now; else all is as before */
+  reloaded: boolean;
+  /** what has changed; if refused, why */
+  reasons: Array<string>;
 }
 
 /** The effects that `play` accepts. */
@@ -323,8 +351,10 @@ export interface LinkEvent {
   remedy: string | null;
 }
 
-/** The surface layout was replaced; `effects` may have changed with it. */
+/** Another surface layout is in use, or it was replaced; `effects` may have changed with it. */
 export interface LayoutEvent {
+  /** of the layout in use; null without one */
+  name?: string | null;
   /** the surface layout; null without one */
   layout: Record<string, unknown> | null;
 }

@@ -1,4 +1,4 @@
-import type { Arguments, ArmResult, Event, HelloResult, Method, Methods, StopResult, Topic, TouchPoint } from "./api.js";
+import type { Arguments, ArmResult, Event, HelloResult, LayoutResult, Method, Methods, StopResult, Topic, TouchPoint } from "./api.js";
 export type * from "./api.js";
 
 /** A call that was refused, or that had no response (code 0). */
@@ -27,6 +27,7 @@ export class Connection {
   call<M extends Method>(method: M, ...params: Arguments<M>): Promise<Methods[M]["result"]>;
   arm(owner: string): Promise<void>;
   disarm(): Promise<unknown>;
+  layout(name: string): Promise<LayoutResult>;
   touch(touches: TouchPoint[]): void;
   lift(): void;
   strength(name: string, gain_db?: number | null): Promise<number>;

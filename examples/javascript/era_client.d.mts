@@ -1,5 +1,5 @@
 import { EventEmitter } from "node:events";
-import type { Arguments, Event, HelloResult, Method, Methods, StatusResult, StopResult, StrengthResult, Topic, Topics } from "./api.js";
+import type { Arguments, Event, HelloResult, LayoutResult, Method, Methods, StatusResult, StopResult, StrengthResult, Topic, Topics } from "./api.js";
 export type * from "./api.js";
 
 /** The socket of this user's daemon, as `era status` finds it. */
@@ -22,6 +22,7 @@ export class EraClient extends EventEmitter {
   disarm(): Promise<void>;
   stop(): Promise<StopResult>;
   strength(name: string, gain_db?: number | null): Promise<StrengthResult>;
+  layout(name: string): Promise<LayoutResult>;
   touch(places: [x_m: number, y_m: number][], source?: string): Promise<unknown>;
   close(): void;
   on<T extends Topic>(topic: T, told: (data: Topics[T], event: Extract<Event, { topic: T }>) => void): this;

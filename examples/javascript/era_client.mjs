@@ -116,6 +116,11 @@ export class EraClient extends EventEmitter {
     return this.call("strength", { name, gain_db });
   }
 
+  /** Use one of the daemon's layouts for all fingers that come from now on. */
+  layout(name) {
+    return this.call("layout", { name });
+  }
+
   /** Report all fingers, [[x, y], ...] in metres, the newest last; repeated until the next call. */
   touch(places, source = this.#name) {
     clearInterval(this.#repeat);

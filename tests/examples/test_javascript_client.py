@@ -106,7 +106,10 @@ async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
 
 
 async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) -> None:
-    """It comes back armed, for longer than a lease; another daemon has not given its lease."""
+    """It comes back armed, for longer than a lease; another daemon has not given its lease.
+
+    It has chosen a layout.
+    """
     program = f"""
         import {{ EraClient }} from {json.dumps(str(BUTTON.with_name("era_client.mjs")))};
         const era = await EraClient.connect();
@@ -114,13 +117,16 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
         era.on("lost", ({{ message }}) => {{ console.log("lost", message); process.exit(0); }});
         await era.subscribe("state");
         await era.arm(3);
-        console.log("armed");
+        const {{ layout }} = await era.layout("climate");
+        console.log("armed on", layout);
     """
     (tmp_path / "kept.mjs").write_text(program, encoding="utf-8")
-    async with ready_daemon(tmp_path) as (bench, era):
+    (tmp_path / "layout.yaml").write_text("elsewhere: null\n", "utf-8")
+    layouts = "layouts: {home: layout.yaml, climate: layout.yaml}\n"
+    async with ready_daemon(tmp_path, layouts) as (bench, era):
         process = await started(bench, program=tmp_path / "kept.mjs")
         assert process.stdout is not None
-        awaited = {b"armed\n", f"{ENABLED}\n".encode()}  # in either order
+        awaited = {b"armed on climate\n", f"{ENABLED}\n".encode()}  # in either order
         while awaited:
             awaited -= {await asyncio.wait_for(process.stdout.readline(), PATIENCE)}
         for connection in list(bench.daemon._server._admission.admitted):

@@ -56,7 +56,7 @@ def test_daemon_refuses_files_that_are_no_plain_data(
 ) -> None:
     """As configuration, rig or layout: with the file's name, at once and without executing it."""
     monkeypatch.chdir(tmp_path)
-    path = write_daemon(tmp_path, {"main": "sim://"}, "layout: layout.yaml\n")
+    path = write_daemon(tmp_path, {"main": "sim://"}, "layouts: {panel: layout.yaml}\n")
     (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
     check_daemon(path)
     (tmp_path / role).unlink()
@@ -79,7 +79,7 @@ async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
     """Each invalid file: nothing is applied, not even valid changes beside it; it plays on."""
     layout, config = tmp_path / "layout.yaml", tmp_path / "daemon.yaml"
     layout.write_text(LAYOUT, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
         await era.arm("test", lease_s=60)
         effects = await era.effects()
         async with holding(era, far=bench.far):

@@ -110,7 +110,7 @@ async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
     program = (sys.executable, "-c", hangs)
     async with (
         far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, "layout: layout.yaml\n", program=program) as daemon,
+        daemon_process(tmp_path, far, "layouts: {panel: layout.yaml}\n", program=program) as daemon,
         await daemon.client() as era,
     ):
         await armed(era)

@@ -60,7 +60,9 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A daemon with the example's surface layout."""
     folder = tmp_path_factory.mktemp("daemon")
     (folder / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
-    with real_daemon(folder, "layout: layout.yaml\n", program=patient_daemon.RESTING) as path:
+    with real_daemon(
+        folder, "layouts: {panel: layout.yaml}\n", program=patient_daemon.RESTING
+    ) as path:
         yield path
 
 

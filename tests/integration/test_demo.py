@@ -68,7 +68,7 @@ def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
     """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
 
     Of the first plate that is drawn, on which these touches keep it. Then the same as two people,
-    by a layout that the daemon has reloaded: both that are down together have a content each.
+    by another layout of the daemon: both that are down together have a content each.
     In virtual time; what differs on wires is a far end of its own, see below.
     """
     monkeypatch.setattr(asyncio, "run", run_virtual)

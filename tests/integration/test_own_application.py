@@ -230,9 +230,14 @@ async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Pat
 
 
 async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> None:
-    """Lifted once hidden, disarmed once left or closed, and by its button without a WebSocket."""
+    """Lifted once hidden, disarmed once left or closed, and by its button without a WebSocket.
+
+    Before it has chosen a layout by the gateway's module.
+    """
     async with shown(tmp_path) as (tab, network, ended, origin):
-        socket = ended.enter_context(real_daemon(tmp_path))
+        (tmp_path / "layout.yaml").write_text("elsewhere: null\n", "utf-8")
+        layouts = "layouts: {home: layout.yaml, climate: layout.yaml}\n"
+        socket = ended.enter_context(real_daemon(tmp_path, layouts))
         era = ended.enter_context(Client.connect(socket))
         wait_for_state(era, "READY_TO_SWITCH_ON")
         era.subscribe("state")
@@ -259,6 +264,7 @@ async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> Non
             await tab.until(SAID, lambda text: text.startswith("ready: "))
             await tab.evaluate(opened)
             assert era.status().armed_by is not None
+            assert (await tab.evaluate("own.layout('climate')"))["layout"] == "climate"
             await tab.evaluate(end)
             await until_disarmed()
         await tab.until("own.socket.readyState === WebSocket.CLOSED")

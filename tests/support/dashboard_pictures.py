@@ -91,7 +91,9 @@ def two_people(folder: Path) -> Iterator[Path]:
     layout = layout_of_people(rig.plate, {"left": None, "right": None})
     (folder / "layout.yaml").write_text(json.dumps(layout), encoding="utf-8")
     program = patient_daemon.RESTING
-    with real_daemon(folder, "layout: layout.yaml\n", program=program, table=table) as socket:
+    with real_daemon(
+        folder, "layouts: {panel: layout.yaml}\n", program=program, table=table
+    ) as socket:
         yield socket
 
 

@@ -33,6 +33,8 @@ from controller.api.methods import (
     EffectsResult,
     HelloParams,
     HelloResult,
+    LayoutResult,
+    ReloadResult,
     RenewResult,
     StatusResult,
     StopResult,
@@ -155,6 +157,10 @@ class ScriptedDaemon:
             case "effects":
                 tap = EffectDescription(name="tap", kind="click", description="", parameters={})
                 return EffectsResult(effects=[tap])
+            case "layout":
+                return LayoutResult(layout="home", layouts=["home"])
+            case "reload":
+                return ReloadResult(reloaded=True, reasons=[])
             case "play":
                 raise RpcError(ErrorCode.REFUSED, "there is no such effect", remedy="see effects")
             case "status":

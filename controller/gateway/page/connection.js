@@ -225,6 +225,11 @@ export class Connection {
     this.rejectPending();
   }
 
+  // Use one of the daemon's layouts for all fingers that come from now on; a promise of { layout, layouts }.
+  layout(name) {
+    return this.call("layout", { name });
+  }
+
   // Report all fingers that are down, [{ id, x_m, y_m }, ...], the newest last; repeated until the next
   // call, and reported to the daemon again after a loss.
   touch(touches) {

@@ -48,7 +48,7 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert [era.name for era in config.rig.eras] == ["SW", "SE", "NE", "NW"]
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
     assert config.touch == ()
-    assert (config.table, config.layout, config.dump_folder, config.log_file) == (None,) * 4
+    assert (config.table, config.dump_folder, config.log_file, *config.layouts) == (None,) * 4
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
 
@@ -104,7 +104,7 @@ def test_config_paths_are_relative_to_its_folder(
             "rigg.yaml",
             "tabel: x.npz\n"
             "mode: loud\n"
-            "layout: none.yaml\n"
+            "layouts: {home: none.yaml, climate: gone.yaml}\n"
             "touch:\n"
             '  - {name: a, url: "tuioo:1"}\n'
             '  - {name: a, url: "tuio:3333"}\n'
@@ -116,7 +116,8 @@ def test_config_paths_are_relative_to_its_folder(
                 (1, "rig"),
                 (2, "tabel"),
                 (3, "mode"),
-                (4, "layout"),
+                (4, "layouts.home"),
+                (4, "layouts.climate"),
                 (6, "touch[0].url"),
                 (7, "touch[1].name"),
                 (8, "touch[2].calibration.turned"),
@@ -147,7 +148,7 @@ def test_example_with_several_simulated_amplifiers_is_accepted(name: str) -> Non
     rig = EXAMPLES.resolve() / f"{name}.yaml"
     assert len(config.urls) > 2
     assert config.urls == {each: f"sim://{rig}?amplifier={each}" for each in config.urls}
-    assert config.layout is not None
+    assert None not in config.layouts
 
 
 @pytest.mark.parametrize("of_main", ["sim://", "serial:///dev/x?baud=9600", "serial:///dev/x"])

@@ -154,7 +154,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
     """Every reason is the present one; a stop is at once, and the end within a second."""
     layout = tmp_path / "layout.yaml"
     layout.write_text(_LAYOUT % "buzz", "utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
         asked = answers_take(monkeypatch, 1e6)
         async with holding(era, LEFT, RIGHT):
             await until(lambda: bench.daemon._controller.cycle.tracker.contacts)
@@ -171,7 +171,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
             assert await said(era) == {"stopped: clear (era clear), then arm again"}
             layout.write_text(_LAYOUT % "click", "utf-8")
             os.kill(os.getpid(), signal.SIGHUP)
-            await until(lambda: bench.daemon._layout.layout.regions[1].on_press == "click")
+            await until(lambda: bench.daemon._layouts.player.layout.regions[1].on_press == "click")
             await era.clear()
             await until_state(era, READY)
             await era.arm("test", lease_s=60)
@@ -183,7 +183,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
             assert await said(era) == {None}
         layout.write_text(_LAYOUT % "buzz", "utf-8")
         os.kill(os.getpid(), signal.SIGHUP)
-        await until(lambda: bench.daemon._layout.layout.regions[1].on_press == "buzz")
+        await until(lambda: bench.daemon._layouts.player.layout.regions[1].on_press == "buzz")
         async with holding(era, LEFT, RIGHT):
             await until(lambda: len(asked) == 2)
             begin = clock.now()

@@ -127,13 +127,15 @@ async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
         path = tmp_path / "daemon.yaml"
         original = path.read_text("utf-8")
 
-        async def reload(*changes: tuple[str, str]) -> float:
+        async def reload(*changes: tuple[str, str], refused: str = "") -> float:
             text = original
             for old, new in changes:
                 assert old in text
                 text = text.replace(old, new)
             path.write_text(text, "utf-8")
-            await bench.daemon.reload()
+            verdict = await era.reload()
+            assert verdict.reloaded is not bool(refused)
+            assert refused in verdict.reasons[0]
             return bench.daemon._config.section.level_db_sl
 
         level = "level_db_sl: "
@@ -143,10 +145,12 @@ async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
             await next_event(era, "pattern")  # reported after it plays
             (contact,) = (await era.status()).contacts
         assert 9.99 < contact.level_db_sl < 16  # single precision
-        assert await reload((f"{level}20", f"{level}21")) == 10
-        assert await reload((f"{level}20", f"{level}loud")) == 10
-        assert await reload(("rig: rig", "rig: bench"), (f"{level}20", f"{level}5")) == 10
-        assert await reload(("# more", "dashboard: 127.0.0.1:1"), (f"{level}20", f"{level}5")) == 10
+        lower = (f"{level}20", f"{level}5")
+        assert await reload((f"{level}20", f"{level}21"), refused="while armed") == 10
+        assert await reload((f"{level}20", f"{level}loud"), refused="level_db_sl") == 10
+        assert await reload(("rig: rig", "rig: bench"), lower, refused="rig: ") == 10
+        page = ("# more", "dashboard: 127.0.0.1:1")
+        assert await reload(page, lower, refused="dashboard: ") == 10
         await era.disarm()
         await until_state(era, READY)
         assert await reload((f"{level}20", f"{level}21")) == 21
@@ -214,7 +218,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
 ) -> None:
     """A region's effect plays at its own level; a request needs a finger and at most that level."""
     (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
         view = bench.daemon._publisher.view
 
         async def level_of(effect: str) -> float | None:

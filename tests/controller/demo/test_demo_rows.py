@@ -263,7 +263,7 @@ async def test_fault_that_lasts_aborts_the_demonstration() -> None:
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
         nothing = cast(Any, None)
         with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await run._play([], 0, recorder, nothing, nothing)
+            await run._play([], 0, recorder, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(

@@ -82,8 +82,10 @@ def new_layout(times: int) -> list[At]:
     """Fingers that are down when the layout is replaced, and some that come later."""
     return [
         At(0.0, {1: 20.0, 2: 10.0}, [ONE, TWO]),
-        At(1.0, {2: 10.0}, [ONE, TWO], layouts=times),
-        At(1.1, {1: 20.0, 2: 10.0}, [finger(1, 0.056), TWO]),
+        At(0.01, {1: 20.0, 2: 10.0}, [ONE, TWO], layouts=times),
+        At(0.9, {2: 24.0}, [ONE, TWO], ("buzz", TWO), 24.0),
+        At(1.0, {2: 24.0}, [ONE, TWO], layouts=times),
+        At(1.1, {1: 20.0, 2: 24.0}, [finger(1, 0.056), TWO]),
         At(2.0, {}, []),
         At(3.0, {1: 20.0}, [ONE]),
         At(4.0, {1: 20.0}, [finger(1, 0.05, since=3.5)], layouts=1),  # not asked between

@@ -65,6 +65,8 @@ PARAMETERS: dict[str, dict[str, object]] = {
     "play": {"effect": "tap", "x_m": 0.1, "y_m": 0.2},
     "forget": {},
     "strength": {"name": "page", "gain_db": -6},
+    "layout": {"name": "home"},
+    "reload": {},
 }
 
 

@@ -57,7 +57,8 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> No
     """Its rig, layout and last dumps once, but no table or other files; missing ones are listed."""
     (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
     (tmp_path / "d.yaml").write_text(
-        "rig: rig.yaml\nlayout: none.yaml\ntable: t.npz\ndumps: {folder: dumps}\n", "utf-8"
+        "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\ndumps: {folder: dumps}\n",
+        "utf-8",
     )
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()

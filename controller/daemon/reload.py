@@ -1,0 +1,64 @@
+"""A configuration that is read again while its daemon runs: what has changed, and may be applied.
+
+Nothing here runs in the event loop, as large layouts take a while to compare.
+"""
+
+from dataclasses import dataclass
+
+from controller.daemon.children import read_in_child
+from controller.daemon.config import DaemonConfig
+from registry.garbage_collection import without_collections
+
+_APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
+
+
+@dataclass(frozen=True)
+class ConfigChange:
+    """A configuration, and how it differs from the one in use.
+
+    restart: changed keys that need a restart; changes: all others, in words; layouts: names of
+    those that differ, None for what every touch feels without any; old_max_db_sl, max_db_sl: the
+    highest level of all layouts before and after [dB SL].
+    """
+
+    config: DaemonConfig
+    restart: list[str]
+    changes: list[str]
+    layouts: frozenset[str | None]
+    old_max_db_sl: float
+    max_db_sl: float
+
+    def refusals(self, *, is_armed: bool) -> list[str]:
+        """Why nothing of it may be applied; empty if all may."""
+        reasons = [f"{key}: changed, which needs a restart" for key in self.restart]
+        if is_armed and self.max_db_sl > self.old_max_db_sl:
+            reasons.append(
+                f"maximum level must not increase while armed, got {self.max_db_sl:g} dB SL (was "
+                f"{self.old_max_db_sl:g}); disarm, then reload"
+            )
+        return reasons
+
+
+def read_again(old: DaemonConfig) -> ConfigChange:
+    """Read a daemon's configuration again; blocks, raises as `read_in_child`."""
+    with without_collections():  # of large layouts
+        return config_change(old, read_in_child(old.source))
+
+
+def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
+    """Compare all keys and layouts, and the content of the rig's file."""
+    before, after = old.section.model_dump(), new.section.model_dump()
+    restart = [key for key in before if before[key] != after[key] and key not in _APPLIED]
+    if old.rig_text != new.rig_text and "rig" not in restart:
+        restart.append("rig")
+    was, now = old.layouts, new.layouts
+    differ = [name for name in {**was, **now} if was.get(name) != now.get(name)]
+    changes = [
+        f"layouts.{name}: {'added' if name not in was else 'changed' if name in now else 'removed'}"
+        for name in differ
+        if name is not None
+    ]
+    if before["level_db_sl"] != after["level_db_sl"]:
+        changes.append(f"level_db_sl: from {before['level_db_sl']:g} to {after['level_db_sl']:g}")
+    highest = [max(each.max_db_sl for each in layouts.values()) for layouts in (was, now)]
+    return ConfigChange(new, restart, changes, frozenset(differ), *highest)

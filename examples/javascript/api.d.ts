@@ -250,7 +250,7 @@ export interface PlayParams {
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** at most, and by default, the effect's own */
+  /** from -20; at most, and by default, the effect's own */
   level_db_sl?: number | null;
 }
 

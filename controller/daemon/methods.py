@@ -62,6 +62,7 @@ from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 from registry import clock
+from registry.suggestions import did_you_mean
 
 _logger = logging.getLogger(__name__)
 
@@ -290,9 +291,10 @@ class ApiService:
 
     @api_method()
     def layout(self, client: Connection, params: LayoutParams) -> LayoutResult:
-        """Use one of the daemon's layouts for all fingers that come from now on.
+        """Use one of the daemon's layouts.
 
-        What plays goes on as after a reload.
+        Of resting fingers, what ends by itself and what a program plays goes on to its end; what
+        lasts follows the new layout at once.
         """
         self._layouts.use(params.name)
         return LayoutResult(layout=params.name, layouts=self._layouts.names)
@@ -367,7 +369,7 @@ class ApiService:
                 ErrorCode.REFUSED,
                 f"name must be a touch source or client, got {name!a}",
                 where="name",
-                remedy=f"choose one of {', '.join(known)}",
+                remedy=f"{did_you_mean(name, known)}choose one of {', '.join(known) or 'none'}",
             )
         if params.gain_db is not None:
             self._strengths.set(name, params.gain_db)

@@ -31,6 +31,7 @@ from controller.api.topics import (
 )
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import PlateView, plate_event
+from controller.effects.strengths import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
@@ -158,7 +159,8 @@ class EventPublisher:
     def strengths(self) -> StrengthResult:
         """The strengths of all touch sources and clients that are known."""
         known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
-        names = sorted({*inputs, *known.sources, *[name for _, name in known.clients()]})
+        clients = [name for _, name in known.clients() if not UNNAMED.fullmatch(name)]
+        names = sorted({*inputs, *known.sources, *clients})
         return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
 
     def learning_summary(self) -> LearningSummary | None:

@@ -1,9 +1,10 @@
 """Strengths: a gain on all that a touch source or a client brings, kept by its name."""
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -14,8 +15,14 @@ from registry.regular_file import regular_file
 MAX_NAMES = 64
 """How many touch sources are remembered, and how many names may have a gain."""
 
+UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
+"""Clients that no strength is kept for: commands, and browsers that have given no name."""
+
 _Gains = Annotated[
-    dict[str, Annotated[float, Field(ge=-40, le=0)]],  # as over the API
+    dict[  # as over the API
+        Annotated[str, Field(min_length=1, max_length=2048)],
+        Annotated[float, Field(ge=-40, le=0)],
+    ],
     Field(max_length=MAX_NAMES),
 ]
 _GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
@@ -31,7 +38,7 @@ class Strengths:
 
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
         self.gains_db = gains_db or {}
-        """Those that are set, by name."""
+        """Those that were set, by name; also to 0."""
         self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
         """The clients: the origin with which the keys of their sources begin, and their names."""
         self.sources: Sequence[str] = ()
@@ -48,12 +55,15 @@ class Strengths:
         return sum([gain for name, gain in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:
-        """Set the gain [dB] of a name from now on; 0 removes it.
+        """Set the gain [dB] of a name from now on.
 
-        Raises InputError for one name more than there may be.
+        For one name more than there may be the oldest at 0 is removed. Raises InputError if all
+        others are lower.
         """
-        gains = {name: gain for name, gain in {**self.gains_db, name: gain_db}.items() if gain}
+        gains = {**self.gains_db, name: gain_db}
         if len(gains) > MAX_NAMES:
+            gains.pop(next((each for each, gain in gains.items() if not gain), name))
+        if gain_db and name not in gains:
             raise InputError(
                 f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
                 "another to 0 dB first"
@@ -78,11 +88,24 @@ def read_strengths(file: Path | None) -> Mapping[str, float]:
         return {}
     try:
         with open(file, "rb", opener=regular_file) as stream:
-            return _GAINS.validate_json(stream.read(), strict=True)
+            gains = json.loads(stream.read(), object_pairs_hook=_unique)
+        return _GAINS.validate_python(gains, strict=True)
     except FileNotFoundError:
         return {}
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
     except (ValidationError, OSError) as error:
         raise InputError(
             f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
             "remove it"
         ) from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON; raises InputError for a name that is repeated."""
+    found = dict[str, Any]()
+    for name, value in pairs:
+        if name in found:
+            raise InputError(f"strengths must have each name once, got {name!a} twice")
+        found[name] = value
+    return found

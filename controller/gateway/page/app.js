@@ -12,7 +12,6 @@ const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: the events before or after them are shown.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
-const UNNAMED = /^(gateway|era|web:\d+ .*|http .*)$/;  // clients that no strength is kept for
 // Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
   daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],
@@ -261,8 +260,7 @@ const HANDLERS = {
   },
   strength({ strengths }) {
     const set = (name, gain) => attempt(() => connection.strength(name, gain));
-    const shown = Object.entries(strengths).filter(([name, gain]) => gain || !UNNAMED.test(name));
-    showStrengths(at("strengths-section"), at("strengths"), shown, set);
+    showStrengths(at("strengths-section"), at("strengths"), Object.entries(strengths), set);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

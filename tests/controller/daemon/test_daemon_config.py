@@ -221,3 +221,21 @@ def test_config_commands_create_and_check_daemon_files(
     bad = RUNNER.invoke(config_app, ["check", "d.yaml", "--json"])
     assert bad.exit_code == 1
     assert [error["key"] for error in json.loads(bad.stdout)["errors"]] == ["level"]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ('{"a": -1000}', "must have strengths of -40 to 0 dB by name"),
+        ('{"": -3}', "must have strengths of -40 to 0 dB by name"),
+        ('{"a": NaN}', "must have strengths of -40 to 0 dB by name"),
+        ('{"a": -3, "a": -6}', "strengths must have each name once, got 'a' twice"),
+        ("{'a': -3}", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+    ],
+)
+def test_kept_strengths_are_those_of_the_api(folder: Path, text: str, problem: str) -> None:
+    """A file that was written by hand is refused at the line that names it, with what is wrong."""
+    (folder / "kept.json").write_text(text, "utf-8")
+    with pytest.raises(ConfigError, match=f"daemon.yaml:2: strengths: .*{problem}"):
+        load_daemon_config(written(folder, "strengths: kept.json\n"))

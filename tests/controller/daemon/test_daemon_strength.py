@@ -147,7 +147,7 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         for gain, what in ((3.0, "at most 0"), (-41.0, "at least -40"), (math.nan, "finite")):
             with pytest.raises(InputError, match=f"^strength: gain_db must be .*{what}.*, got"):
                 await era.strength(name="pen", gain_db=gain)
-        with pytest.raises(RpcError, match=r"^name must be .*, got 'pan'; choose one of pen, "):
+        with pytest.raises(RpcError, match=r"^name must be .*, got 'pan'; did you mean pen\? "):
             await era.strength(name="pan", gain_db=-6)
         held.cancel()
         await asyncio.gather(one.close(), other.close())
@@ -159,12 +159,18 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         await other.hello("seat")  # another name by now, while its finger rests
         assert await levels(era) == [11, 14]
         await other.hello("another")
+        await era.strength(name="another", gain_db=0)
         await era.strength(name="pen", gain_db=-40)
         assert await levels(era) == [-26, 20]
         weak, felt = (await era.status()).contacts
         assert (weak.verdict, felt.verdict) == ("held back", "own")
         assert "-46 dB" in (weak.held_back or "")
         held.cancel()
+        await asyncio.gather(one.close(), other.close())
+    async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
+        assert (await era.strength(name="another", gain_db=-1)).strengths == {"another": -1}
+        await bench.client("era")
+        assert (await era.status()).strengths.keys() == {"another", "pen", "seat", "test"}
 
 
 @in_virtual_time

@@ -76,7 +76,7 @@ def gateway(
 
     def announce(port: int) -> None:
         scheme = "https" if settings.is_encrypted else "http"
-        token = "" if settings.is_token_user_supplied else f"#token={settings.token}"
+        token = f"#token={settings.token}" if token_file is None else f" (token in {token_file})"
         print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))
@@ -128,7 +128,8 @@ app = typer.Typer()
 app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)
-for _command in (demo, gateway, report, touch, watch):
+app.command(cls=DashboardCommand)(demo)
+for _command in (gateway, report, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))

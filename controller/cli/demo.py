@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controller.cli.daemon import DASHBOARD
 from model.commands.options import (
     ExactOption,
     JsonOption,
@@ -46,11 +47,12 @@ def demo(
     seed: SeedOption = None,
     as_json: JsonOption = False,
     dashboard: Annotated[
-        bool,
+        str | None,
         typer.Option(
-            "--dashboard", help="Serve a page in the browser to touch the plate yourself."
+            metavar="[HOST:PORT]",
+            help=f"Serve a page in the browser to touch the plate yourself; default: {DASHBOARD}.",
         ),
-    ] = False,
+    ] = None,
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
@@ -69,7 +71,7 @@ def demo(
 
     if wire not in WIRES:
         raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")
-    if dashboard and (touches is not None or as_json):
+    if dashboard is not None and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
     recorded = None if touches is None else Scene(read_capture(touches))
@@ -77,13 +79,12 @@ def demo(
     rig = load_rig(rig_file)
     started = time.perf_counter()
     table, _ = cached_table(rig)
-    if dashboard:
-        from controller.cli.daemon import DASHBOARD
+    if dashboard is not None:
         from controller.gateway.settings import require_gateway
 
         require_gateway()
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
-        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD, seed=drawn))
+        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=dashboard, seed=drawn))
         return
     if not as_json:
         print(

@@ -48,7 +48,6 @@ def gateway_options(address: str, socket: Path) -> list[str]:
             stream.write(f"{secrets.token_urlsafe(32)}\n")
     except OSError as error:
         raise InputError(f"{file}: cannot write the dashboard's token: {error.strerror}") from error
-    _logger.info("dashboard: token in %s", file)
     return [*options, "--token-file", str(file)]
 
 

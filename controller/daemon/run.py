@@ -58,10 +58,7 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
     dashboard: HOST:PORT on the loopback; overrides the file. trace: a file for everything on the
     wires.
     """
-    try:
-        address = None if dashboard is None else loopback_address(dashboard)
-    except ValueError as error:
-        raise InputError(f"--dashboard: {error}") from error
+    address = None if dashboard is None else page_address(dashboard)
     with ExitStack() as stack:
         stack.enter_context(_ignored_signals())
         _check_limits()
@@ -75,6 +72,14 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         stack.callback(log.close)
         _run(config, lock, log=log, dashboard=address or _page_of_file(config))
     atexit.register(leave_work)
+
+
+def page_address(text: str) -> str:
+    """Return the HOST:PORT of an option --dashboard unchanged; raises InputError."""
+    try:
+        return loopback_address(text)
+    except ValueError as error:
+        raise InputError(f"--dashboard: {error}") from error
 
 
 def _page_of_file(config: DaemonConfig) -> str | None:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import os
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -15,6 +16,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
+from controller.daemon.run import page_address
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
@@ -25,6 +27,7 @@ from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
 from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
 from drivers.errors import LinkError
+from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.plate import Plate
@@ -177,8 +180,9 @@ async def run_live(
     Fingers in each strip of the plate feel a vibration of their own, those between them nothing.
     rig_file, wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses
     the default socket, so that `era status` and others reach it. Raises InputError if one runs
-    already, and LinkError.
+    already or another program listens there, and LinkError.
     """
+    _check_free(page_address(dashboard))
     log = start_log(None, level="warning")
     try:
         layout = example_layout(load_rig(rig_file))
@@ -240,6 +244,20 @@ def _daemon_file(
     content = {"rig": _RIG_FILE, "layouts": named, **more}
     file.write_text(json.dumps(content), encoding="utf-8")
     return file
+
+
+def _check_free(address: str) -> None:
+    """Raise InputError unless HOST:PORT can be listened on."""
+    host, _, port = address.rpartition(":")
+    family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
+    try:
+        socket.create_server((host.strip("[]"), int(port)), family=family).close()
+    except OSError as error:
+        raise InputError(
+            f"--dashboard: cannot listen on {address} ({os.strerror(error.errno or 0)}); stop the "
+            "other program or give another address, such as --dashboard 127.0.0.1:0 for any free "
+            "port"
+        ) from error
 
 
 def _free_port() -> int:

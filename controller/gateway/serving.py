@@ -112,7 +112,7 @@ def listen(settings: Settings) -> socket.socket:
         raise InputError(
             f"cannot listen on {settings.host} port {settings.port} "
             f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
-            "(--listen)"
+            "(--listen; of a daemon --dashboard, or dashboard in its file)"
         ) from error
     # Inherited by accepted connections; the system's default limits are some megabytes.
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)

@@ -183,7 +183,9 @@ def test_page_and_daemon(tmp_path: Path) -> None:
     ) as process:
         try:
             assert process.stdout is not None
-            assert process.stdout.readline().startswith("dashboard: http://127.0.0.1:")
+            told = process.stdout.readline()
+            assert told.startswith("dashboard: http://127.0.0.1:")
+            assert told.endswith(f" (token in {socket.with_name('dashboard-token')})\n")
             with Client.connect(socket, timeout=60) as daemon:
                 daemon.subscribe("state")
                 while (state := daemon.status().state) != "READY_TO_SWITCH_ON":

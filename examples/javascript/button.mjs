@@ -7,7 +7,7 @@
 import { EraClient } from "./era_client.mjs";
 
 const places = process.argv.slice(2).map((text) => text.split(",").map(Number));
-if (!places.length || !places.flat().every(Number.isFinite)) {
+if (!places.length || !places.every((place) => place.length === 2 && place.every(Number.isFinite))) {
   console.error("usage: node button.mjs X,Y [X,Y ...]");
   process.exit(2);
 }
@@ -23,9 +23,11 @@ await era.arm().catch(fail);
 await era.touch(places);
 const pattern = await Promise.race([played, seconds(5)]);
 if (pattern) {
-  const contrast = pattern.predicted_contrast_db;
+  const { contacts, predicted_contrast_db: contrast } = pattern;
   console.log(`ERAs ${Object.keys(pattern.drive).sort().join(", ")}`);
-  console.log(contrast === null ? "one finger" : `felt contrast ${contrast.toFixed(1)} dB`);
+  if (contrast !== null) console.log(`felt contrast ${contrast.toFixed(1)} dB`);
+  else if (contacts.length === 1) console.log("one finger");
+  else for (const { id, feels, level_db_sl } of contacts) console.log(`finger ${id}: ${feels}, ${level_db_sl?.toFixed(1)} dB SL`);
   await seconds(1);
 } else {
   const { silence_reason, cause } = await era.status();

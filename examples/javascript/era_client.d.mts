@@ -11,7 +11,7 @@ export class Refused extends Error {
   data: unknown;
 }
 
-/** A connection to the daemon; emits each topic with its data, and "lost" with an Error. */
+/** A connection to the daemon; emits each topic with its data, "opened" after a loss, and "lost" with an Error. */
 export class EraClient extends EventEmitter {
   static connect(path?: string, name?: string): Promise<EraClient>;
   hello: HelloResult;
@@ -26,5 +26,6 @@ export class EraClient extends EventEmitter {
   touch(places: [x_m: number, y_m: number][], source?: string): Promise<unknown>;
   close(): void;
   on<T extends Topic>(topic: T, told: (data: Topics[T], event: Extract<Event, { topic: T }>) => void): this;
+  on(name: "opened", told: (hello: HelloResult) => void): this;
   on(name: "lost", told: (error: Error) => void): this;
 }

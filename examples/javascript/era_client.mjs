@@ -13,6 +13,13 @@ const RETRY_MS = 200; // between attempts to connect again, for PATIENCE_MS
 const RENEWAL_MS = 500;
 const BUSY = 1005; // code of the API
 
+/** Throws a TypeError that names the first value that is no finite number: JSON would make it null. */
+function requireFinite(values) {
+  for (const [key, value] of Object.entries(values)) {
+    if (!Number.isFinite(value)) throw new TypeError(`${key} must be a finite number, got ${value}`);
+  }
+}
+
 /** The socket of this user's daemon, as `era status` finds it. */
 export function defaultSocket(environment = process.env) {
   if (environment.ERA_HAPTICS_SOCKET) return environment.ERA_HAPTICS_SOCKET;
@@ -32,8 +39,9 @@ export class Refused extends Error {
 /**
  * A connection to the daemon. Emits an event named after each subscribed topic, with its data, and
  * "lost" with an Error when the connection or the lease ends unasked. A connection that the daemon
- * closes is made again, with its subscriptions and its lease; what was pending is rejected and not
- * sent again, and nothing arms again.
+ * closes is made again, with its subscriptions and its lease, and "opened" emitted with the new hello:
+ * choose the layout again, as a restarted daemon begins with the first. What was pending is rejected and
+ * not sent again, and nothing arms again.
  */
 export class EraClient extends EventEmitter {
   #path;
@@ -112,19 +120,21 @@ export class EraClient extends EventEmitter {
   }
 
   /** Set the strength of a touch source or client, by its name: -40 to 0 dB. */
-  strength(name, gain_db) {
+  async strength(name, gain_db) {
+    if (gain_db != null) requireFinite({ gain_db });
     return this.call("strength", { name, gain_db });
   }
 
-  /** Use one of the daemon's layouts for all fingers that come from now on. */
+  /** Use one of the daemon's layouts. */
   layout(name) {
     return this.call("layout", { name });
   }
 
   /** Report all fingers, [[x, y], ...] in metres, the newest last; repeated until the next call. */
-  touch(places, source = this.#name) {
-    clearInterval(this.#repeat);
+  async touch(places, source = this.#name) {
     const touches = places.map(([x_m, y_m], index) => ({ id: index + 1, x_m, y_m }));
+    for (const { x_m, y_m } of touches) requireFinite({ x_m, y_m });
+    clearInterval(this.#repeat);
     const report = () => this.call("touch", { source, touches });
     if (touches.length) this.#repeat = setInterval(() => report().catch(() => {}), 50);
     return report();
@@ -174,6 +184,7 @@ export class EraClient extends EventEmitter {
       try {
         await this.#open();
         this.#socket.on("close", () => this.#ended());
+        this.emit("opened", this.hello);
         return;
       } catch {
         this.#socket.destroy();

@@ -108,15 +108,19 @@ async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
 async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) -> None:
     """It comes back armed, for longer than a lease; another daemon has not given its lease.
 
-    It has chosen a layout.
+    It has chosen a layout, and chooses it again; what is no number is refused before it is sent.
     """
     program = f"""
         import {{ EraClient }} from {json.dumps(str(BUTTON.with_name("era_client.mjs")))};
         const era = await EraClient.connect();
         era.on("state", ({{ new: state }}) => console.log(state));
+        era.on("opened", () => era.layout("climate").then(
+            ({{ layout }}) => console.log("opened", layout), () => {{}}));
         era.on("lost", ({{ message }}) => {{ console.log("lost", message); process.exit(0); }});
         await era.subscribe("state");
         await era.arm(3);
+        for (const wrong of [era.strength("javascript", NaN), era.touch([[0, Infinity]])])
+            await wrong.catch(({{ name, message }}) => console.log(name, message));
         const {{ layout }} = await era.layout("climate");
         console.log("armed on", layout);
     """
@@ -126,7 +130,11 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
     async with ready_daemon(tmp_path, layouts) as (bench, era):
         process = await started(bench, program=tmp_path / "kept.mjs")
         assert process.stdout is not None
-        awaited = {b"armed on climate\n", f"{ENABLED}\n".encode()}  # in either order
+        awaited = {  # in either order
+            *(b"armed on climate\n", f"{ENABLED}\n".encode()),
+            b"TypeError gain_db must be a finite number, got NaN\n",
+            b"TypeError y_m must be a finite number, got Infinity\n",
+        }
         while awaited:
             awaited -= {await asyncio.wait_for(process.stdout.readline(), PATIENCE)}
         for connection in list(bench.daemon._server._admission.admitted):
@@ -137,14 +145,18 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
         *states, lost = (await ended(process))[1].splitlines()
         assert (await era.status()).armed_by is None
     assert states.count(ENABLED) == 1  # when it was connected again
+    assert states.count("opened climate") == 1
     assert lost.startswith("lost ")
 
 
-async def test_without_a_daemon_it_says_so() -> None:
-    """One line on standard error and status 1."""
-    status, _, err = await ended(await started(None, TARGET))
-    assert status == 1
-    assert "nosuch.sock" in err
+@pytest.mark.parametrize(
+    ("place", "expected", "said"), [(TARGET, 1, "nosuch.sock"), ("0.1", 2, "X,Y [X,Y ...]")]
+)
+async def test_without_a_daemon_it_says_so(place: str, expected: int, said: str) -> None:
+    """One line on standard error and its status; what is no place is refused before."""
+    status, _, err = await ended(await started(None, place))
+    assert status == expected
+    assert said in err
     assert len(err.splitlines()) == 1
 
 

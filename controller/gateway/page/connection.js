@@ -22,10 +22,18 @@ export class RpcError extends Error {
   }
 }
 
+
+// Throws a TypeError that names the first value that is no finite number: JSON would make it null.
+function requireFinite(values) {
+  for (const [key, value] of Object.entries(values)) {
+    if (!Number.isFinite(value)) throw new TypeError(`${key} must be a finite number, got ${value}`);
+  }
+}
+
 const noResponse = () => new RpcError({ code: 0, message: "the gateway does not respond" });
 
 export class Connection {
-  // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded,
+  // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded, after a loss too,
   // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
   // disarmed() when the lease is lost: refused by the daemon, or not renewed in time, stopped(result) of each stop, lifted() when all fingers were lifted because
   // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
@@ -225,7 +233,8 @@ export class Connection {
     this.rejectPending();
   }
 
-  // Use one of the daemon's layouts for all fingers that come from now on; a promise of { layout, layouts }.
+  // Use one of the daemon's layouts; a promise of { layout, layouts }. A restarted daemon begins with the
+  // first: choose again in `opened`.
   layout(name) {
     return this.call("layout", { name });
   }
@@ -233,6 +242,7 @@ export class Connection {
   // Report all fingers that are down, [{ id, x_m, y_m }, ...], the newest last; repeated until the next
   // call, and reported to the daemon again after a loss.
   touch(touches) {
+    for (const { id, x_m, y_m } of touches) requireFinite({ id, x_m, y_m });
     this.touches = touches;
     if (!this.isOpen) return;
     const params = { source: this.source ?? "page", touches };
@@ -241,6 +251,7 @@ export class Connection {
 
   // Set the strength of a touch source or client, -40 to 0 dB, or ask for it; a promise of it.
   async strength(name, gain_db = null) {
+    if (gain_db !== null) requireFinite({ gain_db });
     return (await this.call("strength", { name, gain_db })).strengths[name];
   }
 

@@ -4,7 +4,7 @@ import { Connection } from "./connection.js";
 import { colourOf, decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
 import { atLeast, fixed, PlateOverlay } from "./plate.js";
-import { addEvent, annotate, showAmplifiers, showEffects, showLatency, showStrengths, timeOfDay } from "./side.js";
+import { addEvent, annotate, showAmplifiers, showEffects, showLatency, showLayouts, showStrengths, timeOfDay } from "./side.js";
 
 const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate", "inputs", "strength"];
 const TOKEN_KEY = "era-haptics-token";
@@ -33,6 +33,7 @@ let lostSince = null;  // when the gateway, the daemon or a link to an amplifier
 let watchdog;  // s; after which an amplifier without commands silences itself
 let silences = [];  // what amplifiers may play that do not reply
 let outage = null;  // the event of the loss of gateway or daemon, until reconnected
+let layouts = [];  // names of those that may be chosen
 let linkLoss = null;  // the event of a lost link, and the number of retries
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
@@ -123,6 +124,8 @@ function showState(next, word, cause, newEpoch = null) {
 
 function showStatus(status) {
   showState(status.state, status.word, status.cause, status.epoch);
+  ({ layouts } = status);
+  showLayouts(at("layout-choice"), at("layouts"), layouts, status.layout);
   watchdog = status.watchdog_s;
   silences = silencesOf(status);
   if (status.lost_for_s !== null) {
@@ -235,7 +238,8 @@ const HANDLERS = {
     showBanner();
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? [], daemon?.readings);
   },
-  layout({ layout }) {
+  layout({ name, layout }) {
+    showLayouts(at("layout-choice"), at("layouts"), layouts, name);
     if (JSON.stringify(layout) === JSON.stringify(daemon.layout)) return;
     daemon.layout = layout;
     overlay.setUp(daemon);
@@ -282,6 +286,11 @@ async function play(effect) {
 async function clear() {
   await attempt(() => connection.call("clear", { epoch }));
   connection.call("status").then(showStatus, () => {});
+}
+
+// Of one that is refused the status shows what is in use.
+async function choose({ target }) {
+  if (await attempt(() => connection.layout(target.value)) === null) connection.call("status").then(showStatus, () => {});
 }
 
 function updateEffects() {
@@ -339,6 +348,7 @@ at("arm").addEventListener("click", () => attempt(() => connection.arm(`dashboar
 at("disarm").addEventListener("click", () => attempt(() => connection.disarm()).then(showButtons));
 at("clear").addEventListener("click", clear);
 at("stop").addEventListener("click", stop);
+at("layouts").addEventListener("change", choose);
 at("motion").addEventListener("change", ({ target }) => fieldView.setMotion(target.checked));
 at("login").addEventListener("submit", (event) => {
   event.preventDefault();

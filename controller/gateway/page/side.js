@@ -109,6 +109,12 @@ export function showEffects(section, container, effects, play) {
   }));
 }
 
+// The layout in use, where one of several may be chosen.
+export function showLayouts(choice, select, names, name) {
+  choice.hidden = names.length < 2;
+  select.replaceChildren(...names.map((each) => new Option(each, each, false, each === name)));
+}
+
 const LOWEST_DB = -40;
 const FADE_MS = 100;  // the daemon leads to another strength within as long
 

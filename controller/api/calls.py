@@ -18,13 +18,18 @@ BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
 
 
 def signature_of(method: Method) -> inspect.Signature:
-    """The parameters of a method after self: required ones by place or name, others by name."""
+    """The parameters of a method after self: required ones by place or name, others by name.
+
+    What `strength` sets is by place, too.
+    """
     parameters = [inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)]
     fields = method.params.model_fields.items()
     for name, field in sorted(fields, key=lambda each: not each[1].is_required()):
         kind, default = inspect.Parameter.KEYWORD_ONLY, field.default
+        if field.is_required() or name == "gain_db":
+            kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         if field.is_required():
-            kind, default = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.empty
+            default = inspect.Parameter.empty
         parameters.append(
             inspect.Parameter(name, kind, default=default, annotation=field.annotation)
         )

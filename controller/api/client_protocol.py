@@ -5,7 +5,9 @@ whereas the server is strict about every request.
 """
 
 import json
+import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -115,14 +117,16 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
 
 def as_position(position: object) -> tuple[float, float]:
     """A finger's x, y [m]; raises InputError."""
-    try:
+    got = shown(position)
+    with suppress(TypeError, ValueError, OverflowError):
         x, y = (float(each) for each in cast("Iterable[float]", position))
-    except (TypeError, ValueError):
-        raise InputError(
-            "a finger's position must be x, y in metres from the plate's south-west corner, such "
-            f"as (0.10, 0.05), got {shown(position)}"
-        ) from None
-    return x, y
+        if math.isfinite(x) and math.isfinite(y):
+            return x, y
+        got = f"({x:g}, {y:g})"
+    raise InputError(
+        "a finger's position must be x, y in metres from the plate's south-west corner, such as "
+        f"(0.10, 0.05), got {got}"
+    )
 
 
 def read_result(result: object, model: type[_MessageT]) -> _MessageT:

@@ -15,7 +15,7 @@ SUMMARIES = {
     "clear": "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.",
     "forget": "Discard what was learned of the plate, and learn anew. Answers are those of the table at once.",
     "touch": "Report all fingers of a touch source of this client.",
-    "layout": "Use one of the daemon's layouts for all fingers that come from now on. What plays goes on as after a reload.",
+    "layout": "Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once.",
     "reload": "Read the daemon's files again, and apply their layouts if nothing else has changed.",
     "effects": "List the effects.",
     "play": "Play an effect at a finger; only while armed.",

@@ -34,7 +34,9 @@ DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
 
 _DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate", "inputs"]
-"""Topics of `era watch`: all but amplifiers and latency, which are published without end."""
+"""Topics of `era watch`: all but those that are published without end, and the whole layout."""
+
+_MORE_TOPICS = ["amplifiers", "latency", "strength", "layout"]
 
 _RELOAD_TIMEOUT = 130.0  # s; the daemon gives up after 60 s, and another may be reloading
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
@@ -138,8 +140,8 @@ def of_method(method: str) -> Callable[..., None]:
 
 def strength(
     name: Annotated[
-        str, typer.Argument(metavar="SOURCE|CLIENT", help="As the JSON of era status has it.")
-    ],
+        str | None, typer.Argument(metavar="[SOURCE|CLIENT]", help="Default: show all.")
+    ] = None,
     gain_db: Annotated[
         float | None, typer.Argument(metavar="[DB]", help="-40 to 0; default: show what is set.")
     ] = None,
@@ -148,10 +150,10 @@ def strength(
 ) -> None:
     """It is kept by this name; what layout and limits allow is 0."""
     with connected(socket) as era:
-        found = era.strength(name, gain_db=gain_db)
+        strengths = (era.status() if name is None else era.strength(name, gain_db)).strengths
     print_report(
-        [f"{each}: {gain:g} dB" for each, gain in found.strengths.items()],
-        found.model_dump(),
+        [f"{each}: {gain:g} dB" for each, gain in strengths.items()],
+        {"strengths": strengths},
         as_json=as_json,
     )
 
@@ -214,11 +216,11 @@ def watch(
         list[str] | None,
         typer.Argument(
             metavar="[TOPIC ...]",
-            help=f"Default: {', '.join(_DEFAULT_TOPICS)}; also amplifiers, latency, layout.",
+            help=f"Default: {', '.join(_DEFAULT_TOPICS)}; also {', '.join(_MORE_TOPICS)}.",
         ),
     ] = None,
     rate: Annotated[
-        float, typer.Option(min=1, max=60, help="Rate of amplifiers and latency [Hz].")
+        float, typer.Option(min=1, max=60, help="Rate of amplifiers, latency and strength [Hz].")
     ] = 1,
     socket: Socket = None,
     as_json: Annotated[

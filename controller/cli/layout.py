@@ -91,7 +91,7 @@ def use(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Use one of the daemon's layouts for all fingers that come from now on."""
+    """Use one of the daemon's layouts; what lasts at resting fingers follows it at once."""
     with connected(socket) as era:
         used = era.layout(name)
     names = ", ".join(used.layouts)

@@ -32,7 +32,7 @@ def show_status(status: StatusResult) -> str:
         *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
         *_given(("  slow: {}", status.slow_reason)),
         *_given(("  armed by {}", armed)),
-        *_given(("  layout {}", status.layout if len(status.layouts) > 1 else None)),
+        *_given(("  layout {}", status.layout and _layout(status))),
         *map(_contact, status.contacts),
         *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
         *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
@@ -62,6 +62,12 @@ def show_status(status: StatusResult) -> str:
         ("  lost events: {}", sum(status.lost_events.values()) or None),
     )
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
+
+
+def _layout(status: StatusResult) -> str:
+    """Return the layout in use, and which there are if there are several."""
+    others = f" (of {', '.join(status.layouts)})" if len(status.layouts) > 1 else ""
+    return f"{status.layout}{others}"
 
 
 def _given(*texts: tuple[str, object]) -> list[str]:

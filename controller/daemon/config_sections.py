@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict
 
 from model.config.sections import Quantity, Section
-from model.config.units import LENGTH, RATIO
+from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
 from model.rig.key_types import Identifier
@@ -41,7 +41,7 @@ def loopback_address(text: str) -> str:
 
 
 File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
-LevelDbSl = Annotated[float, Quantity(RATIO, at_least=-20, at_most=60)]
+LevelDbSl = Annotated[float, Quantity(LEVEL, at_least=-20, at_most=60)]
 
 
 class CalibrationPoint(Section):

@@ -12,14 +12,14 @@ from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
 from model.config.sections import Quantity, Section
-from model.config.units import FREQUENCY, RATIO
+from model.config.units import FREQUENCY, LEVEL
 from model.finger.perception import STRONG_DB_SL
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
 
 MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
-_DB_SL = Quantity(RATIO, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
+_DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
 
 
 MIN_DURATION = 0.020
@@ -31,9 +31,10 @@ MAX_DURATION = 10.0
 def _level(value: object) -> object:
     if value == NEIGHBOURS:
         return NEIGHBOURS
-    if isinstance(value, str):
-        raise ValueError(f"level must be a number of dB SL or {NEIGHBOURS}, got {value[:40]!r}")
-    return _DB_SL.read(value)
+    try:
+        return _DB_SL.read(value)
+    except ValueError as error:
+        raise ValueError(f"{error}; or {NEIGHBOURS}") from error
 
 
 Modulation: TypeAlias = (

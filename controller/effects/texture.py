@@ -16,7 +16,7 @@ from controller.effects.effect import (
 )
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
-from model.config.units import RATIO, SPEED
+from model.config.units import LEVEL, SPEED
 
 # Speed is measured over this time [s]; panels report 60 to 200 times a second.
 _SPEED_WINDOW = 0.060
@@ -47,7 +47,7 @@ class Texture(Effect):
     fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
     """`level` is reached at it; above `slow`."""
 
-    range: Annotated[float, Quantity(RATIO, at_least=0, at_most=40)] = 14.0
+    range: Annotated[float, Quantity(LEVEL, at_least=0, at_most=40)] = 14.0
     """How many dB below `level` at `slow`."""
 
     modulation: Modulation = None

@@ -20,7 +20,7 @@ export interface Methods {
   forget: { params: RequestedBy; result: Empty };
   /** Report all fingers of a touch source of this client. */
   touch: { params: TouchParams; result: Empty };
-  /** Use one of the daemon's layouts for all fingers that come from now on. What plays goes on as after a reload. */
+  /** Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once. */
   layout: { params: LayoutParams; result: LayoutResult };
   /** Read the daemon's files again, and apply their layouts if nothing else has changed. */
   reload: { params: Empty; result: ReloadResult };

@@ -52,6 +52,7 @@ ANGLE = Dimension(
 )
 RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
+LEVEL = Dimension("a level", "dB", "14 dB", {"dB": "1"})
 RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
 
 # The number is split from its unit here and texts are short, so that nothing is evaluated: pint

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import inspect
 import json
+import math
 import os
 import re
 import socket
@@ -369,6 +370,8 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
             (lambda: era.arm("me", lease_s=0.5), "arm: lease_s .*got 0.5"),
             (lambda: era.touch(0.1), "touch: positions .*got 0.1"),  # type: ignore[arg-type]
             (lambda: era.touch((0.1, 0.05)), "position .*got 0.1"),  # type: ignore[arg-type]
+            (lambda: era.touch([(math.nan, 0.05)]), r"position .*got \(nan, 0.05\)$"),
+            (lambda: era.strength("seat", math.nan), "strength: gain_db must be .*got nan"),
             (lambda: era.play("tap", (0.1, 0.1, 0.1)), "position "),  # type: ignore[arg-type]
             (lambda: era.subscribe("weather"), "subscribe: topics.0"),  # type: ignore[arg-type]
             (lambda: Client.connect(tmp_path / "s", name="a\nb"), r"client .*got 'a\\nb'$"),

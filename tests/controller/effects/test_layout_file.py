@@ -45,13 +45,14 @@ def test_load_layout_reads_the_example() -> None:
 
 def test_a_region_says_how_its_fingers_are_to_be_served(tmp_path: Path) -> None:
     """Each key alone; what is a finger's own is not shared."""
-    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}, on_press: buzz"
+    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}, level: 14 dB, on_press: buzz"
     path = tmp_path / "layout.yaml"
     path.write_text(
         f"regions: {{a: {{{shape}, own: true, protected: true}}, b: {{{shape}, may_share: true}}}}",
         encoding="utf-8",
     )
     a, b = load_layout(path, None).regions
+    assert b.level_db_sl == 14
     assert (a.is_own, a.may_share, a.is_protected) == (True, False, True)
     assert (b.is_own, b.may_share, b.is_protected) == (False, True, False)
     assert {key: a.as_json()[key] for key in ("own", "may_share", "protected")} == {

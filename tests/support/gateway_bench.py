@@ -307,7 +307,7 @@ def gateway_process(
             assert process.stdout is not None
             line = process.stdout.readline()
             assert line.startswith("dashboard: "), errors.read_text()
-            url, _, own = line.removeprefix("dashboard: ").strip().partition("#token=")
+            url, _, own = line.split()[1].partition("#token=")
             yield GatewayProcess(process, url, errors, token or own)
         finally:
             process.kill()

@@ -138,7 +138,7 @@ def try_gateway(era: InstalledEra) -> None:
     listening = ("gateway", "--listen", "127.0.0.1:0", "--token-file", "token")
     with era.running("daemon", "panel.yaml"), era.running(*listening) as gateway:
         assert gateway.stdout is not None
-        url = gateway.stdout.readline().strip().removeprefix("dashboard: ")
+        url = gateway.stdout.readline().split()[1]
         with urllib.request.urlopen(url, timeout=PATIENCE) as page:
             expect(b"<html" in page.read(), "no page")
         with urllib.request.urlopen(f"{url}app.js", timeout=PATIENCE) as program:

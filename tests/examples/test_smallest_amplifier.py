@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import era_haptics
+from drivers.by_hand.reaching import identified
 from installed_program import installed_program
 from judged_line import judged
 
@@ -53,6 +54,23 @@ def test_conformance_on_a_clock_that_is_moved(level: float, tmp_path: Path) -> N
     assert not failed, failed[0]
     skipped = {each.check.name for each in found if each.result == "skipped"}
     assert skipped == (SKIPPED if level < 0.5 else SKIPPED - {"limited"})
+
+
+@pytest.mark.real_time
+async def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: Path) -> None:
+    """Its URL is printed, and a host finds it there; without an argument it says what it takes."""
+    program = tmp_path / "amplifier"
+    build = [installed_program("cc", package="gcc"), "-o", program, SOURCE, "-lm"]
+    subprocess.run(build, check=True)
+    bare = subprocess.run([program], capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    assert (bare.returncode, bare.stdout) == (2, "")
+    assert bare.stderr == "usage: amplifier TTY | --pty\n"
+    with subprocess.Popen([program, "--pty"], stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        url = running.stdout.readline().strip()
+        async with identified(url) as amplifier:
+            assert amplifier.identity["serial_number"] == "SMALLEST-1"
+        running.kill()
 
 
 def test_source_is_small() -> None:

@@ -1,5 +1,6 @@
 """The smallest amplifier in C, which shares no table with the host, under conformance."""
 
+import asyncio
 import ctypes
 import subprocess
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import era_haptics
-from drivers.by_hand.reaching import identified
+from drivers.by_hand.actions import identify
 from installed_program import installed_program
 from judged_line import judged
 
@@ -57,19 +58,18 @@ def test_conformance_on_a_clock_that_is_moved(level: float, tmp_path: Path) -> N
 
 
 @pytest.mark.real_time
-async def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: Path) -> None:
+def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: Path) -> None:
     """Its URL is printed, and a host finds it there; without an argument it says what it takes."""
     program = tmp_path / "amplifier"
     build = [installed_program("cc", package="gcc"), "-o", program, SOURCE, "-lm"]
     subprocess.run(build, check=True)
-    bare = subprocess.run([program], capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    bare = subprocess.run([program], capture_output=True, text=True, check=False)
     assert (bare.returncode, bare.stdout) == (2, "")
     assert bare.stderr == "usage: amplifier TTY | --pty\n"
     with subprocess.Popen([program, "--pty"], stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         url = running.stdout.readline().strip()
-        async with identified(url) as amplifier:
-            assert amplifier.identity["serial_number"] == "SMALLEST-1"
+        assert asyncio.run(identify(url))["serial_number"] == "SMALLEST-1"
         running.kill()
 
 

@@ -13,32 +13,29 @@ from controller.api.topics import TOPICS, EventParams
 
 
 def api_reference() -> str:
-    """All tables, as Markdown."""
+    """All lists, as Markdown."""
     models: dict[str, type[Message]] = {}
     lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
-        lines += ["", f"#### {name}", "", " ".join([SUMMARIES[name], *_notes(method)]), ""]
-        lines += [*_HEAD, *rows]
+        lines += ["", f"#### {name}", "", " ".join([SUMMARIES[name], *_notes(method)]), "", *rows]
     lines += ["", "### Topics", "", "The parameters of every `event` notification, and its `data`:"]
-    lines += ["", *_HEAD, *_rows("", EventParams, models)]
+    lines += ["", *_rows("", EventParams, models)]
     for topic, entry in TOPICS.items():
-        lines += [f"| **{topic}** | | {entry.summary} |", *_data(entry.data, models)]
+        lines += [f"- **{topic}**: {entry.summary}"]
+        lines += [f"  {row}" for row in _data(entry.data, models)]
     lines += ["", "### Types"]
     shown: set[str] = set()
     while left := [name for name in models if name not in shown]:
         for name in left:
             shown.add(name)
             rows = list(_rows("", models[name], models))
-            lines += ["", f"#### {name}", "", _summary(models[name]), "", *_HEAD, *rows]
+            lines += ["", f"#### {name}", "", _summary(models[name]), "", *rows]
     lines += ["", "### Errors", "", "| code | name | meaning |", "|---|---|---|"]
     lines += [
         f"| {code.value} | {code.name} | {meaning} |" for code, meaning in ERROR_MEANINGS.items()
     ]
     return "\n".join(lines) + "\n"
-
-
-_HEAD = ("| key | type | |", "|---|---|---|")
 
 
 def _notes(method: Method) -> Iterator[str]:
@@ -64,16 +61,16 @@ def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -
         if prefix == "→ " and isinstance(field.default, float):
             optional += f", by default {field.default:g}"
         notes = "; ".join(part for part in (field.description, optional) if part)
-        yield f"| {prefix}`{name}` | {kind} | {notes} |"
+        yield f"- {prefix}`{name}` ({kind}){notes and f': {notes}'}"
 
 
 def _data(model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
     """The rows of a topic; what `status` returns as well is one of them."""
     status = set(_rows("", METHODS["status"].result, models))
     rows = list(_rows("", model, models))
-    same = [row.split(" | ")[0].removeprefix("| ") for row in rows if row in status]
+    same = [row.split(" (")[0].removeprefix("- ") for row in rows if row in status]
     if len(same) > 1:
-        yield f"| {', '.join(same)} | as of [status](#status) | |"
+        yield f"- {', '.join(same)}: as of [status](#status)"
     yield from (row for row in rows if len(same) < 2 or row not in status)
 
 

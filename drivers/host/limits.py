@@ -107,7 +107,6 @@ class Rounding:
         self._channels: int = capabilities["channels"]
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
-        self._level_max = limits.level / _LEVEL.per_unit
         self.achieved: dict[tuple[int, int], int] = {}
         """Frequencies that the amplifier plays in place of others, by channel and frequency."""
 
@@ -158,7 +157,7 @@ class Rounding:
                 )
             if channel in commands:
                 raise refused(channel, "must occur once in a layer")
-            if not 0 <= level <= self._level_max * TOLERANCE:  # nor NaN
+            if not 0 <= level * _LEVEL.per_unit < limits.level + 0.5:  # a step of the wire; nor NaN
                 raise self._level_refused(channel, "level", level)
             if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
                 values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
@@ -187,7 +186,8 @@ class Rounding:
         return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
-        return refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
+        highest = self._limits.level / _LEVEL.per_unit
+        return refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
 
     def _check_envelopes(self, tones: Sequence[Tone]) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""

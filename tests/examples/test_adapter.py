@@ -141,25 +141,6 @@ SCRIPT = Path(era_haptics.__file__).parents[1] / "examples" / "adapter" / "scpi.
 LIMITS = GuardLimits(20.0, 900.0, 1.0)
 FULL = 5.0  # V
 PATIENCE = 60.0  # s
-HOST = """
-import asyncio, sys
-from drivers.playing.contents import Layer, Tone
-from drivers.host.group import Group
-from drivers.opening import Lines
-from registry.limits import GuardLimits
-async def main():
-    limits = GuardLimits(20.0, 900.0, 1.0)
-    host = await Lines().amplifier(sys.argv[1], limits, name="a", is_output=True)
-    group = Group({"a": host}, watchdog=0.25)
-    await group.open()
-    await group.arm()
-    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]})
-    print("plays", flush=True)
-    while True:
-        await group.beat()
-asyncio.run(main())
-"""
-
 pytestmark = pytest.mark.real_time
 
 
@@ -244,6 +225,17 @@ async def armed(url: str, watchdog: float = 2.0) -> AsyncIterator[tuple[Group, A
         await lines.close()
 
 
+@asynccontextmanager
+async def playing(
+    watchdog: float = 2.0,
+) -> AsyncIterator[tuple[Instrument, Popen[bytes], Group, Amplifier]]:
+    """The instrument and the adapter, driven by a host whose set is heard."""
+    async with driven() as (instrument, program, url), armed(url, watchdog) as (group, host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        yield instrument, program, group, host
+
+
 def layer(level: float, *, ramp: float = 0.0, keep_phase: bool = False) -> Layer:
     """Two tones of 100 Hz, the second at full level and 120 degrees behind."""
     first = Tone(0, 100.0, level, 30.0, keep_phase=keep_phase)
@@ -259,7 +251,7 @@ async def state(host: Amplifier, name: str) -> None:
                 return
 
 
-async def playing(group: Group, one: Layer) -> None:
+async def failing(group: Group, one: Layer) -> None:
     """Play until that fails."""
     async with asyncio.timeout(PATIENCE):
         await group.apply({"a": [one]})
@@ -292,9 +284,7 @@ async def test_force_is_that_of_the_set_and_follows_it() -> None:
 
 async def test_confirmed_stop_has_switched_the_outputs_off() -> None:
     """At the moment at which the host takes it for confirmed."""
-    async with driven() as (instrument, _, url), armed(url) as (group, _host):
-        await group.apply({"a": [layer(0.5)]})
-        await instrument.until(silent=False)
+    async with playing() as (instrument, _, group, _host):
         stopped = await group.stop()
         assert stopped["a"].is_confirmed
         assert instrument.is_silent
@@ -302,9 +292,7 @@ async def test_confirmed_stop_has_switched_the_outputs_off() -> None:
 
 async def test_watchdog_switches_the_outputs_off() -> None:
     """200 ms without a heartbeat."""
-    async with driven() as (instrument, _, url), armed(url, 0.2) as (group, host):
-        await group.apply({"a": [layer(0.5)]})
-        await instrument.until(silent=False)
+    async with playing(0.2) as (instrument, _, _group, host):
         await instrument.until(silent=True)
         await state(host, "FAULT")
         assert (await host.read_status())["fault"] == FAULTS["WATCHDOG"]
@@ -312,12 +300,10 @@ async def test_watchdog_switches_the_outputs_off() -> None:
 
 async def test_mute_instrument_is_never_reported_silent() -> None:
     """It trips, no stop is confirmed; once the instrument replies again it is switched off."""
-    async with driven() as (instrument, _, url), armed(url) as (group, host):
-        await group.apply({"a": [layer(0.5)]})
-        await instrument.until(silent=False)
+    async with playing() as (instrument, _, group, host):
         instrument.is_mute = True
         with pytest.raises((CommandRefused, LinkError)):
-            await playing(group, layer(0.3))
+            await failing(group, layer(0.3))
         stopped = await group.stop()
         assert not stopped["a"].is_confirmed
         assert not instrument.is_silent
@@ -331,9 +317,7 @@ async def test_mute_instrument_is_never_reported_silent() -> None:
 @pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGSTOP])
 async def test_ended_or_stalled_adapter_is_silenced_by_its_watcher(what: signal.Signals) -> None:
     """Killed or paused while it plays; one that was paused ends when it goes on."""
-    async with driven() as (instrument, program, url), armed(url) as (group, _host):
-        await group.apply({"a": [layer(0.5)]})
-        await instrument.until(silent=False)
+    async with playing() as (instrument, program, _group, _host):
         program.send_signal(what)
         await instrument.until(silent=True)
         if what is signal.SIGSTOP:
@@ -343,11 +327,9 @@ async def test_ended_or_stalled_adapter_is_silenced_by_its_watcher(what: signal.
 
 async def test_instrument_that_reports_an_error_is_switched_off() -> None:
     """An error in its queue, here one that a person at the front panel has caused."""
-    async with driven() as (instrument, _, url), armed(url) as (group, host):
-        await group.apply({"a": [layer(0.5)]})
-        await instrument.until(silent=False)
+    async with playing() as (instrument, _, group, host):
         instrument.errors.append((-222, "Data out of range"))
         with pytest.raises((CommandRefused, LinkError)):
-            await playing(group, layer(0.3))
+            await failing(group, layer(0.3))
         await state(host, "FAULT")
         assert instrument.is_silent

@@ -205,38 +205,3 @@ def test_daemon_continues_when_gateways_are_killed_under_load(
     with Client.connect(daemon, name="test") as era:
         sources = {contact.source for contact in era.status().contacts}
     assert len(sources) == 1  # the watch's own
-
-
-def test_gateway_serves_during_a_flood_of_requests(gateway: GatewayProcess, watched: Watch) -> None:
-    """Ten thousand requests per second over WebSockets; another client is served over HTTP."""
-    over = threading.Event()
-    sent = [0] * 4
-
-    def flood(number: int) -> None:
-        request = (
-            b'{"jsonrpc":"2.0","id":1,"method":"status","params":{}}',
-            b'{"jsonrpc":"2.0","method":"effects","params":{}}',
-            b'{"jsonrpc":"2.0","method":"touch","params":{"source":"me","touches":'
-            b'[{"id":1,"x_m":0.2,"y_m":0.1}]}}',
-            b"garbage",
-        )[number]
-        burst = frame(request) * 25  # each 10 ms: 2500 in a second each
-        while not over.is_set():
-            with contextlib.suppress(OSError, AssertionError), RawWebSocket(gateway) as ws:
-                ws.connection.settimeout(1)
-                while not over.wait(0.01):
-                    ws.connection.sendall(burst)
-                    sent[number] += 25
-
-    threads = [threading.Thread(target=flood, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    try:
-        wait_for(lambda: min(sent) > 0)  # all four flood
-        before = watched.looks
-        wait_for(lambda: http(gateway, "/api/v1/effects", body=b"{}").status == 200)
-        wait_for(lambda: watched.looks > before)
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join()

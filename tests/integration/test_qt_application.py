@@ -13,39 +13,43 @@ from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
 
 FOLDER = Path(__file__).parents[2] / "examples" / "application"
 
+Until = Callable[[Callable[[], object]], None]
+
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 
 
 @pytest.fixture
-def _qt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PySide6 without a screen; its absence is a failure only where `make qt-test` installs it."""
+def until(monkeypatch: pytest.MonkeyPatch) -> Until:
+    """Wait for a condition of PySide6 without a screen.
+
+    Its absence is a failure only where `make qt-test` installs it.
+    """
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
     monkeypatch.syspath_prepend(FOLDER)
     try:
-        import qt_plate  # noqa: F401
+        from PySide6.QtWidgets import QApplication
     except ImportError as error:
         reason = f"no PySide6 ({error}): make qt-test installs it, apt libegl1 and libgl1"
         if (Path(sys.prefix) / "installed-qt").exists():
             pytest.fail(reason)
         pytest.skip(reason)
+    application = QApplication.instance() or QApplication([])
 
-
-@pytest.mark.usefixtures("_qt")
-def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
-    """By a mouse; after a new daemon, and a gateway that hangs, it follows and stays disarmed."""
-    from PySide6.QtCore import QPoint, Qt
-    from PySide6.QtTest import QTest
-    from PySide6.QtWidgets import QApplication
-    from qt_plate import Plate, Window
-
-    application = QApplication([])
-
-    def until(condition: Callable[[], object]) -> None:
+    def wait(condition: Callable[[], object]) -> None:
         def processed() -> object:
             application.processEvents()
             return condition()
 
         wait_for(processed)
+
+    return wait
+
+
+def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path, until: Until) -> None:
+    """By a mouse; after a new daemon, and a gateway that hangs, it follows and stays disarmed."""
+    from PySide6.QtCore import QPoint, Qt
+    from PySide6.QtTest import QTest
+    from qt_plate import Plate, Window
 
     with gateway_process(tmp_path, tmp_path / "era.sock") as gateway:
         window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
@@ -91,22 +95,13 @@ def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path) -> No
             assert era.status().state == "QUICK_STOP_ACTIVE"
 
 
-@pytest.mark.usefixtures("_qt")
-def test_application_without_its_user_or_connection_lifts_and_disarms(tmp_path: Path) -> None:
+def test_application_without_its_user_or_connection_lifts_and_disarms(
+    tmp_path: Path, until: Until
+) -> None:
     """A hidden window, a closed one, and Disarm without a WebSocket; no lease runs out."""
     from PySide6.QtCore import QPoint, Qt
     from PySide6.QtTest import QTest
-    from PySide6.QtWidgets import QApplication
     from qt_plate import Plate, Window
-
-    application = QApplication.instance() or QApplication([])
-
-    def until(condition: Callable[[], object]) -> None:
-        def processed() -> object:
-            application.processEvents()
-            return condition()
-
-        wait_for(processed)
 
     with (
         real_daemon(tmp_path) as socket,

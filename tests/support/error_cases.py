@@ -243,6 +243,10 @@ def filled(shelf: Path) -> Iterator[None]:
         yield
 
 
+_TYPED = re.compile(r"# [\w.]+: |\$ ")
+"""A line of a file, or a command; other lines of `#` are words."""
+
+
 @dataclass(frozen=True)
 class Quotation:
     """An error of the page: the lines that are typed, the message, and the promised status."""
@@ -255,7 +259,7 @@ class Quotation:
 def quotations(page: str) -> list[Quotation]:
     """The errors of the page in their order, each with the exit status of its section.
 
-    Blank lines part those of a section; the first line of each says what is wrong.
+    Blank lines part those of a section; a first line of words says what the message does not.
     """
     found, status = [], -1
     for section in page.split("\n## ")[1:]:
@@ -263,9 +267,10 @@ def quotations(page: str) -> list[Quotation]:
             status = int(promised[1])
         for box in section.split("```text\n")[1:]:
             for entry in box.split("\n```")[0].split("\n\n"):
-                lines = entry.splitlines()[1:]
-                typed = [line for line in lines if line.startswith(("# ", "$ "))]
-                found.append(Quotation(typed, "\n".join(lines[len(typed) :]), status))
+                lines = entry.splitlines()
+                typed = [line for line in lines if _TYPED.match(line)]
+                text = lines[lines.index(typed[-1]) + 1 :]
+                found.append(Quotation(typed, "\n".join(text), status))
     return found
 
 

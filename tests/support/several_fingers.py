@@ -22,6 +22,8 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
 from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
+from drivers.errors import CommandRefused
+from drivers.playing.contents import Layer
 from model.answer.answer import Limits
 from model.answer.timing import Timing
 from model.arrays import FloatArray
@@ -110,6 +112,33 @@ class Fingers(Chain):
         """Note what requests of the host change."""
         super().__post_init__()
         self.committed = self.far_end.committed
+
+    @property
+    def player(self) -> EffectPlayer:
+        """What the layout makes of the fingers."""
+        player = self.controller._intent_source
+        assert isinstance(player, EffectPlayer)
+        return player
+
+    def play(self, effect: str, id: int = 1) -> None:
+        """Play an effect at a finger, as a client does."""
+        (contact,) = [each for each in self.applied[-1].contacts if each.key.id == id]
+        self.player.play(effect, contact, clock.now(), level_db_sl=None)
+        self.controller.cycle.request_update()
+
+    def refuse(self, why: str, is_refused: Callable[[Sequence[Layer]], bool]) -> list[float]:
+        """Let the ledger refuse some layers for a reason; returns when [s] it does."""
+        layers, refused = self.controller.cycle.planner.layers, list[float]()
+        check = layers.check
+
+        def refuse(asked: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
+            if not is_refused(asked["main"]):
+                return check(asked)
+            refused.append(clock.now())
+            return CommandRefused(why)
+
+        layers.check = refuse
+        return refused
 
     def reached(
         self, *, over: float = 0.25

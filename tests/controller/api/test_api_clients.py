@@ -43,36 +43,23 @@ PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 
-async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> None:
-    """Armed for longer than a lease, touched, notified, stopped and cleared, from a thread."""
+async def test_client_plays_and_receives_events(tmp_path: Path) -> None:
+    """Armed, touched and notified from a thread; disarmed after its block."""
     async with ready_daemon(tmp_path) as (bench, _):
 
         def study() -> list[str]:
-            seen: list[str] = []
             with Client.connect(bench.socket, name="study") as era:
                 era.subscribe("pattern", "state")
                 with era.armed("study", lease_s=60):
-                    end = time.monotonic() + 1.3
-                    while time.monotonic() < end or not era.status().drive:
+                    while not era.status().drive:
                         era.touch([PLACE])
                         time.sleep(0.03)
-                    seen.append(era.status().state)
                 era.unsubscribe("pattern")
-                with era.armed("study"):
-                    era.stop()  # by this client itself, so that no lease is lost
-                with pytest.raises(RpcError) as caught:
-                    era.arm("study")
-                assert caught.value.code is ErrorCode.WRONG_STATE
-                assert caught.value.data.remedy is not None
-                era.clear()
-                seen.append(era.status().state)
-                seen += [event.topic for event in era.events(timeout=0.2)]
-            return seen
+                return [event.topic for event in era.events(timeout=0.2)]
 
         seen = await asyncio.to_thread(study)
-        assert seen[:2] == [ENABLED, READY]
-        assert "pattern" in seen[2:]
-        assert seen.count("state") >= 6
+        assert "pattern" in seen
+        assert seen.count("state") >= 5  # at first, then on, enabled, off and ready
 
 
 @in_virtual_time

@@ -120,21 +120,6 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
 
 
 @in_virtual_time
-async def test_fault_stops_and_must_be_cleared(tmp_path: Path) -> None:
-    """Over-voltage: silent and latched."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.arm("me", lease_s=30)
-        async with holding(era, far=bench.far):
-            bench.far.device.inject_fault(FaultWindow(fault="over_voltage"))
-            await until_state(era, "FAULT")
-        assert not any(bench.far.summary().levels)
-        assert "OVER_VOLTAGE" in (await era.status()).cause
-        assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
-        await era.clear()
-        await until_state(era, READY)
-
-
-@in_virtual_time
 async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
     """While armed a lower level; no higher one, invalid one or one beside another change."""
     async with ready_daemon(tmp_path, "level_db_sl: 20\n# more\n") as (bench, era):

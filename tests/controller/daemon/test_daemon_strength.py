@@ -47,7 +47,10 @@ async def seats(folder: Path, more: str = "") -> AsyncIterator[tuple[DaemonBench
     def table(rig: Rig) -> LocalizationTable:
         return phased_table()
 
-    async with ready_daemon(folder, f"layouts: {{panel: layout.yaml}}\n{more}", table=table) as (bench, era):
+    async with ready_daemon(folder, f"layouts: {{panel: layout.yaml}}\n{more}", table=table) as (
+        bench,
+        era,
+    ):
         bench.far.bench.place_fingers(PLACES, now=clock.now())
         await era.arm("test", lease_s=60)
         yield bench, era

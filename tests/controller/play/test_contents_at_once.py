@@ -1,7 +1,6 @@
 """Several fingers, each with a content of its own, on the plate in virtual time."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,14 +11,12 @@ from controller.daemon.messages import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
-from controller.effects.player import EffectPlayer
 from controller.play.intent import Target
 from controller.play.layers import LayerContent, Layers, Sets
 from controller.play.observer import PlayReport
 from controller.play.planner import ENDED
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.playing.contents import Layer
 from model.answer import answer
 from model.arrays import Complex64Array
 from model.errors import InputError
@@ -149,35 +146,6 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
 
 
 @in_virtual_time
-async def test_a_refused_content_is_left_out_and_the_other_plays_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Two contents are refused together: the newer finger is told why, the other is not silent.
-
-    The newer is tried again 50 ms later, when what the other felt before has faded, and no more.
-    """
-    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
-        check, count = fingers.controller.cycle.planner.layers.check, len(fingers.committed)
-        (own,), refused, loop = fingers.applied[-1].contents, [], asyncio.get_running_loop()
-
-        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            others = [each for each in layers["main"] if each.number != own]
-            if any(tone.level for each in others for tone in each.tones):
-                refused.append(loop.time())
-                return CommandRefused("too much power")
-            return check(layers)
-
-        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.3)
-        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
-        assert felt == {1: None, 2: "too much power"}
-        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
-        assert [_id(one) for one in fingers.applied[-1].contents.values()] == [1]
-        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
-
-
-@in_virtual_time
 async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that() -> None:
     """A finger's vibration is raised amid the 40 ms of another's click: both need 1.2 strokes.
 
@@ -187,13 +155,10 @@ async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that(
     effects = {**LAYOUT.effects, "click": Click(level=44.0), "loud": Buzz(level=44.0)}
     layout = SurfaceLayout(regions, effects, elsewhere=None)
     async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
-        begin, (contact,) = asyncio.get_running_loop().time(), fingers.applied[-1].contacts
+        begin = asyncio.get_running_loop().time()
         fingers.at[2] = RIGHT
         await fingers.hold(0.012)
-        player = fingers.controller._intent_source
-        assert isinstance(player, EffectPlayer)
-        player.play("loud", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-        fingers.controller.cycle.request_update()
+        fingers.play("loud")
         await fingers.hold(0.2)
         raised = [each for each in fingers.applied if each.time > begin + 0.012]
         felt = [each for applied in raised for each in applied.targets if each.contact.key.id == 1]
@@ -206,48 +171,13 @@ async def test_what_lasts_has_what_a_loud_click_leaves_and_all_of_it_after_that(
 
 
 @in_virtual_time
-async def test_what_is_refused_beside_a_click_is_felt_after_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The refusal does not say until when; 20 ms after its end the click has faded."""
-    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
-    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
-    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
-        check, refused, loop = (
-            fingers.controller.cycle.planner.layers.check,
-            [],
-            asyncio.get_running_loop(),
-        )
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.012)
-        clicked = fingers.applied[-1].time
-
-        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            (own,) = [each for each in layers["main"] if each.number == 0] or [Layer(0)]
-            if loop.time() < clicked + 0.06 and any(tone.level for tone in own.tones):
-                refused.append(loop.time())
-                return CommandRefused("too much power")
-            return check(layers)
-
-        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
-        fingers.at[1] = (LEFT[0] + 0.01, LEFT[1])
-        await fingers.hold(0.3)
-        assert refused
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
-        assert fingers.applied[-1].time - clicked <= 0.15
-
-
-@in_virtual_time
 async def test_what_is_refused_as_a_click_of_its_finger_fades_is_felt_after_it() -> None:
     """Both need 1.1 strokes: it is refused once the click has ended by itself, and once only."""
     effects = {**LAYOUT.effects, "low": Buzz(level=36.0), "click": Click(level=50.0)}
     layout = replace(LAYOUT, effects=effects)
     async with fingers_on(table(), layout, at={1: LEFT}, held=0.6) as fingers:
-        player, (contact,) = fingers.controller._intent_source, fingers.applied[-1].contacts
-        assert isinstance(player, EffectPlayer)
         begin = asyncio.get_running_loop().time()
-        player.play("click", contact, begin, level_db_sl=None)
-        fingers.controller.cycle.request_update()
+        fingers.play("click")
         await fingers.hold(1.0)
         assert len(fingers.refused) == 1
         (target,) = fingers.applied[-1].targets
@@ -278,26 +208,6 @@ async def test_a_finger_that_rests_feels_again_what_an_amplifier_refused_once(
         (applied,) = fingers.applied
         assert applied.is_touch
         assert applied.latency == pytest.approx(1.0, abs=0.1)
-
-
-@in_virtual_time
-async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
-        check, count = fingers.controller.cycle.planner.layers.check, len(fingers.committed)
-
-        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            if any(not each.tones and not each.renew for each in layers["main"]):
-                return CommandRefused("an ending is too loud")
-            return check(layers)
-
-        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
-        del fingers.at[1]
-        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
-        await fingers.hold(0.3)
-        (_, _, sent), *_ = fingers.committed[count:]
-        assert sorted(any(c.level for c in one.commands) for one in sent) == [False, True]
-        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
 
 
 @in_virtual_time
@@ -341,10 +251,7 @@ async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
         contents = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
         count = len(fingers.committed)
-        player, contact = fingers.controller._intent_source, fingers.applied[-1].contacts[0]
-        assert isinstance(player, EffectPlayer)
-        player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-        fingers.controller.cycle.request_update()
+        fingers.play("tick")
         await fingers.hold(0.4)
         changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
         assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2
@@ -522,10 +429,9 @@ async def test_an_answer_of_a_former_layout_is_not_played(
     async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.5) as fingers:
         fingers.at[2] = RIGHT
         await fingers.hold(0.03)
-        player, count = fingers.controller._intent_source, len(fingers.applied)
-        assert isinstance(player, EffectPlayer)
+        count = len(fingers.applied)
         bands = [replace(region, band=(200.0, 320.0)) for region in LAYOUT.regions]
-        player.replace(replace(LAYOUT, regions=tuple(bands)))
+        fingers.player.replace(replace(LAYOUT, regions=tuple(bands)))
         fingers.controller.cycle.request_update()
         await fingers.hold(0.3)
         (applied,) = fingers.applied[count:]
@@ -541,12 +447,9 @@ async def test_an_effect_that_is_played_again_before_its_answer_is_felt(
     answering_after(0.05, monkeypatch)
     layout = replace(LAYOUT, effects={**LAYOUT.effects, "long": Buzz(level=14.0, duration=0.5)})
     async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.3) as fingers:
-        player, count = fingers.controller._intent_source, len(fingers.applied)
-        assert isinstance(player, EffectPlayer)
-        (contact,) = [each for each in fingers.applied[-1].contacts if each.key.id == 1]
+        count = len(fingers.applied)
         for _ in range(10):
-            player.play("long", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-            fingers.controller.cycle.request_update()
+            fingers.play("long")
             await fingers.hold(0.03)
         names = {
             one.content.targets[0][1].content

@@ -1,21 +1,20 @@
 """A modulated content beside a steady one, over the wire at the fingertips."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.signal import hilbert
 
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.play.content import Content, Targets
+from controller.play.content import Content
 from controller.play.intent import Pulse, Target
 from controller.play.layers import LayerContent, Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
-from drivers.errors import CommandRefused
 from model.answer.answer import Layer
 from model.answer.fingers import Placement
 from model.answer.timing import Timing
@@ -133,44 +132,24 @@ async def test_voices_of_one_finger_end_together() -> None:
 
 @in_virtual_time
 async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
-    """A carrier without one side band would be another content: the finger feels none."""
+    """A carrier without one side band would be another content: the finger feels none.
+
+    It is tried again 50 ms later, when what the other felt before has faded, and no more; the other
+    plays on.
+    """
     async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
-        layers_of_all = fingers.controller.cycle.planner.layers
-        check, refusals = layers_of_all.check, []
-
-        def refusing(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            (played,) = layers.values()
-            if sum(any(tone.level for tone in each.tones) for each in played) >= 3:
-                refusals.append(layers)
-                return CommandRefused("no more")
-            return check(layers)
-
-        layers_of_all.check = refusing
-        fingers.at[1] = LEFT
+        refused = fingers.refuse(
+            "no more",
+            lambda layers: sum(any(t.level for t in each.tones) for each in layers) >= 3,
+        )
+        fingers.at[1], count = LEFT, len(fingers.committed)
         await fingers.hold(0.5)
-        assert refusals
+        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
+        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
         targets = {each.contact.key.id: each for each in fingers.applied[-1].targets}
         assert targets[1].held_back == "no more"
         assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1
         assert {one.content.key[0].id for one in fingers.applied[-1].contents.values()} == {2}
-
-
-def test_a_click_of_its_finger_restarts_no_modulated_content_that_others_feel() -> None:
-    """It is of another content, in a layer of its own: carrier and side bands play on."""
-    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
-    shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
-    click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
-
-    def content(targets: Targets, frequency: float, voice: int = 0) -> Content:
-        pattern = Layer({"SW": Tone(frequency, 1e-6)})
-        return Content((targets[0][0].key, voice), targets, Placement((LEFT,)), pattern)
-
-    voices = [content(shared, 100.0 + 20 * (voice % 3 - 1), voice) for voice in range(3)]
-    playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    contents = {number: LayerContent(one, one.layer, drive={}) for number, one in enumerate(voices)}
-    playing.start(Sets(started=frozenset(contents)), contents, 0.0)
-    every = playing.numbered([*voices, content(((contacts[0], click),), 150.0)])
-    assert playing.starting(every) == ([3], set())
 
 
 def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:

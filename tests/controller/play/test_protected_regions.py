@@ -1,8 +1,6 @@
 """What reaches fingers that it is not for: regions where others are not noticed, and leaks."""
 
-import asyncio
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
@@ -11,11 +9,8 @@ from controller.daemon.messages import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
-from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
-from drivers.errors import CommandRefused
-from drivers.playing.contents import Layer
 from model.config.shapes import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
@@ -40,14 +35,6 @@ SHARED = SurfaceLayout(
     elsewhere=None,
 )
 AT_ONE_CONTENT = {1: (0.138, 0.06), 2: (0.165, 0.06)}
-
-
-def _tick(fingers: Fingers, contact: Contact) -> None:
-    """Play a click at a contact, as a client does."""
-    player = fingers.controller._intent_source
-    assert isinstance(player, EffectPlayer)
-    player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
-    fingers.controller.cycle.request_update()
 
 
 @in_virtual_time
@@ -149,7 +136,7 @@ async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_th
         ((shared, one),) = fingers.applied[-1].contents.items()
         owner, other = (contact for contact, _ in one.content.targets)
         count, sent = len(fingers.applied), len(fingers.committed)
-        _tick(fingers, owner)
+        fingers.play("tick", owner.key.id)
         await fingers.hold(0.3)
         sets = [one for _, _, layers in fingers.committed[sent:] for one in layers]
         assert {one.layer for one in sets if not one.renew} == {1 - shared}
@@ -163,21 +150,16 @@ async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_th
 
 
 @in_virtual_time
-async def test_a_click_that_is_refused_leaves_what_others_share(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_click_that_is_refused_leaves_what_others_share() -> None:
     """Of the finger whose content it is: only the click is left out."""
     async with fingers_on(table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
-        sent, check = len(fingers.committed), fingers.controller.cycle.planner.layers.check
-
-        def refuse(layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
-            if any(tone.level for each in layers["main"] if not each.renew for tone in each.tones):
-                return CommandRefused("too much power")
-            return check(layers)
-
-        monkeypatch.setattr(fingers.controller.cycle.planner.layers, "check", refuse)
-        _tick(fingers, one.content.targets[0][0])
+        sent = len(fingers.committed)
+        fingers.refuse(
+            "too much power",
+            lambda layers: any(t.level for each in layers if not each.renew for t in each.tones),
+        )
+        fingers.play("tick", one.content.targets[0][0].key.id)
         await fingers.hold(0.1)
         assert {n: each.content for n, each in fingers.applied[-1].contents.items()} == {
             shared: one.content

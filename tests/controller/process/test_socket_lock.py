@@ -77,19 +77,6 @@ def test_socket_is_shared_with_group_of_its_folder(tmp_path: Path, folder: int, 
     lock.release()
 
 
-def test_socket_lock_refuses_second_daemon(tmp_path: Path) -> None:
-    """The error names the process of the first; another socket in the same folder is free."""
-    first = SocketLock(tmp_path / "a.sock")
-    with first.bind():
-        with pytest.raises(InputError, match=rf"process {os.getpid()}\b"):
-            SocketLock(first.path)
-        other = SocketLock(tmp_path / "b.sock")
-        other.bind().close()
-        other.release()
-        assert first.path.is_socket()
-    first.release()
-
-
 def test_socket_lock_says_that_a_file_system_has_no_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,11 +77,16 @@ def test_layer_that_cannot_be_is_refused(layer: Layer) -> None:
 
 
 def test_values_are_rounded_to_the_safe_side() -> None:
-    """Ramps upward, levels to the nearest, valid_for never to 0, which means without end."""
+    """Ramps upward, levels to the nearest, valid_for never to 0, which means without end.
+
+    Full level in single precision, which may be 1 + 2^-22, is full level.
+    """
     layer = Layer(0, (tone(level=0.33336, frequency=99.99),), ramp=0.0101, valid_for=1e-5)
     (one,) = Ledger(WIDE, CAN).admit([layer], 0.0)
     assert (one.ramp, one.valid_for) == (11, 1)
     assert (one.commands[0].level, one.commands[0].frequency) == (3334, 2000)
+    (full,) = Ledger(WIDE, CAN).admit([Layer(0, (tone(level=1 + 2**-22),))], 0.0)
+    assert full.commands[0].level == 10000
 
 
 def test_least_limit_holds() -> None:

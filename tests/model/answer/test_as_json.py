@@ -119,25 +119,3 @@ def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
     result = RUNNER.invoke(app, command)
     assert isinstance(result.exception, InputError)
     assert "--batch" in str(result.exception)
-
-
-def test_query_has_all_measures(table_file):
-    """The keys that scripts rely on, and figures that fit each other."""
-    options = "--target 0.09,0.07 --quiet 0.25,0.18 --mode phased --level 18 --json"
-    result = RUNNER.invoke(app, ["table", "query", str(table_file), *options.split()])
-    answer = json.loads(result.stdout)
-    (layer,), (felt, quiet) = answer["layers"], answer["fingers"]
-    assert (layer["mode"], layer["fingers"]) == ("phased", [0])
-    assert (felt["verdict"], quiet["verdict"]) == ("own", "quiet")
-    assert (felt["layer"], quiet["layer"], quiet["level_db_sl"]) == (0, None, None)
-    assert felt["promised_level_db_sl"] == pytest.approx(18.0)
-    assert felt["level_db_sl"] > 18.0
-    assert felt["promised_contrast_db"] < felt["median_contrast_db"] < felt["contrast_db"]
-    assert quiet["foreign_level_db_sl"] > felt["level_db_sl"] - felt["contrast_db"] > -10
-    assert answer["is_imperceptible_to_quiet"] is False
-    assert answer["applied"] == []
-    assert answer["solve_time_s"] > 0
-    for tone in layer["drive"].values():
-        assert 0 < tone["level"] <= 1
-        assert -180 <= tone["phase_deg"] <= 180
-    assert "transient_contrast_db" in answer

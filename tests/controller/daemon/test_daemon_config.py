@@ -102,7 +102,7 @@ def test_config_paths_are_relative_to_its_folder(
         ("rig.yaml", "strengths: /dev/zero\n", [(2, "strengths")]),
         ("rig.yaml", "touch: 3\n", [(2, "touch")]),
         ("rig.yaml", "touch: [3]\n", [(2, "touch[0]")]),
-        (
+        pytest.param(
             "rigg.yaml",
             "tabel: x.npz\n"
             "mode: loud\n"
@@ -127,6 +127,7 @@ def test_config_paths_are_relative_to_its_folder(
                 (10, "log.level"),
                 (11, "dashboard"),
             ],
+            id="all at once",
         ),
     ],
 )

@@ -57,11 +57,13 @@ _logger = logging.getLogger(__name__)  # what was measured; shown by pytest --lo
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A daemon with the example's surface layout."""
+    """A daemon with the example's surface layout, by two names."""
     folder = tmp_path_factory.mktemp("daemon")
     (folder / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
     with real_daemon(
-        folder, "layouts: {panel: layout.yaml}\n", program=patient_daemon.RESTING
+        folder,
+        "layouts: {panel: layout.yaml, other: layout.yaml}\n",
+        program=patient_daemon.RESTING,
     ) as path:
         yield path
 
@@ -661,10 +663,22 @@ async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client)
     await page.until("document.querySelector('#problem').innerText")
 
 
-async def test_effects_and_events_are_seen_on_a_laptop(page: Page) -> None:
-    """Of 1280 by 800 pixels, without scrolling; the scale of the field is a short figure."""
+async def test_effects_and_events_are_seen_on_a_laptop(page: Page, era: Client) -> None:
+    """Of 1280 by 800 pixels, without scrolling; the scale of the field is a short figure.
+
+    So is the choice of a layout, which the daemon then uses.
+    """
     await show_on(page, Screen("laptop", 1280, 800))
-    for shown in ("#effects button:last-child", "#strengths output", "#log li:first-child"):
+    for name in ("other", "panel"):
+        await page.evaluate(
+            "((choice) => {"
+            f" choice.value = '{name}'; choice.dispatchEvent(new Event('change'));"
+            "})(document.querySelector('#layouts'))"
+        )
+        await asyncio.to_thread(wait_for, lambda name=name: era.status().layout == name)
+    await page.until("document.querySelector('#layouts').value === 'panel'")
+    laid = ("#layouts", "#effects button:last-child", "#strengths output", "#log li:first-child")
+    for shown in laid:
         place = f"document.querySelector('{shown}').getBoundingClientRect().bottom"
         assert 0 < await page.evaluate(place) < 800
     scale = (

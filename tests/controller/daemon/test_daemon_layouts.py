@@ -95,9 +95,7 @@ def test_commands_choose_a_layout_and_reload(
         assert said.count("\n") == 1
         assert "did you mean climate" in said
         assert "\n  layout climate (of home, climate)\n" in era("status")[1]
-        client.touch([(0.1, 0.1)], source="seat")
-        assert era("strength", "seat", "-6") == (0, "seat: -6 dB\n")
-        assert era("strength") == (0, "python: 0 dB\nseat: -6 dB\n")
+        assert era("strength", "python", "-6") == era("strength") == (0, "python: -6 dB\n")
         config, home = tmp_path / "daemon.yaml", tmp_path / "home.yaml"
         text = config.read_text("utf-8")
         home.write_text("elsewhere: null\n", "utf-8")

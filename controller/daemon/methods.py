@@ -103,6 +103,7 @@ class ApiService:
         self._strengths = layouts.player.strengths
         self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving: asyncio.Task[None] | None = None
+        self._save_problem = ""  # of the last attempt
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
@@ -386,7 +387,11 @@ class ApiService:
             try:
                 await asyncio.to_thread(self._strengths.save, file)
             except (OSError, RuntimeError) as error:  # no thread is left
-                _logger.error("strengths: not kept: %s", error)
+                if self._save_problem != str(error):  # said once
+                    _logger.error("strengths: not kept: %s", error)
+                self._save_problem = str(error)
+            else:
+                self._save_problem = ""
 
     async def close(self) -> None:
         """Wait until the strengths are kept, 0.2 s at most."""

@@ -175,13 +175,18 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
 
 @in_virtual_time
 async def test_a_disk_that_hangs_delays_no_other_request(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Strengths hold and are answered; touches and disarming go on, and the newest is kept."""
-    disk = asyncio.Event()
+    """Strengths hold and are answered; touches and disarming go on, and the newest is kept.
+
+    One that is full is logged once.
+    """
+    disk, full = asyncio.Event(), [True]
 
     async def hangs(work: Callable[[Path], None], file: Path) -> None:
         await disk.wait()
+        if full:
+            raise OSError(28, "No space left on device")
         work(file)
 
     async with seats(tmp_path, "strengths: kept.json\n") as (_, era):
@@ -191,7 +196,11 @@ async def test_a_disk_that_hangs_delays_no_other_request(
         await era.touch([PLACES["left"]])
         await era.disarm()
         disk.set()
-    assert json.loads((tmp_path / "kept.json").read_text()) == {"test": -10.0}
+        await asyncio.sleep(0.1)
+        assert caplog.text.count("strengths: not kept: [Errno 28] No space left on device") == 1
+        full.clear()
+        await era.strength("test", -11.0)
+    assert json.loads((tmp_path / "kept.json").read_text()) == {"test": -11.0}
 
 
 @in_virtual_time

@@ -157,7 +157,8 @@ class Playback:
         has_own = np.isin(numbers, own)
         loudest = others[~has_own].max(initial=-np.inf)
         above = np.where(has_own, mine, mine[own].min())
-        contrasts = above - np.where(others > -np.inf, others, loudest)
+        with np.errstate(invalid="ignore"):  # of silence to silence, which has no contrast
+            contrasts = above - np.where(others > -np.inf, others, loudest)
         times = self.records[0].times[count // 2 :: step][: levels.shape[2] - 1]
         return tuple(
             FeltFinger(
@@ -191,7 +192,7 @@ class Playback:
     def transient_contrast_db(self) -> float | None:
         """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without these."""
         targets, quiet = self.targets, self.quiet
-        if not quiet:
+        if not quiet or self.contrast_db is None:
             return None
         inside = targets[0].times <= ONSET_WINDOW
         first = [

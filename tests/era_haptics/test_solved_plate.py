@@ -186,6 +186,14 @@ def test_signals_settle_at_the_responses() -> None:
         np.testing.assert_allclose(sine + 1j * cosine, expected, atol=1e-5 * abs(expected).max())
 
 
+@pytest.mark.parametrize("quiet", [[], QUIET])
+def test_signals_of_silence_have_no_contrast(plate: era.SolvedPlate, quiet: Any) -> None:
+    """Nothing is felt, without a warning of numpy's, beside a quiet finger, too."""
+    played = plate.play(np.zeros((4, 60)), TARGET, quiet=quiet, sample_rate=4000)
+    assert played.level_db_sl == -np.inf
+    assert (played.contrast_db, played.transient_contrast_db) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("signals", "rate", "says"),
     [

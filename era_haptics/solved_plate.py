@@ -19,7 +19,7 @@ from era_haptics.arguments import (
     expect_rig,
 )
 from era_haptics.drive import Played, layers_of
-from model.answer.answer import Answer, Layer
+from model.answer.answer import Answer
 from model.answer.fingers import Placement, Stimulus, check_on_plate, together
 from model.arguments import expect_number, is_whole, shown
 from model.arrays import ComplexArray, FloatArray
@@ -127,7 +127,7 @@ class SolvedPlate:
                 name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
                 for name, tone in each.items()
             }
-            for layer in self._layers(drive)
+            for layer in layers_of(drive, self.rig)
             for each in layer.excitations
         ]
         return plate_map(self._real, *excitations, raster=points, free=self._free)
@@ -173,7 +173,7 @@ class SolvedPlate:
                 sample_rate=cast(float, sample_rate),
                 imperfections=self._drawn,
             )
-        layers = self._layers(drive)
+        layers = layers_of(drive, self.rig)
         if placed is not None:
             own = tuple(range(len(placed)))
             layers = tuple([replace(each, fingers=own) for each in layers])
@@ -185,18 +185,6 @@ class SolvedPlate:
             duration=duration,
             imperfections=self._drawn,
         )
-
-    def _layers(self, drive: Played) -> tuple[Layer, ...]:
-        """The layers; raises InputError beyond the frequencies that the plate is solved for."""
-        layers, highest = layers_of(drive, self.rig), self.rig.limits.frequency_max
-        tones = [item for one in layers for each in one.excitations for item in each.items()]
-        for name, tone in tones:
-            if tone.frequency > highest:
-                raise InputError(
-                    f"frequency of {name} must be at most {highest:g} Hz, got {tone.frequency:g}; "
-                    "raise limits.frequency of the rig"
-                )
-        return layers
 
     @cached_property
     def _free(self) -> FreePlate:

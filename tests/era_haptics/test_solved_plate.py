@@ -188,7 +188,13 @@ def test_signals_settle_at_the_responses() -> None:
 
 @pytest.mark.parametrize("quiet", [[], QUIET])
 def test_signals_of_silence_have_no_contrast(plate: era.SolvedPlate, quiet: Any) -> None:
-    """Nothing is felt, without a warning of numpy's, beside a quiet finger, too."""
+    """Nothing is felt, without a warning of numpy's, beside a quiet finger, too.
+
+    What exceeds full stroke by rounding is full stroke.
+    """
+    loud = [np.full((4, 60), level) for level in (1, 1 + 5e-10)]
+    first, second = (plate.play(each, TARGET, sample_rate=4000).level_db_sl for each in loud)
+    assert first == second
     played = plate.play(np.zeros((4, 60)), TARGET, quiet=quiet, sample_rate=4000)
     assert played.level_db_sl == -np.inf
     assert (played.contrast_db, played.transient_contrast_db) == (None, None)
@@ -200,7 +206,7 @@ def test_signals_of_silence_have_no_contrast(plate: era.SolvedPlate, quiet: Any)
         (np.zeros((3, 300)), 3000, r"SW, SE, NE, NW, got shape \(3, 300\)"),
         (np.zeros((4, 300)) + 0j, 3000, "real numbers"),
         (np.full((4, 300), np.nan), 3000, "-1 to 1, got nan of SW at sample 0"),
-        (np.eye(4, 300) * 1.5, 3000, "-1 to 1, got 1.5 of SW at sample 0"),
+        (np.eye(4, 300) * 1.00000001, 3000, "-1 to 1, got 1.00000001 of SW at sample 0"),
         (np.zeros((4, 300)), 1000, "above 1000 Hz"),
         (np.zeros((4, 300)), None, "sample_rate"),
         (np.zeros((4, 30)), 6000, "last from 0.01 to 10 s, got 0.005"),

@@ -1,7 +1,7 @@
 """Drives in hertz, fractions of full stroke and degrees, and their conversion to layers."""
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -74,7 +74,7 @@ def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
             raise InputError("an answer must have a layer to be played, got one of quiet fingers")
     else:
         layers = (_layer_of(drive, rig),)
-    limits, levels = rig.limits, Counter[str]()
+    limits, levels = rig.limits, defaultdict[str, float](float)
     tones = [item for one in layers for each in one.excitations for item in each.items()]
     for name, tone in tones:
         if not limits.frequency_min <= tone.frequency <= limits.frequency_max:

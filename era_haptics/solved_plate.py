@@ -139,10 +139,10 @@ class SolvedPlate:
         *,
         quiet: Positions = (),
         loads: Sequence[float] = (),
-        duration: float = 1.0,
+        duration: float | None = None,
         sample_rate: float | None = None,
     ) -> Playback:
-        """Compute what fingers feel during a duration [s], from rest.
+        """Compute what fingers feel during a duration [s], from rest, by default until steady.
 
         target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
         each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
@@ -150,9 +150,10 @@ class SolvedPlate:
         sample_rate [Hz] drive is an array (ERAs, samples) of band-limited signals in full strokes,
         which say the duration and where records are sampled. The plate in time is solved exactly,
         without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
-        duration too short for a steady state, and signals that no ERA can play.
+        duration in which the slowest vibration does not decay to 5 %, and what no ERA can play.
         """
-        expect_number(duration, what="duration", unit="seconds")
+        if duration is not None:
+            expect_number(duration, what="duration", unit="seconds")
         others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
         placed = None if target is None else as_points(target, what="target")
         if placed is not None:

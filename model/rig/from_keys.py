@@ -60,14 +60,11 @@ def rig(
     weightless fingers. What is left out, or None, has the file's default. Raises ConfigError with
     all problems, by argument and key.
     """
-    if amplifiers is None and isinstance(eras, Mapping):
+    if amplifiers is None:
+        expect(eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}')
         amplifiers = {"main": {"url": "sim://"}}
-        eras = {
-            name: {"amplifier": "main", "channel": number, **each}
-            if isinstance(each, Mapping)
-            else each
-            for number, (name, each) in enumerate(eras.items())
-        }
+        wired = {name: {"amplifier": "main", "channel": n} for n, name in enumerate(eras)}
+        eras = _merged(wired, eras)
     sections = {
         "plate": plate,
         "eras": eras,
@@ -123,14 +120,20 @@ def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
             }
             for name, each in data[kind].items()
         }
-    eras = {**data["eras"], **changes.get("eras", {})}
-    eras |= {
-        name: _given({**data["eras"].get(name, {}), **each})
-        for name, each in eras.items()
-        if isinstance(each, Mapping)
-    }
+    eras = _merged(data["eras"], changes.get("eras", {}))
     whole = {key: changes[key] for key in _SECTIONS & changes.keys()}
-    return rig_of(_document("rig.replaced", {**data, **whole, "eras": _given(eras)}))
+    return rig_of(_document("rig.replaced", {**data, **whole, "eras": eras}))
+
+
+def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of which keys are changed, added, or left out, as whole sections are, by None."""
+    sections = {**own, **changes}
+    return _given(
+        {
+            name: _given({**own.get(name, {}), **each}) if isinstance(each, Mapping) else each
+            for name, each in sections.items()
+        }
+    )
 
 
 def stated(rig: Rig) -> Document:

@@ -122,7 +122,7 @@ def test_keys_that_cannot_follow_are_refused() -> None:
         (lambda: RIG.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
         (lambda: RIG.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
         (lambda: RIG.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
-        (lambda: era.rig(SHEET, 4), ["eras: must be a map"]),
+        (lambda: era.rig(SHEET, 4), ["eras must be a Mapping, got 4"]),
         (lambda: era.rig(SHEET, {"SW": 4}), ["eras.SW: must be a map"]),
         (lambda: RIG.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
         (lambda: RIG.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),

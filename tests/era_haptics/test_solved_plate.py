@@ -285,7 +285,8 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     """Judged ones first, in the order of their contrast, then by score, unsupported ones last."""
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
-    found = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2).layouts
+    designed = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2)
+    found = designed.layouts
     assert len(found) == 8
     contrasts = [each.contrast for each in found]
     assert contrasts[2:] == [None] * 6
@@ -293,6 +294,8 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     scores = [each.expected_contrast for each in found[2:] if each.expected_contrast is not None]
     assert scores == sorted(scores, reverse=True)
     assert all(len(each.eras) == 4 for each in found)
+    best = f"{found[0].name}, 4 ERAs, {contrasts[0]:.1f} dB"
+    assert repr(designed) == f"<Design of 8 layouts: {best}>"
 
 
 @pytest.mark.parametrize(
@@ -305,9 +308,12 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
         {"layouts": "random:3", "finalists": 0},
         {"lowest": 0.5},
         {"apart": "wide"},
+        {"eras": "six"},
+        {"where": "middle"},
     ],
 )
 def test_design_refuses(wrong: dict[str, object]) -> None:
-    """Too few ERAs, no whole number, no layouts, no file, no finalists, too low a mode, a word."""
-    with pytest.raises(era.InputError):
+    """Arguments are named as they are given, not as flags of the command."""
+    with pytest.raises(era.InputError) as refused:
         era.design(make_paper_rig(12, 9), **wrong)  # type: ignore[arg-type]
+    assert "--" not in str(refused.value)

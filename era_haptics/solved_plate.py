@@ -86,9 +86,10 @@ class SolvedPlate:
 
         points (p, 2) [m]; frequencies (f,) [Hz]: those of a table by default; fingers: that rest on
         the plate, as positions [m] or with their loads; seed: of another plate, as
-        `SolvedPlate(rig, seed=seed)`. Complex amplitudes (f, ERAs, p) of exp(+i omega t), ERAs as
-        in `rig.eras`: times weights in full strokes they are the field of `map`. Raises InputError
-        for points and fingers off the plate, and frequencies for which it is not solved.
+        `SolvedPlate(rig, seed=seed)`. Complex peak amplitudes h (f, ERAs, p), ERAs as in
+        `rig.eras`: weights w in full strokes give a(t) = Im[h w exp(i omega t)], without fingers
+        the field of `map`. Raises InputError for points and fingers off the plate, and frequencies
+        for which it is not solved.
         """
         if seed is not None:
             drawn = SolvedPlate(self.rig, seed=seed)
@@ -108,12 +109,12 @@ class SolvedPlate:
         return found * self._drawn.factors(self.rig)[:, None]
 
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
-        """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
+        """Compute the steady peak acceleration [m/s²] over the bare plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        All layers of an answer play. ERAs at one frequency add as complex amplitudes, magnitudes of
-        several frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot
-        play.
+        No finger rests on it: fingers move the nulls, which `responses` and `play` show.
+        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
+        (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
         """
         points = (
             None

@@ -164,7 +164,7 @@ class RankedLayout:
 
     @property
     def rig(self) -> Rig:
-        """The rig with these ERAs on free channels, if need be of a further, simulated amplifier."""
+        """The rig with these ERAs on free channels, if need be of another, simulated amplifier."""
         keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
         return rig_of(Document("RankedLayout.rig", "", keys, {}))
 

@@ -104,7 +104,7 @@ class Rig:
         return {era.name: era.stroke for era in self.eras}
 
     def replaced(self, **changes: Any) -> "Rig":
-        """Make a rig with other keys: thickness=0.002, plate={"thickness": 0.002} or whole sections.
+        """Make a rig with other keys, as thickness=0.002, plate={"thickness": 0.002}, or sections.
 
         Of eras the keys given change, as eras={"SW": {"stiffness": 2e4}}. What follows from them
         follows: damping by `damping_ratio`, a mesh `auto`, a laminate's equivalent plate; ERAs and

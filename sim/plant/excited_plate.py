@@ -60,7 +60,7 @@ MAX_DURATION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class FeltFinger:
-    """What one finger felt, steady as in a `Sensation`, and over time.
+    """What one finger felt on the plate that played, steady and over time; nothing is promised.
 
     level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
     its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
@@ -90,7 +90,7 @@ class Vibration:
     """What one layer, or signals of all ERAs, do alone at all fingers.
 
     frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
-    all fingers.
+    all fingers, one after the other.
     """
 
     frequencies: tuple[float, ...]
@@ -133,7 +133,7 @@ class Playback:
 
     @cached_property
     def records(self) -> tuple[Record, ...]:
-        """Of each finger, of all layers together, in the order in which they were given."""
+        """Record of each finger, of all layers together, in the order in which they were given."""
         return tuple(
             replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
             for alone in zip(*[each.records for each in self.vibrations], strict=True)

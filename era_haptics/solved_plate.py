@@ -109,11 +109,11 @@ class SolvedPlate:
         return found * self._drawn.factors(self.rig)[:, None]
 
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
-        """Compute the steady peak acceleration [m/s²] over the bare plate, and its nulls.
+        """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        No finger rests on it: fingers move the nulls, which `responses` and `play` show.
-        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
+        All layers of an answer play, without the fingers: these move nulls, as `responses` and
+        `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
         (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
         """
         points = (

@@ -34,8 +34,9 @@ def check_packages() -> None:
 
 def _check(package: str) -> None:
     own = Path(__file__).resolve().parents[1] / package / "__init__.py"
-    found = find_spec(package)
-    origin = Path((found and found.origin) or own)
+    loaded = sys.modules.get(package)  # which need not have a specification
+    found = find_spec(package) if loaded is None else None
+    origin = Path(getattr(loaded, "__file__", None) or (found and found.origin) or own)
     if not own.exists():
         why = f"{own.parent} is missing"
     elif origin.resolve() != own:
@@ -45,8 +46,9 @@ def _check(package: str) -> None:
     else:
         return
     other = _distribution(origin)
+    by = "" if other is None else f", by the distribution {other}"
     raise HiddenPackage(
-        f"{why}{f', by the distribution {other}' * bool(other)}, the package {package} of "
+        f"{why}{by}, the package {package} of "
         "era-haptics; rename the other, or install era-haptics in an environment of its own",
         name=package,
     )

@@ -11,20 +11,21 @@ Found = Mapping[Case, Sequence[Outcome]]
 
 
 def as_markdown(found: Found) -> str:
-    """A table of steady contrasts, and one of what happens in events."""
+    """A table of steady contrasts, with a row of all cases, and one of what happens in events."""
     lines = [
         "| | plates | goal | promised [dB] (10 %) | felt [dB] (10 %) | served | promise kept |",
         "|---|---|---|---|---|---|---|",
     ]
     for case, each in found.items():
         promised, felt = np.array([one.worst for one in each]).T
-        fingers = sum(len(one.fingers) for one in each)
         lines.append(
             f"| {case.title} | {len(each)} | {'-' if case.goal_db is None else case.goal_db} | "
             f"{_shown(promised)} | {_shown(felt)} | "
             f"{100 * np.mean([one.served for one in each]):.0f} % | "
-            f"{100 * kept(each):.0f} % of {fingers} |"
+            f"{_shown_kept(each)} |"
         )
+    every = [one for each in found.values() for one in each]
+    lines.append(f"| all | {len(every)} | - | - | - | - | {_shown_kept(every)} |")
     names = list(dict.fromkeys(n for each in found.values() for one in each for n in one.events))
     lines += ["", f"| | {' | '.join(names)} |", "|---|" + "---|" * len(names)]
     for case, each in found.items():
@@ -45,6 +46,10 @@ _WORST = {"moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
 def kept(found: Sequence[Outcome]) -> float:
     """Share of the promises that are kept."""
     return float(np.mean([felt >= promised for one in found for promised, felt in one.fingers]))
+
+
+def _shown_kept(found: Sequence[Outcome]) -> str:
+    return f"{100 * kept(found):.0f} % of {sum(len(one.fingers) for one in found)}"
 
 
 def _shown(values: Sequence[float] | np.ndarray, *, worst: float = 10) -> str:

@@ -35,6 +35,7 @@ from controller.api.schema import (
 )
 
 DEFAULT_LEASE = 10.0  # s
+MAX_SENDER = 2048  # characters of a sender's name, escaped
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -212,13 +213,17 @@ class PlayParams(Message):
     effect: Name
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
-    level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
+    level_db_sl: float | None = Field(
+        None, description="from -20; at most, and by default, the effect's own"
+    )
 
 
 class StrengthParams(Message):
     """A touch source or client and its gain; without a gain nothing is set."""
 
-    name: Name = Field(description="of an input, a source or a client")
+    name: Annotated[str, Field(min_length=1, max_length=MAX_SENDER)] = Field(
+        description="of an input, a sender there, a source or a client"
+    )
     gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )

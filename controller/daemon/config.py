@@ -105,6 +105,8 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         read_strengths(strengths)
     except InputError as error:
         validation.add(("strengths",), str(error))
+    if strengths is not None and not strengths.parent.is_dir():
+        validation.add(("strengths",), f"folder not found: {strengths.parent}; create it")
     _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:

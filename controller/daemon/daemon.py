@@ -258,7 +258,7 @@ class Daemon:
             gateway = () if self._gateway is None else (self._gateway,)
             for task in gateway:
                 task.cancel()
-            closing = (self._inputs.close(), self._server.close())
+            closing = (self._inputs.close(), self._server.close(), self._api.close())
             for found in await asyncio.gather(
                 *learning, *closing, *gateway, return_exceptions=True
             ):

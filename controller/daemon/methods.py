@@ -7,7 +7,7 @@ import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from functools import partial
+from contextlib import suppress
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -42,6 +42,7 @@ from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import effects_result, hello_result, playing_of
 from controller.daemon.publisher import EventPublisher
+from controller.effects.effect import MIN_DB_SL
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER
@@ -61,12 +62,13 @@ from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.table.table import LocalizationTable
 from registry import clock
-from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
+
+_SAVE_TIMEOUT = 0.2  # s; of what is being written when the daemon ends
 
 _ENABLED = DaemonState.OPERATION_ENABLED
 
@@ -99,7 +101,7 @@ class ApiService:
         self._clients = set[Connection]()  # that are connected and have said or done something
         self._strengths = layouts.player.strengths
         self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
-        self._saving = asyncio.Lock()
+        self._saving: asyncio.Task[None] | None = None
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
@@ -122,6 +124,8 @@ class ApiService:
         """Introduce the client; returns what the daemon drives."""
         client.name = params.client
         self._clients.add(client)
+        if self._strengths.gains_db:  # its fingers may rest
+            self._controller.cycle.request_update()
         return hello_result(
             self._config,
             self._table,
@@ -320,13 +324,14 @@ class ApiService:
                 remedy=f"choose one of {', '.join(sorted(effects))}",
             )
         level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
-        if params.level_db_sl is not None and params.level_db_sl > level_max:
+        level = params.level_db_sl
+        if level is not None and not MIN_DB_SL <= level <= level_max:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"level of effect {params.effect!a} must be at most {level_max:g} dB SL, got "
-                f"{params.level_db_sl:g}",
+                f"level of effect {params.effect!a} must be from {MIN_DB_SL:g} to {level_max:g} "
+                f"dB SL, got {level:g}",
                 where="level_db_sl",
-                remedy="raise its level in the surface layout",
+                remedy="choose one of these, or another level in the surface layout",
             )
 
         def distance(contact: Contact) -> float:
@@ -344,14 +349,14 @@ class ApiService:
             params.effect,
             nearest,
             clock.now(),
-            level_db_sl=params.level_db_sl,
+            level_db_sl=level,
             player=client.name,
         )
         self._controller.cycle.request_update()
         return Empty()
 
     @api_method()
-    async def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
+    def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
         """Set the strength of a touch source or client, or show it; the status shows all.
 
         What plays is led there within 100 ms.
@@ -367,13 +372,25 @@ class ApiService:
         if params.gain_db is not None:
             self._strengths.set(name, params.gain_db)
             self._controller.cycle.request_update()
-            if (file := self._config.strengths) is not None:
-                async with self._saving:  # the newest last
-                    try:
-                        await in_thread(partial(self._strengths.save, file), name="strengths")
-                    except OSError as error:
-                        _logger.error("strengths: not kept: %s", error)
+            if self._saving is None or self._saving.done():
+                self._saving = asyncio.create_task(self._save_strengths(), name="strengths")
         return StrengthResult(strengths={name: self._strengths.gains_db.get(name, 0.0)})
+
+    async def _save_strengths(self) -> None:
+        """Keep the strengths, the newest last; no request waits for the disk."""
+        saved: Mapping[str, float] | None = None
+        while (file := self._config.strengths) and saved is not self._strengths.gains_db:
+            saved = self._strengths.gains_db
+            try:
+                await asyncio.to_thread(self._strengths.save, file)
+            except (OSError, RuntimeError) as error:  # no thread is left
+                _logger.error("strengths: not kept: %s", error)
+
+    async def close(self) -> None:
+        """Wait until the strengths are kept, 0.2 s at most."""
+        if self._saving is not None:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._saving, _SAVE_TIMEOUT)
 
     @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

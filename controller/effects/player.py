@@ -263,10 +263,11 @@ class EffectPlayer:
         self.strengths.note(contact.key.source)
         self._enter(finger, contact, now)
         if (before := self._already_pressed.pop(contact.key, None)) is not None:
-            finger.plays = [
-                *(each for each in finger.plays if not each.outlasts_its_layout),
-                *(each for each in before.plays if each.outlasts_its_layout),
-            ]
+            kept = [each for each in before.plays if each.outlasts_its_layout]
+            for each in kept:  # felt before what starts, here and among other fingers
+                self._number += 1
+                each.number = self._number
+            finger.plays = [each for each in finger.plays if not each.outlasts_its_layout] + kept
         return finger
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:

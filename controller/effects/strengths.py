@@ -3,24 +3,30 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import ConfigDict, NonPositiveFloat, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
+from registry.regular_file import regular_file
 
-MAX_SOURCES = 64
-"""How many touch sources are remembered."""
+MAX_NAMES = 64
+"""How many touch sources are remembered, and how many names may have a gain."""
 
-_GAINS = TypeAdapter(dict[str, NonPositiveFloat], config=ConfigDict(allow_inf_nan=False))
+_Gains = Annotated[
+    dict[str, Annotated[float, Field(ge=-40, le=0)]],  # as over the API
+    Field(max_length=MAX_NAMES),
+]
+_GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
 
 
 class Strengths:
     """Gains [dB] by name, 0 at most, which is what holds where none is set.
 
-    A name is that of a touch input of the configuration, of a sender there (`table:left@10.0.0.2`),
-    of a touch source as its client calls it, or of a client. At a finger the gains of its names and
-    of the client that plays its effect add up, each once.
+    A name is that of a touch input of the configuration, of a sender there
+    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, or of a client. At a
+    finger the gains of its names and of the client that plays its effect add up, each once.
     """
 
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
@@ -34,7 +40,7 @@ class Strengths:
     def note(self, source: str) -> None:
         """Note that a touch source has a finger."""
         name, _ = self._names_of(source)
-        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_SOURCES:]
+        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
 
     def gain_db(self, source: str, player: str | None = None) -> float:
         """Return the gain at a finger of a source; player: the client that plays its effect."""
@@ -42,9 +48,17 @@ class Strengths:
         return sum([gain for name, gain in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:
-        """Set the gain [dB] of a name from now on; 0 removes it."""
-        gains = {**self.gains_db, name: gain_db}
-        self.gains_db = {name: gain for name, gain in gains.items() if gain}
+        """Set the gain [dB] of a name from now on; 0 removes it.
+
+        Raises InputError for one name more than there may be.
+        """
+        gains = {name: gain for name, gain in {**self.gains_db, name: gain_db}.items() if gain}
+        if len(gains) > MAX_NAMES:
+            raise InputError(
+                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
+                "another to 0 dB first"
+            )
+        self.gains_db = gains
 
     def save(self, file: Path) -> None:
         """Write the gains that are set, atomically; raises OSError."""
@@ -60,11 +74,15 @@ class Strengths:
 
 def read_strengths(file: Path | None) -> Mapping[str, float]:
     """Read the gains [dB] of a file, none where there is no file; raises InputError."""
+    if file is None:
+        return {}
     try:
-        return (
-            _GAINS.validate_json(file.read_bytes(), strict=True) if file and file.exists() else {}
-        )
+        with open(file, "rb", opener=regular_file) as stream:
+            return _GAINS.validate_json(stream.read(), strict=True)
+    except FileNotFoundError:
+        return {}
     except (ValidationError, OSError) as error:
         raise InputError(
-            f"{file}: must have strengths of 0 dB or less by name; correct or remove it"
+            f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
+            "remove it"
         ) from error

@@ -44,8 +44,8 @@ class AnswerThread(Generic[T]):
 
     def compute(self, question: Callable[[], T], *, instead: T) -> None:
         """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
-        loop, self.is_busy = asyncio.get_running_loop(), True
-        self._answer = loop.run_in_executor(self._threads, question)
+        loop = asyncio.get_running_loop()
+        self._answer, self.is_busy = loop.run_in_executor(self._threads, question), True
         self._answer.add_done_callback(self._note)
         loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
 

@@ -82,14 +82,15 @@ class Content:
 
     key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
     predictions; targets: that finger, then those that share it; placement: where they are, and all
-    others; predictions: one per target; gain_db: that the layer has, its fingers' strength.
+    others; predictions: one per target, which also depend on others; gain_db: that the layer has,
+    its fingers' strength.
     """
 
     key: tuple[ContactKey, int]
     targets: Targets
     placement: Placement
     layer: Layer
-    predictions: tuple[Prediction, ...] = ()
+    predictions: tuple[Prediction, ...] = field(default=(), compare=False)
     gain_db: float = 0.0
 
     @property
@@ -143,12 +144,20 @@ class Selection:
         return bool(self.contents) and is_each_alone and not self.not_served
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return it with the strengths of fingers; what several share has the lowest."""
+        """Return it with the strengths of fingers; what several share has the lowest.
+
+        Also that of one whose short pulse is felt above it meanwhile.
+        """
         if not (self.contents and any(gains_db.values())):
             return self
+        every = {key: gain for (key, _), gain in gains_db.items()}
         gains = {
             each.targets: min(
-                0.0, *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets]
+                0.0,
+                *[
+                    gains_db.get((at.key, to.is_short), every.get(at.key, 0.0))
+                    for at, to in each.targets
+                ],
             )
             for each in self.contents
         }

@@ -258,8 +258,8 @@ class Layers:
         """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
         numbers: dict[int, Content] = {}
         for number, one in self.contents.items():
-            if one.content in contents:
-                numbers[number] = one.content
+            if one.content in contents:  # what is predicted of it may differ
+                numbers[number] = contents[contents.index(one.content)]
         kept, new = [*numbers.values()], list[Content]()
         for content in contents:
             if content in kept:
@@ -315,7 +315,8 @@ class Layers:
         playing: dict[int, LayerContent] = {}
         for number, one in self.contents.items():
             if number in numbers and number not in starting:
-                playing[number] = one
+                content = numbers[number]
+                playing[number] = one if one.content is content else replace(one, content=content)
         settled = [0.0]
         for number in starting:
             content = numbers[number]

@@ -241,7 +241,7 @@ def conformance(
         print(json.dumps(report.to_json()))
     else:
         print(report.summary)
-        if report.left:
+        if report.left and report.overall != "failed":
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if report.overall == "failed":
         raise typer.Exit(1)

@@ -21,15 +21,20 @@ def refused_by_amplifier(where: str, refusal: Nak, *, may_play: bool) -> Command
     )
 
 
-def no_reply(where: str, timeout: float, remark: str, *, before: float, boot_time: float) -> str:
-    """Return why a request on a line had no reply within a time [s].
+def no_reply(
+    where: str, name: str, timeout: float, remark: str, *, before: float, boot_time: float
+) -> str:
+    """Return why a request of a name on a line had no reply within a time [s].
 
     remark: what came instead; before [s]: for how long the reply before was awaited; boot_time [s]:
     of a board behind a port that was opened just now, else 0.
     """
     if not remark and before > timeout:
         remark = f"the reply before took {1e3 * before:.0f} ms: check what delays frames on the way"
-    came = f", but {remark}" if remark else "; check that the amplifier is switched on"
+    hint = "check that the amplifier is switched on"
+    if name == "GetCaps":  # which comes behind an answered Hello
+        hint = "it answered Hello, but not GetCaps"
+    came = f", but {remark}" if remark else f"; {hint}"
     cause = f"{where}: no reply within {1e3 * timeout:g} ms{came}"
     if boot_time:
         cause += (

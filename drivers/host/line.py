@@ -382,6 +382,7 @@ class Line:
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
         member.silence_cause = no_reply(
             self.name,
+            job.name,
             job.timeout,
             remark,
             before=member.counts.last_round_trip or 0.0,

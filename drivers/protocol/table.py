@@ -312,6 +312,8 @@ _MESSAGES = (
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
+NAMES: Mapping[int, str] = {HELLO: "Hello", **{each.number: each.name for each in _MESSAGES}}
+"""Names of requests by number."""
 
 
 def read_request(number: int, words: Sequence[int]) -> tuple[str, Values]:

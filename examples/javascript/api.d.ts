@@ -250,13 +250,13 @@ export interface PlayParams {
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** at most, and by default, the effect's own */
+  /** from -20; at most, and by default, the effect's own */
   level_db_sl?: number | null;
 }
 
 /** A touch source or client and its gain; without a gain nothing is set. */
 export interface StrengthParams {
-  /** of an input, a source or a client */
+  /** of an input, a sender there, a source or a client */
   name: string;
   /** of all that it brings, 0 for what layout and limits allow */
   gain_db?: number | null;

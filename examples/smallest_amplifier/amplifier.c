@@ -1,17 +1,19 @@
 /* The smallest amplifier of protocol 3: two channels on a serial line, in one file.
  *
- *     cc -O2 -o amplifier amplifier.c -lm && ./amplifier /dev/ttyUSB0
+ *     cc -O2 -o amplifier amplifier.c -lm && ./amplifier --pty    (or /dev/ttyUSB0)
  *
  * Written from the rules of the protocol alone. It plays nothing: `level_of` is where the samples
  * of a channel come from. Times are in seconds, amplitudes in full levels.
  */
 
+#define _GNU_SOURCE 1
 #include <complex.h>
 #include <fcntl.h>
 #include <math.h>
 #include <poll.h>
 #include <stdint.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <termios.h>
 #include <time.h>
@@ -90,11 +92,8 @@ static void lead(Voice *voice, double time, const Envelope *shape, double ramp,
 static void fade(Voice *voice, double time, double ramp, int by_ending) {
     int was_fading = voice->has_ended;
     voice->has_ended = 1;
-    if (by_ending && voice->has_ending && !was_fading) {
-        lead(voice, time, &voice->ending, ramp, 0);
-    } else if (last_of(voice) || end_of(voice) > time + ramp) {
-        lead(voice, time, NULL, ramp, 0);
-    }
+    if (by_ending && voice->has_ending && !was_fading) lead(voice, time, &voice->ending, ramp, 0);
+    else if (last_of(voice) || end_of(voice) > time + ramp) lead(voice, time, NULL, ramp, 0);
 }
 
 static void let_last(int layer) { layers[layer].ends = layers[layer].waits_until = INFINITY; }
@@ -315,10 +314,7 @@ static int take_part(const uint16_t *in, int count, double now, int *channel) {
         seen |= 1 << layer;
         read_layer(&words, 0, 0, 0, 0);
     }
-    if (words.code) {
-        *channel = words.channel;
-        return drop(words.code);
-    }
+    if (words.code) return *channel = words.channel, drop(words.code);
     staged.is_whole = 1;
     if (plays) play(staged.word, staged.words, token, now);
     return taken(token, !plays, plays, 0);
@@ -479,12 +475,16 @@ static void take(int line, const uint8_t *data, ssize_t count, double now) {
 }
 
 int main(int argc, char **argv) {
-    int line = argc == 2 ? open(argv[1], O_RDWR | O_NOCTTY) : STDIN_FILENO;
+    if (argc != 2) return fprintf(stderr, "usage: amplifier TTY | --pty\n"), 2;
+    int is_pty = !strcmp(argv[1], "--pty"), flags = O_RDWR | O_NOCTTY;
+    int line = is_pty ? posix_openpt(flags) : open(argv[1], flags), far = line;
+    if (is_pty) far = grantpt(line) || unlockpt(line) ? -1 : open(ptsname(line), flags);
     struct termios raw;
-    if (line < 0 || tcgetattr(line, &raw)) return fprintf(stderr, "usage: amplifier [TTY]\n"), 2;
+    if (far < 0 || tcgetattr(far, &raw)) return perror(argv[1]), 2;
     cfmakeraw(&raw);
     cfsetspeed(&raw, B921600);
-    tcsetattr(line, TCSANOW, &raw);
+    tcsetattr(far, TCSANOW, &raw);
+    if (is_pty) printf("serial://%s\n", ptsname(line)), fflush(stdout);
     for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
     uint8_t data[256];
     struct pollfd ready = {.fd = line, .events = POLLIN};

@@ -17,6 +17,7 @@ static struct can_node node;
 static struct slcan slcan;
 static uint32_t samples_to_measuring;
 static uint8_t stored[3]; // addresses, of each line
+static bool is_high_voltage;
 
 // After a longer time every watchdog has expired, and every ramp ended.
 #define SAMPLES_LATE_MAX ((WATCHDOG_MAX + RAMP_MAX) * SAMPLES_PER_MS)
@@ -50,7 +51,7 @@ void loop_init(void)
     rtu_init(&rtu, &modbus);
     can_init(&node, &amplifier, stored[LINE_CAN], send_can);
     slcan_init(&slcan, &node);
-    board_high_voltage(false);
+    board_high_voltage(is_high_voltage = false);
 }
 
 static void measure(void)
@@ -61,6 +62,15 @@ static void measure(void)
     };
     measured.cause = board_fault(&measured.channel);
     amplifier_measured(&amplifier, measured);
+}
+
+// Switched, it is measured at once: no status shows the voltage of before beside the new state.
+static void switch_high_voltage(void)
+{
+    bool is_switched = is_high_voltage != amplifier.high_voltage;
+    board_high_voltage(is_high_voltage = amplifier.high_voltage);
+    if (is_switched)
+        measure();
 }
 
 void loop_samples(void)
@@ -80,12 +90,12 @@ void loop_samples(void)
         board_output(samples);
     }
     amplifier_time(&amplifier, now);
-    board_high_voltage(amplifier.high_voltage);
+    switch_high_voltage();
 }
 
 static void send(enum line line, const uint8_t *reply, uint16_t length)
 {
-    board_high_voltage(amplifier.high_voltage);
+    switch_high_voltage();
     if (length > 0)
         board_write(line, reply, length);
 }

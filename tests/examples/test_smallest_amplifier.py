@@ -1,5 +1,6 @@
 """The smallest amplifier in C, which shares no table with the host, under conformance."""
 
+import asyncio
 import ctypes
 import subprocess
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import era_haptics
+from drivers.by_hand.actions import identify
 from installed_program import installed_program
 from judged_line import judged
 
@@ -53,6 +55,22 @@ def test_conformance_on_a_clock_that_is_moved(level: float, tmp_path: Path) -> N
     assert not failed, failed[0]
     skipped = {each.check.name for each in found if each.result == "skipped"}
     assert skipped == (SKIPPED if level < 0.5 else SKIPPED - {"limited"})
+
+
+@pytest.mark.real_time
+def test_program_serves_a_pseudo_terminal_and_leaves_the_users_alone(tmp_path: Path) -> None:
+    """Its URL is printed, and a host finds it there; without an argument it says what it takes."""
+    program = tmp_path / "amplifier"
+    build = [installed_program("cc", package="gcc"), "-o", program, SOURCE, "-lm"]
+    subprocess.run(build, check=True)
+    bare = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (bare.returncode, bare.stdout) == (2, "")
+    assert bare.stderr == "usage: amplifier TTY | --pty\n"
+    with subprocess.Popen([program, "--pty"], stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        url = running.stdout.readline().strip()
+        assert asyncio.run(identify(url))["serial_number"] == "SMALLEST-1"
+        running.kill()
 
 
 def test_source_is_small() -> None:

@@ -148,3 +148,18 @@ def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
     status = values_of(firmware, hand.GET_STATUS)
     assert status["state"] == hand.ENABLED
     assert status["watchdog_left"] == pytest.approx(40, abs=1)
+
+
+def test_high_voltage_is_measured_as_soon_as_it_is_switched(replaying: Path) -> None:
+    """Read every 0.1 ms amid a Disarm along 5 ms: never 1800 V beside a flag that says off."""
+    firmware = MovedFirmware(replaying)
+    firmware.receive(SERIAL, arm())
+    firmware.receive(SERIAL, apply(1, command(0, 100, 0.5)))
+    firmware.move(0.0993)
+    firmware.receive(SERIAL, request(hand.DISARM, 5))
+    seen = set()
+    for step in range(120):
+        firmware.move(0.0993 + 1e-4 * step)
+        status = values_of(firmware, hand.GET_STATUS)
+        seen.add((status["flags"], status["high_voltage"]))
+    assert seen == {(1, 1800), (0, 0)}

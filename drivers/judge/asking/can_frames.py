@@ -20,6 +20,7 @@ from drivers.judge.asking.client import (
     expect_equal,
     expect_one_of,
     expect_within,
+    message_name,
     read_as,
     require,
     require_in_time,
@@ -112,7 +113,7 @@ class CanClient(Client):
         """Send a message and await its reply."""
         sequence, sent = self.next_number(), clock.now()
         self.put(REQUEST + self.address, *segments(sequence, number, words))
-        heard = await self.replied(lambda each: each.number == sequence, number)
+        heard = await self.replied(lambda each: each.number == sequence, message_name(number))
         if heard.type == NAK:
             return self.refusal(sent, heard.at, number, heard.words)
         expect_equal(heard.type, number, "type of a reply")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from inspect import isawaitable
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 from drivers.errors import CommandError
 from drivers.judge.asking.client import (
@@ -22,17 +22,17 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.records import Refusal
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, unpack_layers
 from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
 from registry import clock
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check
-_ARMED = "not run: it is armed, perhaps by another host"
+_ARMED = "it is armed, perhaps by another host"
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
-Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]
-"""What a check does, or the rows that are carried out."""
+Steps: TypeAlias = Callable[[Any], Awaitable[None] | Rows]
+"""What a check does with a Subject, or its Client, or the rows that are carried out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,7 @@ class Check:
     """A rule of the contract: its name, what it requires, and the place that says so.
 
     drives: whether it arms the amplifier. kinds: of wires on which it can be tried, empty for all.
+    greets: whether it needs the client alone, and nothing of the amplifier but its Hello.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Check:
     drives: bool
     kinds: tuple[str, ...]
     run: Steps
+    greets: bool = False
 
 
 class Result(StrEnum):
@@ -151,13 +153,16 @@ class Report:
         return {result.value: results.count(result) for result in Result}
 
 
-def reading(place: str, *kinds: str, drives: bool = False) -> Callable[[Steps], Check]:
+def reading(
+    place: str, *kinds: str, drives: bool = False, greets: bool = False
+) -> Callable[[Steps], Check]:
     """Make a check that only reads of its steps, whose docstring begins with 'It'."""
 
     def make(steps: Steps) -> Check:
         text = " ".join((steps.__doc__ or "").split())
         requirement = text.removeprefix("It ").removesuffix(".")
-        return Check(getattr(steps, "__name__", ""), requirement, place, drives, kinds, steps)
+        name = getattr(steps, "__name__", "")
+        return Check(name, requirement, place, drives, kinds, steps, greets)
 
     return make
 
@@ -166,11 +171,17 @@ driving = partial(reading, drives=True)
 """Makes a check that arms the amplifier and drives its channels."""
 
 
-async def identified(client: Client, level: float) -> Subject:
-    """Identify the amplifier at the far end of a client; raises Violation."""
+async def greeted(client: Client) -> Values:
+    """Read the identity of an amplifier of this version; raises Violation."""
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
     expect(bool(versions >> VERSION & 1), "versions", expected="bit 3 set", seen=versions)
+    return identity
+
+
+async def identified(client: Client, level: float) -> Subject:
+    """Identify the amplifier at the far end of a client; raises Violation."""
+    identity = await greeted(client)
     answer = await client.exchange(MESSAGES["GetCaps"].number, ())
     expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
     can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
@@ -197,7 +208,7 @@ async def run_checks(
     why_none = next((each.reason for each in before if each.result is Result.NOT_RUN), "")
     for number, check in checks:
         if (took := clock.now() - began) > _MAX_TIME:
-            why_none = why_none or f"not run: the checks before took {took:.0f} s"
+            why_none = why_none or f"the checks before took {took:.0f} s"
         is_armed = any(isinstance(each.finding, Armed) for each in (*before, *results))
         if why := _ARMED if check.drives and is_armed else why_none:
             result = CheckResult(check, number, Result.NOT_RUN, why)
@@ -221,8 +232,8 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
     if is_late:
         late = client.slow_reply or f"this machine was late by {1e3 * client.lag:.0f} ms"
         reason = f"no verdict in {client.attempts or 1} attempts: {reason}; {late}"
-    if isinstance(finding, Unusable):
-        reason = f"not run: {reason}"
+    if why and why != reason:
+        reason = f"{reason}; then {why}"
     result = CheckResult(
         check,
         number,
@@ -232,7 +243,7 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
         seconds=clock.now() - began,
         attempts=client.attempts + (not is_late),
     )
-    return result, why and f"not run: after {check.name} {why}"
+    return result, why and f"{check.name} failed"
 
 
 async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding, str]:
@@ -241,16 +252,11 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
     subject: Subject | None = None
     client.heard.clear()
     try:
-        subject = await identified(client, level)
-        if check.drives:
-            step = subject.can["level_step"] / FULL
-            if level < step:
-                raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
-            await subject.rest()
+        if check.greets:
+            await cast("Awaitable[None]", check.run(client))
         else:
-            await subject.watch()
-        rows = check.run(subject)
-        await (rows if isawaitable(rows) else subject.run(rows))
+            subject = await identified(client, level)
+            await _carry_out(check, subject, level)
         expect(
             not client.heard,
             "messages that were not asked for",
@@ -262,9 +268,23 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
     if isinstance(finding, Violation):
         finding.came = client.came.hex(" ")
         finding.sent = in_words(subject.sent_set) if subject else ""
-    left = await _left(check, client, subject, level)
+    is_greeted = check.greets and type(finding) is Finding
+    left = None if is_greeted else await _left(check, client, subject, level)
     finding = left if left and not isinstance(finding, Violation) else finding
     return finding, str(left or "")
+
+
+async def _carry_out(check: Check, subject: Subject, level: float) -> None:
+    """Carry out the steps of a check, from rest if it drives."""
+    if check.drives:
+        step = subject.can["level_step"] / FULL
+        if level < step:
+            raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
+        await subject.rest()
+    else:
+        await subject.watch()
+    rows = check.run(subject)
+    await (rows if isawaitable(rows) else subject.run(rows))
 
 
 async def _left(
@@ -275,7 +295,10 @@ async def _left(
     while subject is None or check.drives:
         try:
             with suppress(Unusable):  # it is silent, but cannot be judged
-                await (subject.rest() if subject else identified(client, level))
+                if subject:
+                    await subject.rest()
+                else:
+                    await (greeted(client) if check.greets else identified(client, level))
             break
         except Violation as found:
             if clock.now() > due:

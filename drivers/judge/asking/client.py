@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 from drivers import trace
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import NAK_RECORD, REACTION
+from drivers.protocol.table import NAK_RECORD, NAMES, REACTION
 from drivers.wires.wire import read_nak
 from registry import clock
 
@@ -39,6 +39,14 @@ class Violation(Finding):
         super().__init__(f"{what} must be {expected}, got {seen}")
 
 
+class NoReply(Violation):
+    """It did not reply in time: to what, and what came instead."""
+
+    def __init__(self, what: str, seen: str) -> None:
+        super().__init__(what, expected="a reply", seen=seen)
+        self.args = (self.seen,)
+
+
 class Armed(Violation):
     """It is armed, perhaps by another host: nothing is driven."""
 
@@ -53,6 +61,12 @@ class Unusable(Finding):
 
 class Late(Finding):
     """This machine was too late for what the check needs: it must be made again."""
+
+
+def message_name(number: int) -> str:
+    """Return the name of a message with its number, or the number of one without a name."""
+    name = NAMES.get(number)
+    return f"{name} (message {number})" if name else f"message {number}"
 
 
 def require(is_possible: bool, why: str) -> None:
@@ -323,17 +337,20 @@ class Client(ABC):
         finally:
             timer.cancel()
 
-    async def replied(self, is_meant: Callable[[Heard], bool], number: int) -> Heard:
-        """Return the reply to a message that was sent; Violation where none comes."""
+    async def replied(self, is_meant: Callable[[Heard], bool], what: str) -> Heard:
+        """Return the reply to what was sent; Violation where none comes."""
         before, self.lag = self.lag, 0.0
         found = await self.next(is_meant, self.timeout)
         is_in_time, self.lag = self.lag <= _STALLED, max(self.lag, before)
         if found is None:
-            require_in_time(is_in_time, f"no reply came to message {number}")
-            others = f", but {len(self.came)} other bytes" if self.came else ""
-            seen = f"none within {self.timeout:g} s{others}"
-            raise Violation(f"reply to message {number}", expected="one", seen=seen)
+            require_in_time(is_in_time, f"no reply came to {what}")
+            others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
+            raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
         return found
+
+    def remark(self) -> str:
+        """Return what is wrong with the bytes that came in place of a reply, if that is known."""
+        return ""
 
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""

@@ -17,6 +17,7 @@ from drivers.judge.asking.client import (
     altered,
     expect,
     expect_equal,
+    message_name,
     read_as,
     require_in_time,
 )
@@ -96,7 +97,8 @@ class ModbusClient(Client):
         self._reader.end()
         number = 0 if self.is_rtu else self.number
         self.write(data)
-        heard = await self.replied(lambda each: each.number == number or not each.type, pdu[0])
+        what = f"function {pdu[0]} from register {int.from_bytes(pdu[1:3])}"
+        heard = await self.replied(lambda each: each.number == number or not each.type, what)
         unit, response = heard.frame
         expect(bool(heard.type), "response", expected="a valid frame", seen=response.hex(" "))
         seen = unit, response[0] & ~EXCEPTION
@@ -138,7 +140,7 @@ class ModbusClient(Client):
         shown, result, *reply = await self.read(BOX * number + REPLY, count)
         when = when or When(sent, clock.now())
         if tag is not None:
-            expect_equal(shown, tag, f"tag of the reply to message {number}")
+            expect_equal(shown, tag, f"tag of the reply to {message_name(number)}")
         if result:
             return self.refusal(*when, number, (number, *divmod(result, 256)))
         return Answer("", None, tuple(reply), when)

@@ -6,7 +6,7 @@ from contextlib import suppress
 from functools import partial
 from typing import cast
 
-from drivers.judge.asking.check import driving, reading
+from drivers.judge.asking.check import driving, greeted, reading
 from drivers.judge.asking.client import (
     Armed,
     Client,
@@ -45,13 +45,13 @@ _FEATURE_OF = {
 }
 
 
-@reading("protocol.md#messages")
-async def identity(subject: Subject) -> None:
+@reading("protocol.md#messages", greets=True)
+async def identity(client: Client) -> None:
     """It says who it is, always the same, and that it speaks version 3."""
-    first = subject.identity
+    first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
         expect(bool(first[name]), name, expected="a text", seen="none")
-    expect_equal(await subject.client.hello(), first, "identity, read again")
+    expect_equal(await client.hello(), first, "identity, read again")
 
 
 @reading("protocol.md#messages")

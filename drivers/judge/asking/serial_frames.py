@@ -3,6 +3,7 @@
 import asyncio
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import cast
 
@@ -16,6 +17,7 @@ from drivers.judge.asking.client import (
     When,
     altered,
     expect_equal,
+    message_name,
     read_as,
 )
 from drivers.judge.asking.material import layer
@@ -62,6 +64,16 @@ class SerialClient(Client):
             self._others |= {frame.address} - {self.address}
         return data
 
+    def remark(self) -> str:
+        """Return whether a reply has its CRC in the wrong byte order."""
+        for piece in filter(None, self.came.split(b"\0")):
+            with suppress(cobs.DecodeError):
+                content = cobs.decode(piece)
+                body, crc = content[:-_CRC_SIZE], content[-_CRC_SIZE:]
+                if crc == zlib.crc32(body).to_bytes(_CRC_SIZE, "big"):
+                    return ", whose CRC fits with its four bytes reversed: it goes low byte first"
+        return ""
+
     def question(self, address: int) -> bytes:
         """Return the frame of a Hello to an address."""
         return self.frame(HELLO, b"", to=address, version=NEUTRAL)
@@ -85,14 +97,14 @@ class SerialClient(Client):
         is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
         required = (NAK if is_refused else number) | REPLY, NEUTRAL if is_neutral else VERSION
         seen = heard.type, heard.frame.version
-        expect_equal(seen, required, f"type, version of the reply to message {number}")
+        expect_equal(seen, required, f"type, version of the reply to {message_name(number)}")
         return answer
 
     async def _replied(self, number: int, payload: bytes, version: int) -> Heard:
         self.write(self.frame(number, payload, version=version))
         sequence = self.sequence
         heard = await self.replied(
-            lambda each: each.number == sequence and each.type != EVENT, number
+            lambda each: each.number == sequence and each.type != EVENT, message_name(number)
         )
         expect_equal(heard.frame.address, self.address, "address of a reply")
         return heard

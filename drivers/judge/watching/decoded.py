@@ -10,7 +10,6 @@ from drivers.judge.amplifier import FEEDING as FEEDING
 from drivers.judge.watching.capture import Direction
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.table import (
-    BY_NUMBER,
     ENABLED,
     EVENT,
     EVENT_RECORD,
@@ -20,6 +19,7 @@ from drivers.protocol.table import (
     MESSAGES,
     NAK,
     NAK_RECORD,
+    NAMES,
     REFUSALS,
     STATES,
     STATUS,
@@ -34,8 +34,6 @@ A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
 REPLIES = {HELLO: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
 """Records of replies by the name of the request."""
-NAMES = {HELLO_NUMBER: HELLO, **{number: message.name for number, message in BY_NUMBER.items()}}
-"""Names of requests by number."""
 BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
 """Requests that may be for all amplifiers of a line."""
 _WITH_STATE = (STATUS, EVENT_RECORD)

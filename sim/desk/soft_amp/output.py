@@ -83,7 +83,7 @@ class JackOutput:
         self._client.close()
 
 
-_WITH_PRIORITY, _WITHOUT = 128, 512  # frames of a block
+_WITH_PRIORITY, _WITHOUT = 128, 256  # frames of a block, each below the 10 ms of a reply
 
 
 def sounddevice() -> ModuleType:
@@ -92,7 +92,7 @@ def sounddevice() -> ModuleType:
         import sounddevice as library
     except ModuleNotFoundError:
         raise InputError(
-            "PortAudio: python-sounddevice must be installed: pip install 'era-haptics[sound]'"
+            "PortAudio: python-sounddevice must be installed: pip install -e '.[sound]'"
         ) from None
     except OSError:
         raise InputError(

@@ -98,9 +98,11 @@ def test_config_paths_are_relative_to_its_folder(
         ("rig.yaml", "learn: rig.yaml\n", [(2, "learn")]),
         ("rig.yaml", "learn: .\n", [(2, "learn")]),
         ("rig.yaml", "learn: none/learned.npz\n", [(2, "learn")]),
+        ("rig.yaml", "strengths: none/kept.json\n", [(2, "strengths")]),
+        ("rig.yaml", "strengths: /dev/zero\n", [(2, "strengths")]),
         ("rig.yaml", "touch: 3\n", [(2, "touch")]),
         ("rig.yaml", "touch: [3]\n", [(2, "touch[0]")]),
-        (
+        pytest.param(
             "rigg.yaml",
             "tabel: x.npz\n"
             "mode: loud\n"
@@ -125,6 +127,7 @@ def test_config_paths_are_relative_to_its_folder(
                 (10, "log.level"),
                 (11, "dashboard"),
             ],
+            id="all at once",
         ),
     ],
 )

@@ -246,6 +246,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
                 ("alert", ON_PAD, None),  # no finger there
                 ("unknown", ON_QUIET, None),
                 ("alert", ON_QUIET, 18.1),
+                ("alert", ON_QUIET, -20.1),  # no answer has such levels: all would be silent
             ):
                 refused = era.play(effect, place, level_db_sl=level)
                 assert await error_code(refused) is ErrorCode.REFUSED

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import cache
 from pathlib import Path
@@ -14,6 +14,7 @@ import pytest
 from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.demo.run import layout_of_people
+from controller.effects.strengths import MAX_NAMES
 from daemon_bench import DaemonBench, ready_daemon
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -84,6 +85,12 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_pat
         both = [(era, name, name) for name in PLACES]
         await hold(1.0, *both)
         tones = {each.effect: each.frequency_hz for each in (await era.status()).contacts}
+        planner = bench.daemon._controller.cycle.planner
+        assert planner is not None
+        (sent,) = [
+            n for n, one in planner.layers.contents.items() if "right" in one.content.key[0].source
+        ]
+        settled_at = planner.layers.contents[sent].settled_at
         for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
             set_at = clock.now()
             await era.strength(name="left", gain_db=gain)
@@ -106,6 +113,7 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_pat
                     assert 20 * np.log10(found[-1] / found[0]) == pytest.approx(gain or 6, abs=0.05)
                 else:
                     assert 20 * np.log10(found / found[0]) == pytest.approx(0.0, abs=0.1)
+            assert planner.layers.contents[sent].settled_at == settled_at  # not sent again
             assert len(moving) == 5
             for course in moving:
                 changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)
@@ -148,9 +156,59 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         one, other = await bench.client("seat"), await bench.client("another")
         held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
         assert await levels(era) == [11, 20]
+        await other.hello("seat")  # another name by now, while its finger rests
+        assert await levels(era) == [11, 14]
+        await other.hello("another")
         await era.strength(name="pen", gain_db=-40)
         assert await levels(era) == [-26, 20]
         weak, felt = (await era.status()).contacts
         assert (weak.verdict, felt.verdict) == ("held back", "own")
         assert "-46 dB" in (weak.held_back or "")
         held.cancel()
+
+
+@in_virtual_time
+async def test_a_disk_that_hangs_delays_no_other_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strengths hold and are answered; touches and disarming go on, and the newest is kept."""
+    disk = asyncio.Event()
+
+    async def hangs(work: Callable[[Path], None], file: Path) -> None:
+        await disk.wait()
+        work(file)
+
+    async with seats(tmp_path, "strengths: kept.json\n") as (_, era):
+        monkeypatch.setattr(asyncio, "to_thread", hangs)
+        setting = [era.strength(name="test", gain_db=-1.0 - gain) for gain in range(10)]
+        await asyncio.wait_for(asyncio.gather(*setting), 0.5)
+        await era.touch([PLACES["left"]])
+        await era.disarm()
+        disk.set()
+    assert json.loads((tmp_path / "kept.json").read_text()) == {"test": -10.0}
+
+
+@in_virtual_time
+async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
+    """A client that invents sources fills neither memory nor file: 64 names may have one."""
+    async with ready_daemon(tmp_path, "strengths: kept.json\n") as (_, era):
+        names = [f"{number} {'x' * 70}" for number in range(MAX_NAMES + 1)]
+        for name in names:
+            await era.touch([PLACES["left"]], source=name)
+            await asyncio.sleep(0.01)
+            if name is names[-1]:
+                with pytest.raises(RpcError, match=r"^strengths must be of at most 64 names"):
+                    await era.strength(name=name, gain_db=-1)
+                await era.strength(name=names[0], gain_db=0)
+            await era.strength(name=name, gain_db=-1)
+    kept = json.loads((tmp_path / "kept.json").read_text())
+    assert kept == dict.fromkeys(names[1:], -1)
+
+
+@in_virtual_time
+async def test_every_name_that_is_listed_can_be_set(tmp_path: Path) -> None:
+    """Also that of a sender whose own name is as long as may be, and not printable."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        sender = f"table:tuio:10.0.0.2/{chr(0x1F600) * 100!a}"
+        bench.daemon._layouts.player.strengths.note(sender)
+        assert (await era.strength(name=sender, gain_db=-6)).strengths == {sender: -6}

@@ -282,6 +282,21 @@ def test_fingers_feel_their_effects(name: str) -> None:
                 target.pulse.started_at = step.now
 
 
+def test_a_press_outlasts_its_layout_beside_an_older_finger() -> None:
+    """The newest finger outside of all regions stays it, though the older one starts anew."""
+    effects: dict[str, Effect] = {"press": Buzz(duration=1.0), "buzz": Buzz()}
+    player = EffectPlayer(SurfaceLayout((), effects, "press"))
+    fingers = [ONE, finger(2, since=0.5)]
+    player.intent([ONE], 0.0)
+    player.intent(fingers, 0.5)
+    player.replace(SurfaceLayout((), effects, "buzz"))
+    felt = [player.intent(fingers, at).targets for at in (1.2, 1.6)]
+    assert [[(each.key.id, each.content) for each in one] for one in felt] == [
+        [(2, "press")],
+        [(2, "buzz")],
+    ]
+
+
 @pytest.mark.parametrize(
     ("ramp", "level", "step", "levels"),
     [

@@ -11,10 +11,12 @@ from controller.daemon.messages import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import Target
+from controller.play.chooser import Chooser
+from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.layers import LayerContent, Layers, Sets
 from controller.play.observer import PlayReport
 from controller.play.planner import ENDED
+from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from model.answer import answer
@@ -528,6 +530,22 @@ async def test_status_says_what_each_finger_feels() -> None:
             tones = event.layers[str(number)].values()
             assert {tone.frequency_hz for tone in tones} == {contact.frequency_hz}
         assert len({contact.frequency_hz for contact in event.contacts}) == 3
+
+
+@in_virtual_time
+async def test_what_is_shared_stays_weak_while_its_weakest_finger_feels_a_click() -> None:
+    """Of five that share a vibration one has 20 dB less: so has the vibration, amid its click."""
+    contacts = [Contact(ContactKey("s", n), 0.05 + 0.02 * n, 0.05, 0.0) for n in range(5)]
+    lasting = [Target(each.key, 14.0, content="buzz") for each in contacts]
+    clicking = [replace(lasting[0], pulse=Pulse(0.04, 1.0), content="click"), *lasting[1:]]
+    selector, found = Selector(Chooser(table())), list[list[float]]()
+    for targets in (lasting, lasting, clicking):
+        gains = {(each.key, each.is_short): 0.0 for each in targets[1:]}
+        gains[targets[0].key, targets[0].is_short] = -20.0
+        chosen = selector.select(contacts, HapticIntent(tuple(targets)), playable(), now=1.0)
+        found.append([each.gain_db for each in chosen.weakened(gains).contents])
+        await asyncio.sleep(0.1)
+    assert found[1:] == [[-20.0], [-20.0, -20.0]]
 
 
 def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> None:

@@ -146,3 +146,22 @@ async def test_ten_moving_fingers_with_slow_answers_starve_nothing(
         await fingers.hold(1.0)
         assert fingers.levels() == {"main": (0.0,) * 4}
         assert len(fingers.committed) <= count + 1
+
+
+@in_virtual_time
+async def test_a_thread_that_cannot_start_is_asked_for_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the system has no thread left all is silent, and felt again once there is one."""
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
+
+        def exhausted(*_: object) -> None:
+            raise RuntimeError("can't start new thread")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(type(asyncio.get_running_loop()), "run_in_executor", exhausted)
+            fingers.at[2] = RIGHT
+            await fingers.hold(0.3)
+            assert fingers.levels() == {"main": (0.0,) * 4}
+        await fingers.hold(0.4)
+        assert said(fingers) == {1: None, 2: None}

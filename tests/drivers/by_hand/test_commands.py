@@ -166,7 +166,7 @@ def test_conformance_reads_first_and_reports_what_is_left() -> None:
 
 @pytest.mark.real_time
 async def test_conformance_stops_after_a_failed_reading_check() -> None:
-    """An amplifier that is armed already: exit status 1, and nothing is driven."""
+    """An amplifier that is armed already: exit status 1, nothing is driven, nor advised."""
     async with WORD_WIRES["serial"](1) as far:
         far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000}, monotonic())
         arguments = ("conformance", far.url(1), "--write", "--json")
@@ -177,6 +177,8 @@ async def test_conformance_stops_after_a_failed_reading_check() -> None:
         assert report["not_run"] > 40
         rows = {row["name"]: row for row in report["checks"]}
         assert rows["starts_disarmed"]["result"] == "failed"
+        shown = await asyncio.to_thread(invoke, "conformance", far.url(1))
+        assert (shown.exit_code, "Next: " in shown.stdout) == (1, False)
 
 
 @pytest.mark.real_time

@@ -204,6 +204,10 @@ async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None
     end.outward = lambda name, data: []
     with pytest.raises(LinkTimeout, match="30 ms; check that the amplifier is switched on"):
         await host.read_status()
+    end = MemoryLine("serial", "a")  # its replies to Hello, of type 81, alone arrive
+    end.outward = lambda name, data: unaltered(name, data) * (data[2:3] == b"\x81")
+    with pytest.raises(LinkTimeout, match="; it answered Hello, but not GetCaps"):
+        await end.hosts["a"].open()
 
 
 @in_virtual_time

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from cobs import cobs
 
 import era_haptics
 from drivers.errors import CommandError
@@ -175,16 +176,43 @@ def test_nothing_is_run_after_one_that_is_not_silenced() -> None:
     assert sum(each.seconds for each in results) < 10
 
 
-def test_mute_amplifier_fails() -> None:
-    """The first check says so, and no other is run."""
-    far = plain()
-    far.is_answering = False
-    result, *others = judged("serial", far=far)
-    assert (result.result, result.finding.seen) == (
-        Result.FAILED,
-        "reply to message 1: none within 0.5 s",
-    )
-    assert {each.result for each in others} == {Result.NOT_RUN}
+def _with_crc_reversed(data: bytes) -> bytes:
+    content = cobs.decode(data[1:-1])
+    stuffed: bytes = cobs.encode(content[:-4] + content[:-5:-1])
+    return b"\0" + stuffed + b"\0"
+
+
+# Behind a zero and a number of the stuffing comes the type: 81 of the reply to Hello.
+@pytest.mark.parametrize(
+    ("alter", "passed", "reason"),
+    [
+        (lambda data: b"", 0, r"Hello \(message 1\): no reply within 0.5 s"),
+        (
+            _with_crc_reversed,
+            0,
+            r"Hello \(message 1\): no reply within 0.5 s, but \d+ other bytes, whose CRC fits with "
+            "its four bytes reversed: it goes low byte first",
+        ),
+        (
+            lambda data: data * (data[2:3] == b"\x81"),
+            1,
+            r"GetCaps \(message 2\): no reply within 0.5 s",
+        ),
+    ],
+    ids=["mute", "crc reversed", "hello alone"],
+)
+def test_amplifier_that_is_not_identified_fails_once(
+    alter: Callable[[bytes], bytes], passed: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the message and the cause; a good Hello has passed, and what follows is not run."""
+    send = JudgedLine._send
+    monkeypatch.setattr(JudgedLine, "_send", lambda line, data: send(line, alter(data)))
+    before, (failed, *others) = (found := judged("serial", far=plain()))[:passed], found[passed:]
+    assert [each.result for each in before] == [Result.PASSED] * passed
+    assert failed.result is Result.FAILED
+    assert re.fullmatch(reason, failed.reason), failed.reason
+    after = {(each.result, each.reason) for each in others}
+    assert after == {(Result.NOT_RUN, f"{failed.check.name} failed")}
 
 
 def _stall(duration: float) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from model.errors import InputError
 from sim.desk.soft_amp.library import compile_engine
-from sim.desk.soft_amp.output import portaudio_stream
+from sim.desk.soft_amp.output import PortAudioOutput, portaudio_stream
 from sim.desk.soft_amp.settings import Law, Place, Protocol, Settings, terminal_place
 
 
@@ -71,6 +71,21 @@ def test_link_follows_the_terminal_and_has_one_user(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no symbolic link"), terminal_place(link):
         pass
     assert link.read_text() == "mine"
+
+
+@pytest.mark.parametrize("is_realtime", [False, True])
+def test_block_is_shorter_than_a_reply_may_take(
+    is_realtime: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 48 kHz, with and without real-time priority: the page allows 10 ms."""
+    names = ("_terminate", "_initialize", "check_output_settings")
+    library = SimpleNamespace(**dict.fromkeys(names, lambda *given, **others: None))
+    device = {"name": "card", "index": 0, "default_samplerate": 48_000.0}
+    monkeypatch.setattr("sim.desk.soft_amp.output.sounddevice", lambda: library)
+    monkeypatch.setattr("sim.desk.soft_amp.output.portaudio_device", lambda *_, **others: device)
+    monkeypatch.setattr("sim.desk.soft_amp.output.may_be_realtime", lambda: is_realtime)
+    output = PortAudioOutput(settings(device="card"))
+    assert output.block / output.rate < 0.01
 
 
 class _Busy:

@@ -113,8 +113,8 @@ class SolvedPlate:
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
         All layers of an answer play, without the fingers: these move nulls, as `responses` and
-        `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
+        `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several
+        frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
         """
         points = (
             None

@@ -35,6 +35,7 @@ from model.answer.fingers import Stimulus as Stimulus
 from model.answer.measures import Measures as Measures
 from model.calibration.calibration_result import Calibration as Calibration
 from model.design.request import design as design
+from model.design.run import Assessment as Assessment
 from model.design.run import Design as Design
 from model.design.run import RankedLayout as RankedLayout
 from model.errors import InputError as InputError
@@ -56,6 +57,8 @@ from model.vibration.maps import PlateMap as PlateMap
 from registry.limits import GuardLimits as GuardLimits
 from sim.plant.excited_plate import FeltFinger as FeltFinger
 from sim.plant.excited_plate import Playback as Playback
+from sim.plant.excited_plate import Vibration as Vibration
+from sim.plant.fingers import Record as Record
 
 _HOMES: dict[str, str]
 __all__: list[str]

@@ -34,7 +34,7 @@ def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...
     """Convert to layers by name of the amplifier, for its `play` and `apply`.
 
     One for each layer of an answer, and for each of its side bands, with its ramp, onset and
-    ending; channels by the rig's wiring. Raises InputError for an unknown ERA.
+    ending; channels by the rig's wiring. Raises InputError for a drive that the rig cannot play.
     """
     expect_rig(rig)
     voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]

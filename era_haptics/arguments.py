@@ -19,6 +19,10 @@ Fingers: TypeAlias = Positions | Sequence[Finger]
 """Positions [m] of fingers, or fingers with their loads and bounds."""
 
 
+MAX_LEVEL = 1 + 1e-9
+"""Full stroke, with the rounding of weights that were divided by the largest."""
+
+
 def expect_rig(value: object) -> None:
     """Raise InputError for anything but a rig, such as the name of its file."""
     expect(value, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
@@ -77,14 +81,14 @@ def as_signals(given: object, rig: Rig, sample_rate: object) -> FloatArray:
             f"signals must be real numbers ({len(rig.eras)}, samples), a row for each ERA, "
             f"{', '.join(each.name for each in rig.eras)}, got {got}"
         )
-    beyond = np.argwhere(~(np.abs(found) <= 1))  # NaN, too
+    beyond = np.argwhere(~(np.abs(found) <= MAX_LEVEL))  # NaN, too
     if len(beyond):
         row, sample = beyond[0].tolist()
         raise InputError(
-            f"signals must be within full stroke, -1 to 1, got {found[row, sample]:g} of "
+            f"signals must be within full stroke, -1 to 1, got {found[row, sample]} of "
             f"{rig.eras[row].name} at sample {sample}"
         )
-    return found
+    return np.clip(found, -1, 1)
 
 
 def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:

@@ -1,11 +1,13 @@
 """Drives in hertz, fractions of full stroke and degrees, and their conversion to layers."""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import TypeAlias
 
+from era_haptics.arguments import MAX_LEVEL
 from model.answer.answer import Answer, Layer
 from model.arguments import expect_number, shown
 from model.errors import InputError
@@ -36,13 +38,17 @@ class Drive:
             raise InputError(
                 f"frequency of a drive must be positive and finite, got {self.frequency} Hz"
             )
-        if not 0 <= self.level <= 1:
+        if not 0 <= self.level <= MAX_LEVEL:
             raise InputError(
                 f"level of a drive must be 0 (silence) to 1 (full stroke), got {self.level}"
             )
+        object.__setattr__(self, "level", min(self.level, 1.0))
         if not math.isfinite(self.phase_deg):
             raise InputError(f"phase of a drive must be finite, got {self.phase_deg} degrees")
 
+
+_MAX_SUM = 1 + 1e-6
+"""Highest sum of levels, with the rounding of answers in single precision."""
 
 _UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
 
@@ -50,19 +56,45 @@ Driven: TypeAlias = float | Drive | Tone
 """A frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
 
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
-"""By ERA name: what it plays, or several of them at once."""
+"""By ERA name: what it plays, or a list of what it plays at once."""
 
 Played: TypeAlias = Answer | Layer | Drives
 """What ERAs are to play: an answer with all its layers, one layer, or drives."""
 
 
 def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
-    """The layers of an answer, or one; raises InputError for an unknown ERA, and for silence."""
+    """The layers of an answer, or one; raises InputError for silence, and what the rig cannot play.
+
+    That is an unknown ERA, a frequency beyond the rig's limits, and more than full stroke of all
+    that an ERA plays at once.
+    """
     if isinstance(drive, Answer | Layer):
         layers = drive.layers if isinstance(drive, Answer) else (drive,)
         if not layers:
             raise InputError("an answer must have a layer to be played, got one of quiet fingers")
-        return layers
+    else:
+        layers = (_layer_of(drive, rig),)
+    limits, levels = rig.limits, defaultdict[str, float](float)
+    tones = [item for one in layers for each in one.excitations for item in each.items()]
+    for name, tone in tones:
+        if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
+            raise InputError(
+                f"frequency of {name} must be from {limits.frequency_min:g} to "
+                f"{limits.frequency_max:g} Hz, got {tone.frequency} Hz; widen limits.frequency of "
+                "the rig"
+            )
+        levels[name] += abs(tone.amplitude) / rig.era(name).stroke
+    for name, level in levels.items():
+        if not level <= _MAX_SUM:  # NaN, too
+            raise InputError(
+                f"level of {name}, the sum of all that it plays at once, must be at most 1, its "
+                f"stroke of {rig.era(name).stroke:g} m, got {level}"
+            )
+    return layers
+
+
+def _layer_of(drive: object, rig: Rig) -> Layer:
+    """The layer of drives, all at once."""
     if not isinstance(drive, Mapping):
         raise InputError(
             "drive must be an answer, a layer or a mapping of names of ERAs, such as "
@@ -70,24 +102,28 @@ def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
         )
     tones: dict[str, list[Tone]] = {}
     for name, given in drive.items():
-        if name not in rig.wiring:
-            raise InputError(f"unknown ERA {name!r}; known are {', '.join(rig.wiring)}")
-        several = given if isinstance(given, list | tuple) else (given,)
-        tones[name] = [_tone_of(one, name, rig) for one in several]
+        tones[name] = [
+            _tone_of(one, name, rig) for one in (given if isinstance(given, list) else [given])
+        ]
     count = max([1, *map(len, tones.values())])
     excitation, *others = (
         {name: each[number] for name, each in tones.items() if number < len(each)}
         for number in range(count)
     )
-    return (Layer(excitation, side_bands=tuple(others)),)
+    return Layer(excitation, side_bands=tuple(others))
 
 
 def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
     """The tone of an ERA; raises InputError for what is none."""
+    stroke = rig.era(name).stroke
+    if isinstance(given, tuple):
+        raise InputError(
+            f"drive of {name} must be a frequency, a Drive, a Tone or a list of these, got "
+            f"{given}; make one drive with era.Drive(110, 0.5, 90)"
+        )
     if isinstance(given, Tone):
         for key, unit in _UNITS_OF_A_TONE.items():
             expect_number(getattr(given, key), what=f"{key} of the tone of {name}", unit=unit)
         return given
     one = given if isinstance(given, Drive) else Drive(given)
-    amplitude = float(one.level) * rig.era(name).stroke
-    return Tone(float(one.frequency), amplitude, math.radians(one.phase_deg))
+    return Tone(float(one.frequency), float(one.level) * stroke, math.radians(one.phase_deg))

@@ -18,7 +18,7 @@ from model.figures.drawing import map_figure
 from model.figures.table_pictures import contrast_map_figure, layer_figure
 from model.study.contrast_map import ContrastMap
 from model.table.table import LocalizationTable
-from sim.plant.excited_plate import Playback
+from sim.plant.excited_plate import LEVEL_WINDOW, Playback
 from sim.plant.fingers import Record
 
 
@@ -83,13 +83,13 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
 def draw_playback(playback: Playback) -> Figure:
     """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
-    The peak within a period of the lowest frequency: the mean over the fingertip of a target, the
-    loudest point of a quiet finger, as in contrast.
+    The peak within a period of the lowest frequency, of signals within 30 ms: the mean over the
+    fingertip of a target, the loudest point of a quiet finger, as in contrast.
     """
     expect(playback, Playback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
-    period = 1 / min(playback.frequencies)
+    period = 1 / min(playback.frequencies, default=1 / LEVEL_WINDOW)
     for number, record in enumerate(playback.targets, start=1):
         times, peaks = _peaks(record, period)
         axes.plot(1000 * times, peaks @ record.weights, label=f"target {number}", lw=2)
@@ -115,6 +115,6 @@ def draw_playback(playback: Playback) -> Figure:
 def _peaks(record: Record, period: float) -> tuple[FloatArray, FloatArray]:
     """Times (n,) [s] and the largest acceleration (n, p) [m/s²] within the period before each."""
     step = record.times[1] - record.times[0]
-    width = max(1, round(period / step))
+    width = min(max(1, round(period / step)), len(record.times))
     windows = sliding_window_view(np.abs(record.accelerations), width, axis=0)
     return record.times[width - 1 :], windows.max(axis=-1)

@@ -19,7 +19,7 @@ from era_haptics.arguments import (
     expect_rig,
 )
 from era_haptics.drive import Played, layers_of
-from model.answer.answer import Answer, Layer
+from model.answer.answer import Answer
 from model.answer.fingers import Placement, Stimulus, check_on_plate, together
 from model.arguments import expect_number, is_whole, shown
 from model.arrays import ComplexArray, FloatArray
@@ -86,9 +86,10 @@ class SolvedPlate:
 
         points (p, 2) [m]; frequencies (f,) [Hz]: those of a table by default; fingers: that rest on
         the plate, as positions [m] or with their loads; seed: of another plate, as
-        `SolvedPlate(rig, seed=seed)`. Complex amplitudes (f, ERAs, p) of exp(+i omega t), ERAs as
-        in `rig.eras`: times weights in full strokes they are the field of `map`. Raises InputError
-        for points and fingers off the plate, and frequencies for which it is not solved.
+        `SolvedPlate(rig, seed=seed)`. Complex peak amplitudes h (f, ERAs, p), ERAs as in
+        `rig.eras`: weights w in full strokes give a(t) = Im[h w exp(i omega t)], without fingers
+        the field of `map`. Raises InputError for points and fingers off the plate, and frequencies
+        for which it is not solved.
         """
         if seed is not None:
             drawn = SolvedPlate(self.rig, seed=seed)
@@ -111,9 +112,9 @@ class SolvedPlate:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
-        All layers of an answer play. ERAs at one frequency add as complex amplitudes, magnitudes of
-        several frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot
-        play.
+        All layers of an answer play, without the fingers: these move nulls, as `responses` and
+        `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several
+        frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
         """
         points = (
             None
@@ -127,7 +128,7 @@ class SolvedPlate:
                 name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
                 for name, tone in each.items()
             }
-            for layer in self._layers(drive)
+            for layer in layers_of(drive, self.rig)
             for each in layer.excitations
         ]
         return plate_map(self._real, *excitations, raster=points, free=self._free)
@@ -139,10 +140,10 @@ class SolvedPlate:
         *,
         quiet: Positions = (),
         loads: Sequence[float] = (),
-        duration: float = 1.0,
+        duration: float | None = None,
         sample_rate: float | None = None,
     ) -> Playback:
-        """Compute what fingers feel during a duration [s], from rest.
+        """Compute what fingers feel during a duration [s], from rest, by default until steady.
 
         target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
         each with its own layer and load; loads: relative to the rig's fingertip, targets first, 1
@@ -150,9 +151,10 @@ class SolvedPlate:
         sample_rate [Hz] drive is an array (ERAs, samples) of band-limited signals in full strokes,
         which say the duration and where records are sampled. The plate in time is solved exactly,
         without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
-        duration too short for a steady state, and signals that no ERA can play.
+        duration in which the slowest vibration does not decay to 5 %, and what no ERA can play.
         """
-        expect_number(duration, what="duration", unit="seconds")
+        if duration is not None:
+            expect_number(duration, what="duration", unit="seconds")
         others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
         placed = None if target is None else as_points(target, what="target")
         if placed is not None:
@@ -173,7 +175,7 @@ class SolvedPlate:
                 sample_rate=cast(float, sample_rate),
                 imperfections=self._drawn,
             )
-        layers = self._layers(drive)
+        layers = layers_of(drive, self.rig)
         if placed is not None:
             own = tuple(range(len(placed)))
             layers = tuple([replace(each, fingers=own) for each in layers])
@@ -185,18 +187,6 @@ class SolvedPlate:
             duration=duration,
             imperfections=self._drawn,
         )
-
-    def _layers(self, drive: Played) -> tuple[Layer, ...]:
-        """The layers; raises InputError beyond the frequencies that the plate is solved for."""
-        layers, highest = layers_of(drive, self.rig), self.rig.limits.frequency_max
-        tones = [item for one in layers for each in one.excitations for item in each.items()]
-        for name, tone in tones:
-            if tone.frequency > highest:
-                raise InputError(
-                    f"frequency of {name} must be at most {highest:g} Hz, got {tone.frequency:g}; "
-                    "raise limits.frequency of the rig"
-                )
-        return layers
 
     @cached_property
     def _free(self) -> FreePlate:

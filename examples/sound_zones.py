@@ -1,6 +1,6 @@
 """Two methods of personal sound zones on a plate, beside the library's own, on drawn plates.
 
-    python examples/sound_zones.py        ten pairs of fingers on the paper's plate
+    python examples/sound_zones.py        pairs of fingers on the paper's plate
     python examples/sound_zones.py DIR    entries for the contrast benchmark exported into DIR
 
 One finger shall feel a vibration, the others nothing: a bright and a dark zone.
@@ -15,7 +15,8 @@ import numpy as np
 import era_haptics as era
 
 LEVEL_DB_SL = 20
-KNOWN, JUDGES = range(1000, 1020), range(40)  # seeds of plates: what methods may use, and others
+FEW, MANY = 20, 60  # plates that methods may use, seeds from 1000 on
+JUDGES = range(40)  # seeds of others
 # A fingertip, as the library has it: rings of points, their radius [m], a point's share in a mean.
 RINGS = [(1, 0.0, 1 / 6), (8, 0.013 * 0.5**0.5, 1 / 12), (12, 0.013, 1 / 72)]
 TURNS = np.concatenate([radius * np.exp(2j * np.pi * np.arange(n) / n) for n, radius, _ in RINGS])
@@ -68,16 +69,19 @@ def felt(weights, fields):
     return target, 20 * np.log10(target / size[..., len(SHARES) :].max(axis=-1))
 
 
-def chosen(method, fields, thresholds):
+def chosen(method, fields, thresholds, judged=None):
     """Frequency by its index and weights (ERAs,): the most contrast of those with the level.
 
-    Level and contrast that nine of ten of these plates give, the largest weight at full stroke.
+    Level and contrast that nine of ten plates give, the largest weight at full stroke. judged: the
+    fields of these, by default those of which the weights are.
     """
     zones = np.concatenate(fields, axis=2).reshape(*fields.shape[1:3], len(fields), -1)
     bright, dark = np.split(zones, [len(SHARES)], axis=3)
     weights = method(*(zone.reshape(*zone.shape[:2], -1) for zone in (bright, dark)))
     weights /= np.abs(weights).max(axis=1, keepdims=True)
-    target, contrast = np.percentile(felt(weights, fields), 10, axis=1)
+    target, contrast = np.percentile(
+        felt(weights, fields if judged is None else judged), 10, axis=1
+    )
     contrast[20 * np.log10(target / thresholds) < LEVEL_DB_SL] = -np.inf
     return contrast.argmax(), weights[contrast.argmax()]
 
@@ -91,35 +95,45 @@ def ours(table, fingers):
     return np.abs(table.frequencies - layer.frequency).argmin(), np.array(weights)
 
 
-def plates_of(rig):
+def plates_of(rig, *counts):
     """What methods may know of the rig's plate: the nominal one, or some that are drawn."""
-    drawn = [era.SolvedPlate(rig, seed=seed) for seed in KNOWN]
-    return {"nominal plate": [era.SolvedPlate(rig)], f"{len(drawn)} drawn plates": drawn}
+    drawn = [era.SolvedPlate(rig, seed=seed) for seed in range(1000, 1000 + max(counts))]
+    known = {f"{count} drawn plates": drawn[:count] for count in counts}
+    return {"nominal plate": [era.SolvedPlate(rig)], **known}
 
 
-def by_method(plates, fingers, thresholds):
-    """Frequency by its index and weights of each method, by its name and what it knows."""
-    fields = {of: fields_of(some, fingers) for of, some in plates.items()}
+def by_method(fields, thresholds):
+    """Frequency by its index and weights of each method, by its name and whose fields it knows."""
     return {
-        f"{name}, {of}": chosen(method, fields[of], thresholds)
+        f"{name}, {of}": chosen(method, some, thresholds)
         for name, method in METHODS.items()
-        for of in plates
+        for of, some in fields.items()
     }
 
 
 def compare(pairs):
-    """Contrast [dB] that nine of ten judging plates give, by method, median over the pairs."""
+    """Contrast [dB] that nine of ten judging plates give at each pair of fingers, by method."""
     rig = era.load_rig(era.example_rig_path())
-    table, plates, found = era.table(rig, drive_mode="phased"), plates_of(rig), {}
+    table, plates, found = era.table(rig, drive_mode="phased"), plates_of(rig, FEW, MANY), {}
     judges = [era.SolvedPlate(rig, seed=seed) for seed in JUDGES]
     for fingers in pairs:
         judged = fields_of(judges, fingers)
-        rows = {"era-haptics": ours(table, fingers)}
-        rows |= by_method(plates, fingers, table.thresholds)
+        fields = {of: fields_of(some, fingers) for of, some in plates.items()}
+        many = fields.pop(f"{MANY} drawn plates")
+        rows = {"era-haptics": ours(table, fingers), **by_method(fields, table.thresholds)}
+        nominal, few = fields.values()
+        for name, weighed, tried in (
+            (f"nominal weights, frequency of {FEW}", nominal, few),
+            (f"weights of {FEW}, nominal frequency", few, nominal),
+            (f"weights and frequency of {MANY}", many, many),
+        ):
+            rows[f"contrast control, {name}"] = chosen(
+                contrast_control, weighed, table.thresholds, tried
+            )
         for name, (frequency, weights) in rows.items():
             contrast = felt(weights, judged[:, frequency])[1]
             found.setdefault(name, []).append(np.percentile(contrast, 10))
-    return {name: np.median(contrasts) for name, contrasts in found.items()}
+    return found
 
 
 def write_entries(folder):
@@ -127,9 +141,10 @@ def write_entries(folder):
     document, patterns = json.loads((folder / "localization-1.json").read_text("utf-8")), {}
     for plate, content in document["plates"].items():
         rig = era.load_rig(folder / f"{plate}.yaml")
-        table, plates = era.table(rig, drive_mode="phased"), plates_of(rig)
+        table, plates = era.table(rig, drive_mode="phased"), plates_of(rig, FEW)
         for place, fingers in content["sets"].items():
-            for name, (row, weights) in by_method(plates, fingers, table.thresholds).items():
+            fields = {of: fields_of(some, fingers) for of, some in plates.items()}
+            for name, (row, weights) in by_method(fields, table.thresholds).items():
                 patterns.setdefault(name, {})[place] = {
                     e.name: [table.frequencies[row], min(abs(w), 1), np.degrees(np.angle(w))]
                     for e, w in zip(rig.eras, weights, strict=True)
@@ -141,16 +156,18 @@ def write_entries(folder):
         print(f"wrote {file}")
 
 
-def ten_pairs():
+def pairs_of_fingers(count=20):
     """Pairs of fingers at least 5 cm apart, 13 mm from the edges of the paper's plate."""
     rng = np.random.default_rng(0)
-    drawn = rng.uniform([0.013, 0.013], [0.2918, 0.2156], size=(20, 2, 2))
-    return drawn[np.linalg.norm(drawn[:, 0] - drawn[:, 1], axis=1) >= 0.05][:10].tolist()
+    drawn = rng.uniform([0.013, 0.013], [0.2918, 0.2156], size=(2 * count, 2, 2))
+    return drawn[np.linalg.norm(drawn[:, 0] - drawn[:, 1], axis=1) >= 0.05][:count].tolist()
 
 
 if __name__ == "__main__":
     if sys.argv[1:]:
         write_entries(Path(sys.argv[1]))
     else:
-        for name, contrast in compare(ten_pairs()).items():
-            print(f"{name:35} {contrast:5.1f} dB")
+        contrasts = compare(pairs_of_fingers())
+        for name, each in contrasts.items():
+            less = np.mean(np.subtract(each, contrasts["era-haptics"]))
+            print(f"{name:55} {np.median(each):5.1f} dB {less:+5.1f} dB")

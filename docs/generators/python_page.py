@@ -1,9 +1,9 @@
 """The entries of docs/reference/python-api.md: signatures and docstrings of `era_haptics`.
 
 Each block goes up to the next section, below the comment that has its names: `<!-- api: query;
-Rig: era, fingerprint; Client(): * -->` is a function, a class with two of its members, and one that
-is made elsewhere, with all of its members. Functions are a list, a class has a heading and a list
-of its members.
+Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and one
+that is made elsewhere, with all of its members. Functions are a list, a class has a heading and a
+list of its members. Defaults are of what a program makes.
 """
 
 import ast
@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import era_haptics
 
 _BLOCK = re.compile(r"(<!-- api: (.+?) -->\n\n).*?(?=\n## |\Z)", re.DOTALL)
-_WIDTH = 120
+_WIDTH = 140
 
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -88,7 +88,8 @@ def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> I
     fields, listed = [], []
     for member in tree.body:
         if isinstance(member, ast.AnnAssign) and not ast.unparse(member.target).startswith("_"):
-            fields.append(ast.unparse(member))
+            name, default, value = ast.unparse(member).partition(" = ")
+            fields.append(name if is_made_elsewhere else name + default + value)
         elif isinstance(member, Function):
             if member.name == "__init__" and not is_made_elsewhere:
                 fields.append(ast.unparse(member.args).removeprefix("self, "))

@@ -49,7 +49,7 @@ class Sensation:
       vibrations here, or of an only one above its own at the loudest quiet finger; of a quiet
       finger the weakest vibration at its own finger above all of them here. As modelled, of half
       and of nine of ten plates; None where there is nothing to compare with
-    - foreign_level_db_sl: of all other vibrations here, promised
+    - foreign_level_db_sl: of all other vibrations here, promised, not nominal as level_db_sl
     - lowered_db: by how much it is weaker than its stimulus asks
     - is_disturbing: whether it is held back because of a finger's max_foreign_db_sl
     """

@@ -77,7 +77,7 @@ def area_of(where: str, plate: Plate) -> Area:
         return Area(path.read_bytes().hex(), length, width, contains)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
-            f"--where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
+            f"where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
             f"file of polygons, got {where!r}"
         )
     document = read_document(path, if_empty="it must have polygons, each a name with its corners")
@@ -109,7 +109,7 @@ def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
         spacing *= 0.7
     if len(places) == 0:
         raise InputError(
-            "--where must leave room for ERAs on the plate, got none; check that it is in metres, "
+            "where must leave room for ERAs on the plate, got none; check that it is in metres, "
             "from the plate's corner, and white where ERAs may stand"
         )
     return places, spacing

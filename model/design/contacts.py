@@ -113,7 +113,7 @@ class ContactRule:
     def _no_room(self, fingers: int) -> InputError:
         return InputError(
             f"{fingers} fingers {1000 * self.apart:g} mm apart must find room in the regions of "
-            f"--contacts, got none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
+            f"contacts, got none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
             "regions"
         )
 
@@ -186,7 +186,7 @@ def _place_in(shape: Shape, plate: Plate, rng: np.random.Generator) -> Point:
         x, y = rng.uniform(*box).tolist()
         if plate.contains(x, y) and shape.contains(x, y):
             return x, y
-    raise InputError("regions of --contacts must have an area, got one that has none")
+    raise InputError("regions of contacts must have an area, got one that has none")
 
 
 class _RegionSection(ShapedSection):

@@ -87,7 +87,7 @@ class DesignProblem:
         """Check the number of ERAs."""
         if self.count + self.supports < MIN_SUPPORTING:
             raise InputError(
-                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
                 f"got {self.count}"
             )
 
@@ -173,8 +173,8 @@ class DesignProblem:
         found = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= self.apart)
         if not len(found):
             raise InputError(
-                f"--where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, got "
-                f"room for {len(positions)}; enlarge it, or lower --eras or --apart"
+                f"where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, got "
+                f"room for {len(positions)}; enlarge it, or reduce eras or apart"
             )
         return found
 
@@ -224,9 +224,9 @@ def supported_layouts(
         problem.shortfall(each) == 0 for problem in given for each in given[problem].values()
     ):
         raise InputError(
-            f"a layout of --layouts must support the plate with its lowest rigid-body frequency at "
+            f"a given layout must support the plate with its lowest rigid-body frequency at "
             f"least {problems[0].lowest:g} Hz and weight on each ERA, got none that does; add ERAs "
-            "or stiffer ones, widen --where, or lower --lowest"
+            "or stiffer ones, widen where, or reduce lowest"
         )
     return given
 
@@ -238,7 +238,7 @@ def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
         return _layouts_of_file(Path(text), problem)
     count = int(found[1])
     if not 1 <= count <= MAX_LAYOUTS:
-        raise InputError(f"--layouts must be random:1 to random:{MAX_LAYOUTS}, got {text}")
+        raise InputError(f"layouts must be random:1 to random:{MAX_LAYOUTS}, got {text}")
     return random_layouts(problem, count)
 
 
@@ -296,7 +296,7 @@ def _layouts_of_file(path: Path, problem: DesignProblem) -> NamedLayouts:
         if not problem.are_apart(positions):
             raise InputError(
                 f"{where} must have ERAs at least {1000 * problem.apart:g} mm apart; move them, or "
-                "lower --apart"
+                "reduce apart"
             )
         found[name] = positions
     return found

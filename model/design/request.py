@@ -68,7 +68,8 @@ def design(
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     check_progress(progress)
-    counts: Any = [len(rig.eras)] if eras is None else [eras] if is_whole(eras) else eras
+    asked: Any = len(rig.eras) if eras is None else eras
+    counts = [asked] if is_whole(asked) or isinstance(asked, str) else asked
     for what, row, made_by in (
         ("eras", counts, "range(3, 7)"),
         ("keep", keep, '["SW"]'),
@@ -94,17 +95,17 @@ def design(
         expect_number(number, what=what, unit=unit)
     expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
     if not 0 < apart < max(rig.plate.length, rig.plate.width):
-        raise InputError(f"--apart must be above 0 and below the plate's length, got {apart:g} m")
+        raise InputError(f"apart must be above 0 and below the plate's length, got {apart:g} m")
     own = [era.name for era in rig.eras]
     if any(each not in own or keep.count(each) > 1 for each in keep) or len(keep) > min(counts):
         raise InputError(
-            f"--keep must be up to {min(counts)} different ERAs of the rig, {', '.join(own)}, got "
+            f"keep must be up to {min(counts)} different ERAs of the rig, {', '.join(own)}, got "
             f"{', '.join(map(str, keep))}"
         )
     tried = sorted({float(each) for each in stiffness if 0 < each < math.inf})
     if len(tried) < len(stiffness) or len(tried) > MAX_STIFFNESSES:
         raise InputError(
-            f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
+            f"stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
             f"{', '.join(f'{each:g}' for each in stiffness)}"
         )
     rule = contact_rule(
@@ -119,7 +120,7 @@ def design(
         for each in (tried or (None,))
     ]
     if cluster is not None and workers is not None:
-        raise InputError("only one of --workers and --cluster can be given")
+        raise InputError("only one of workers and cluster can be given")
     machines: Machines = (
         partial(on_processes, workers or 1) if cluster is None else partial(on_cluster, cluster)
     )

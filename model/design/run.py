@@ -63,9 +63,12 @@ class Assessment:
     contrast_db: FloatArray
     level_db_sl: FloatArray
 
+    def __repr__(self) -> str:
+        return f"<Assessment of {len(self.quiet)} sets: {self.mean_db:.1f} dB>"
+
     @property
     def mean_db(self) -> float:
-        """Mean contrast, each number of quiet fingers counting the same."""
+        """Mean contrast [dB], each number of quiet fingers counting the same."""
         return float(np.mean([self.contrast_db[self.quiet == k].mean() for k in self.kinds]))
 
     @property
@@ -74,7 +77,7 @@ class Assessment:
         return [int(each) for each in np.unique(self.quiet)]
 
     def median_db(self, quiet: int) -> float:
-        """Median contrast with a number of quiet fingers."""
+        """Median contrast [dB] with a number of quiet fingers."""
         return float(np.median(self.contrast_db[self.quiet == quiet]))
 
     @property
@@ -119,7 +122,8 @@ def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tu
 class RankedLayout:
     """A layout of a design, and its answers on fresh contact sets if it was judged.
 
-    name: of a given one, or the number of its start.
+    name: of a given one, or the number of its start; judged: its answers, to compare with `own` of
+    the design.
     """
 
     problem: DesignProblem
@@ -160,7 +164,7 @@ class RankedLayout:
 
     @property
     def rig(self) -> Rig:
-        """The rig with these ERAs, as `era design` writes it: on free channels."""
+        """The rig with these ERAs on free channels, if need be of another, simulated amplifier."""
         keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
         return rig_of(Document("RankedLayout.rig", "", keys, {}))
 
@@ -183,6 +187,10 @@ class Design:
     sensitivities: FloatArray
     own: Assessment | None
     sets: list[FloatArray]
+
+    def __repr__(self) -> str:
+        best = f"{self.best.name}, {self.best.count} ERAs, {self.best.mean_db:.1f} dB"
+        return f"<Design of {len(self.layouts)} layouts: {best}>"
 
     @property
     def best(self) -> RankedLayout:
@@ -237,7 +245,7 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
             raise InputError(
                 f"the plate must be supported by {problem.count} ERAs with its lowest rigid-body "
                 f"frequency at least {problem.lowest:g} Hz and weight on each of them, got no such "
-                "layout; add ERAs or stiffer ones, widen --where, or lower --lowest"
+                "layout; add ERAs or stiffer ones, widen where, or reduce lowest"
             )
     judged = _judged(layouts, runner)
     ends = [each for each in judged if each.count == each.problem.count]

@@ -7,9 +7,10 @@ At each frequency the expected power at the quiet fingertips, a weighted mean ov
 quadratic form w^H R w of the weights w, and the weights that reach the targets with the least of it
 solve R w = c, where c sums conj(h_t) of the targets, each times a factor. Where the maximum
 over the quiet fingertips counts, their weights mu_q are multiplied by the root of their expected
-power and the system is solved again (Lawson's algorithm for minimax approximation; few steps, since
-the minimax of expected powers is not the best percentile). A mean is at most the maximum, so that
-|c^H w| / sqrt(w^H R w) bounds the score at a frequency.
+power and the system is solved again (Lawson's algorithm for minimax approximation; three steps, of
+which the best is kept, since the minimax of expected powers is not the best percentile). A mean is
+at most the maximum, so that for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
+Of several it estimates it: phases and factors in c are the best of those tried.
 
 `model/compiled/search.h` is the same in C.
 """
@@ -78,8 +79,9 @@ _TINY, _LEAST, _LEAST_FIELD = 1e-7, np.float32(1e-30), np.float32(1e-20)
 class CoherentResult:
     """The best weights (f, eras) at each frequency, and their robust score (f,).
 
-    The score is 0 where none were found that reach the level. bound (f,): upper bound of the score;
-    missed (f,): the best score of weights that miss the level.
+    The score is 0 where none were found that reach the level. bound (f,): of the score for one
+    target, for several an estimate that other phases may exceed; missed (f,): the best score of
+    weights that miss the level.
     """
 
     score: Float32Array

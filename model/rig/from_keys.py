@@ -24,7 +24,7 @@ from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
 from model.rig.sections import PlateSection, RigSection
 
-_SECTIONS = RigSection.model_fields.keys() - {"plate"}
+_SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
 """Keys that are changed as a whole."""
 
 _OF_THEORY = {"length", "width", "thickness", "material", "layers", "bond", "air_gap"}
@@ -45,7 +45,7 @@ def rig(
     plate: Mapping[str, Any],
     eras: Mapping[str, Mapping[str, Any]],
     *,
-    amplifiers: Mapping[str, Mapping[str, Any]],
+    amplifiers: Mapping[str, Mapping[str, Any]] | None = None,
     masses: Mapping[str, Mapping[str, Any]] | None = None,
     mesh: str | None = None,
     limits: Mapping[str, Any] | None = None,
@@ -55,10 +55,16 @@ def rig(
 ) -> Rig:
     """Make a rig of a `Plate` and an `Era` for each name, as of a file with these sections.
 
-    amplifiers: such as `{"main": {"url": "sim://"}}`; uncertainty, fingertip: also an `Uncertainty`
-    and a `Fingertip`. What is left out has the file's default. Raises ConfigError with all
-    problems, by argument and key.
+    amplifiers: by default `{"main": {"url": "sim://"}}`, a simulated one, with the ERAs on its
+    channels in order; uncertainty, fingertip: also an `Uncertainty` and a `Fingertip`, "none" for
+    weightless fingers. What is left out, or None, has the file's default. Raises ConfigError with
+    all problems, by argument and key.
     """
+    if amplifiers is None:
+        expect(eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}')
+        amplifiers = {"main": {"url": "sim://"}}
+        wired = {name: {"amplifier": "main", "channel": n} for n, name in enumerate(eras)}
+        eras = _merged(wired, eras)
     sections = {
         "plate": plate,
         "eras": eras,
@@ -91,29 +97,43 @@ def save_rig(rig: Rig, path: Path | str) -> None:
 def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
     """Make a rig with other keys, see `Rig.replaced`."""
     data: dict[str, Any] = {**stated(rig).data}
-    plate = {**data["plate"], **{k: v for k, v in changes.items() if k not in _SECTIONS}}
-    if plate.get("modes") and _OF_THEORY & changes.keys() and "modes" not in changes:
+    for key in {"plate", "eras"} & changes.keys():
+        expect(changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era')
+    of_plate = {key: each for key, each in changes.items() if key not in RigSection.model_fields}
+    of_plate |= changes.get("plate", {})
+    data["plate"] = _given({**data["plate"], **of_plate})
+    if data["plate"].get("modes") and _OF_THEORY & of_plate.keys() and "modes" not in of_plate:
         raise InputError(
             "rig.replaced: plate.modes must be given with another plate, got those identified on "
             "this one; modes=None for the theory's"
         )
-    whole = {key: changes[key] for key in _SECTIONS & changes.keys()}
-    document = _document("rig.replaced", {**data, **whole, "plate": _given(plate)})
-    read = Validation(document, RigSection).field
+    read = Validation(_document("rig.replaced", data), RigSection).field
     factors = [
         (read(("plate", key), PlateSection) or own) / own
         for key, own in (("length", rig.plate.length), ("width", rig.plate.width))
     ]
-    moved: Any = document.data if factors != [1, 1] else {}
-    for section in (
-        each
-        for kind in {"eras", "masses"} & moved.keys() - whole.keys()
-        for each in moved[kind].values()
-    ):
-        section["at"] = [
-            f * quantity(x, LENGTH) for f, x in zip(factors, section["at"], strict=True)
-        ]
-    return rig_of(document)
+    for kind in {"eras", "masses"} & data.keys() if factors != [1, 1] else ():
+        data[kind] = {
+            name: {
+                **each,
+                "at": [f * quantity(x, LENGTH) for f, x in zip(factors, each["at"], strict=True)],
+            }
+            for name, each in data[kind].items()
+        }
+    eras = _merged(data["eras"], changes.get("eras", {}))
+    whole = {key: changes[key] for key in _SECTIONS & changes.keys()}
+    return rig_of(_document("rig.replaced", {**data, **whole, "eras": eras}))
+
+
+def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of which keys are changed, added, or left out, as whole sections are, by None."""
+    sections = {**own, **changes}
+    return _given(
+        {
+            name: _given({**own.get(name, {}), **each}) if isinstance(each, Mapping) else each
+            for name, each in sections.items()
+        }
+    )
 
 
 def stated(rig: Rig) -> Document:

@@ -104,11 +104,13 @@ class Rig:
         return {era.name: era.stroke for era in self.eras}
 
     def replaced(self, **changes: Any) -> "Rig":
-        """Make a rig with other keys: of its plate, as thickness=0.002, or whole sections.
+        """Make a rig with other keys, as thickness=0.002, plate={"thickness": 0.002}, or sections.
 
-        What follows from them follows: damping by `damping_ratio`, a mesh `auto`, a laminate's
-        equivalent plate; ERAs and masses keep their share of the sides. None leaves a key out.
-        Raises ConfigError with all problems, InputError for `modes` identified on another plate.
+        Of eras the keys given change, as eras={"SW": {"stiffness": 2e4}}. What follows from them
+        follows: damping by `damping_ratio`, a mesh `auto`, a laminate's equivalent plate; ERAs and
+        masses keep their share of the sides. None leaves a key, or an ERA, out: it has its default,
+        so a finger, which is weightless as fingertip="none". Raises ConfigError with all problems,
+        InputError for `modes` identified on another plate.
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made

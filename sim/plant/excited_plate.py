@@ -45,6 +45,12 @@ STEADY = 0.25
 LEVEL_WINDOW, LEVEL_STEP = 0.03, 0.005
 """Hann window under which a level over time is a root mean square, and the steps of both [s]."""
 
+RINGING = 3.0
+"""Time constants of the slowest vibration that the plate is given: 5 % of its start are left."""
+
+MIN_DURATION = 1.0
+"""Playback [s] where none is given, unless the plate rings longer."""
+
 MIN_SIGNAL = 0.01
 """Shortest signals [s]; shorter ones are followed by zeros."""
 
@@ -54,7 +60,7 @@ MAX_DURATION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class FeltFinger:
-    """What one finger felt, steady as in a `Sensation`, and over time.
+    """What one finger felt on the plate that played, steady and over time; nothing is promised.
 
     level_db_sl: of its own layers, mean over the fingertip; foreign_level_db_sl: of all others at
     its loudest point; both -inf without one. times (w,) [s], and at these levels_db_sl and
@@ -84,7 +90,7 @@ class Vibration:
     """What one layer, or signals of all ERAs, do alone at all fingers.
 
     frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
-    all fingers.
+    all fingers, one after the other.
     """
 
     frequencies: tuple[float, ...]
@@ -97,8 +103,8 @@ class Playback:
     """Records of fingertips while layers played, from rest at time 0.
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
-    onsets; threshold: of levels. Steady measures are fitted to the last STEADY seconds, after the
-    plate has settled (50 ms to 1 s); those of signals are of the power in these.
+    onsets; threshold: of levels. Steady measures are fitted to the last 0.25 s, after the plate has
+    settled, which `play` sees to; those of signals are of the power in these, settled or not.
     """
 
     vibrations: tuple[Vibration, ...]
@@ -127,7 +133,7 @@ class Playback:
 
     @cached_property
     def records(self) -> tuple[Record, ...]:
-        """Of each finger, of all layers together, in the order in which they were given."""
+        """Record of each finger, of all layers together, in the order in which they were given."""
         return tuple(
             replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
             for alone in zip(*[each.records for each in self.vibrations], strict=True)
@@ -157,7 +163,8 @@ class Playback:
         has_own = np.isin(numbers, own)
         loudest = others[~has_own].max(initial=-np.inf)
         above = np.where(has_own, mine, mine[own].min())
-        contrasts = above - np.where(others > -np.inf, others, loudest)
+        with np.errstate(invalid="ignore"):  # of silence to silence, which has no contrast
+            contrasts = above - np.where(others > -np.inf, others, loudest)
         times = self.records[0].times[count // 2 :: step][: levels.shape[2] - 1]
         return tuple(
             FeltFinger(
@@ -191,7 +198,7 @@ class Playback:
     def transient_contrast_db(self) -> float | None:
         """Contrast [dB] of the peaks over the first 100 ms to quiet fingers; None without these."""
         targets, quiet = self.targets, self.quiet
-        if not quiet:
+        if not quiet or self.contrast_db is None:
             return None
         inside = targets[0].times <= ONSET_WINDOW
         first = [
@@ -241,10 +248,13 @@ def play(
     layers: Sequence[Layer],
     fingers: Sequence[Finger],
     *,
-    duration: float,
+    duration: float | None,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> Playback:
     """Play layers for a duration [s] on a plate at rest, under fingers, by number in the layers.
+
+    duration: at least the onsets and RINGING time constants of the slowest vibration (0.2 to 0.9 s
+    on the plates of the examples), or MAX_DURATION; so long, and a second, for None.
 
     The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
     imperfections make of the rig's, for forces at its ERAs and loads. Each layer starts along its
@@ -255,16 +265,20 @@ def play(
     driven = [_bases(layer, rig.eras) for layer in layers]
     terms = [term for bases in driven for motion in bases for term in motion]
     settled = max([term.start for term in terms], default=0.0)  # of the last, which goes on
-    if not settled < duration <= MAX_DURATION:  # false for NaN, too
+    loaded = _plant_under(rig, reduced, fingers, imperfections).loaded
+    slowest = max(-float(loaded.plate.decay.real.max()), RINGING / MAX_DURATION)
+    least = min(settled + RINGING / slowest, MAX_DURATION)
+    if duration is None:
+        duration = max(least, MIN_DURATION)
+    if not least <= duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
-            f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
-            f"{duration:g} s; one second suffices for most plates"
+            f"duration must be at least {least:.3g} s, the onset and until the plate rings no "
+            f"more, and at most {MAX_DURATION:g} s, got {duration:g} s; None is long enough"
         )
-    points, loaded, vibrations = _points(rig, fingers), None, []
+    points, vibrations = _points(rig, fingers), []
     for layer, bases in zip(layers, driven, strict=True):
         frequencies, _ = base_amplitudes(layer.excitation, rig.eras, *layer.side_bands)
         plant = _plant_under(rig, reduced, fingers, imperfections, loaded)
-        loaded = plant.loaded
         for number, (era, motion) in enumerate(zip(rig.eras, bases, strict=True)):
             plant.set_input(number, realised(motion, imperfections.errors_of(era.name, rig)))
         times, felt = plant.advance(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import era_haptics as era
 from era_haptics.arguments import as_points
 from era_haptics.drive import layers_of
+from model.answer.answer import Layer
 from model.rig.rig import Channel
 from paper_plate import make_paper_rig
 
@@ -72,9 +74,10 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
         "SE": era.Tone(110, 0.25e-4, -math.pi / 2),
         "NE": tone,
     }
-    (layer,) = layers_of({"SW": [110, era.Drive(90, level=0.5)], "SE": (110,)}, RIG)
+    half = era.Drive(110, level=0.5)
+    (layer,) = layers_of({"SW": [half, era.Drive(90, level=0.5)], "SE": [110]}, RIG)
     assert layer.excitations == (
-        {"SW": era.Tone(110, 1e-4), "SE": era.Tone(110, 1e-4)},
+        {"SW": era.Tone(110, 0.5e-4), "SE": era.Tone(110, 1e-4)},
         {"SW": era.Tone(90, 0.5e-4)},
     )
 
@@ -82,6 +85,7 @@ def test_layers_of_accepts_frequency_drive_and_tone() -> None:
 def test_layers_of_converts_numbers_of_numpy() -> None:
     """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
     drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
+    assert era.Drive(110, level=np.float64(1.0000000000000002)).level == 1  # of divided weights
     tone = layers_of({"SW": drive}, RIG)[0].excitation["SW"]
     assert tone == era.Tone(110.5, 0.25e-4, 0.0)
     assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
@@ -90,16 +94,22 @@ def test_layers_of_converts_numbers_of_numpy() -> None:
 @pytest.mark.parametrize(
     ("drives", "message"),
     [
-        ({"XX": 110}, "XX'; known are SW, SE, NE, NW"),
-        ({"XX": era.Tone(110, 1e-4)}, "XX'; known are SW, SE, NE, NW"),
+        ({"XX": 110}, "XX'; choose from SW, SE, NE, NW"),
+        ({"XX": era.Tone(110, 1e-4)}, "XX'; choose from SW, SE, NE, NW"),
         ({"SW": 0}, "frequency.* got 0 Hz"),
         ({"SW": math.inf}, "frequency.* got inf Hz"),
         ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
         ({"SW": [110, -1]}, "frequency.* got -1 Hz"),
+        ({"SW": 39.9}, r"frequency of SW must be from 40 to 500 Hz, got 39.9 Hz; .*limits\.freq"),
+        ({"SW": (110, 0.5, 90)}, r"got \(110, 0.5, 90\); .*era\.Drive\(110, 0.5, 90\)"),
+        ({"SW": era.Tone(110, 1.00001e-4)}, "level of SW.*0.0001 m, got 1.0000[01]"),
+        ({"SW": era.Tone(110, math.nan)}, "level of SW.*got nan"),
+        ({"SE": 90, "SW": [era.Drive(110, 0.7), era.Drive(250, 0.6)]}, "level of SW.*got 1.29999"),
+        (Layer({"SW": era.Tone(110, 1e-4)}).scaled(1), "level of SW.*got 1.122"),
     ],
 )
-def test_layers_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:
-    """Unknown ERAs and frequencies that are not positive numbers."""
+def test_layers_of_refuses_an_invalid_drive(drives: Any, message: str) -> None:
+    """Unknown ERAs, frequencies beyond the limits, more than full stroke of one ERA, a tuple."""
     with pytest.raises(era.InputError, match=message):
         layers_of(drives, RIG)
 
@@ -107,7 +117,7 @@ def test_layers_of_refuses_an_invalid_drive(drives: dict[str, float], message: s
 @pytest.mark.parametrize(
     ("level", "phase", "message"),
     [
-        (1.1, 0, "level.* got 1.1"),
+        (1.000000002, 0, "level.* got 1.000000002"),
         (math.nan, 0, "level.* got nan"),
         (1, math.inf, "phase.* got inf"),
     ],

@@ -107,6 +107,18 @@ def test_page_example_feels_what_was_predicted(
     assert (tmp_path / "contents.png").stat().st_size > 10_000
 
 
+def test_page_rig_needs_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nine lines, executed as printed: of three plates the thickest has the most contrast."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    lines = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
+    exec(lines, {"era": era})
+    contrasts = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
+    assert len(contrasts) == 3
+    assert contrasts == sorted(contrasts)
+
+
 def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
 

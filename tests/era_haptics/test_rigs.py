@@ -47,6 +47,8 @@ def test_rig_with_defaults_is_the_papers_and_has_its_table(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     rig = era.rig(SHEET, SPRINGS, amplifiers=MAIN)
     assert rig == era.load_rig(EXAMPLES / "paper_plate.yaml")
+    bare = {name: era.Era(at=each["at"], stiffness=17e3) for name, each in SPRINGS.items()}
+    assert era.rig(SHEET, bare) == rig  # a simulated amplifier, channels in order
     steps: list[tuple[int, int]] = []
     table = era.table(rig, frequencies=[60], progress=lambda *done: steps.append(done))
     assert (table.fingerprint, steps) == (rig.fingerprint, [(1, 2), (2, 2)])
@@ -84,6 +86,22 @@ def test_places_keep_their_share_of_the_plates_sides() -> None:
     assert rig.replaced(length=0.4, eras=SPRINGS).eras[1].x == 0.3048
 
 
+def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
+    """The damping goes with the stiffness; an ERA is added, another left out; others stay."""
+    changed = RIG.replaced(
+        plate={"thickness": "2 mm"}, length=0.4, eras={"SW": {"stiffness": 2e4}, "NW": None}
+    )
+    assert changed.plate.thickness == 0.002
+    assert [(each.name, each.x, each.stiffness) for each in changed.eras] == [
+        ("SW", 0, 2e4), ("SE", pytest.approx(0.4), 17e3), ("NE", pytest.approx(0.4), 17e3)
+    ]  # fmt: skip
+    mass = 2700 * 0.002 * 0.4 * 0.2286
+    assert changed.eras[0].damping == pytest.approx(2 * 0.05 * math.sqrt(2e4 * mass / 3))
+    assert changed.replaced(eras={"NW": SPRINGS["NW"]}).eras[3].stiffness == 17e3
+    assert RIG.replaced(fingertip=None) == RIG
+    assert RIG.replaced(fingertip="none").fingertip is None
+
+
 def test_keys_that_cannot_follow_are_refused() -> None:
     """Deviations of modes were identified on the plate before; None leaves a key out."""
     rig = era.rig({**SHEET, "modes": [(1.02, 1.1)]}, SPRINGS, amplifiers=MAIN)
@@ -101,7 +119,11 @@ def test_keys_that_cannot_follow_are_refused() -> None:
         (lambda: era.rig(SHEET, SPRINGS, amplifiers={}), ["eras.SW.amplifier: unknown"]),
         (lambda: era.rig(3, 4, amplifiers=5), ["plate: must be a map", "eras: must be a map"]),
         (lambda: RIG.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean thickness"]),
-        (lambda: RIG.replaced(plate={}), ["plate.plate: unknown key"]),
+        (lambda: RIG.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
+        (lambda: RIG.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
+        (lambda: RIG.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
+        (lambda: era.rig(SHEET, 4), ["eras must be a Mapping, got 4"]),
+        (lambda: era.rig(SHEET, {"SW": 4}), ["eras.SW: must be a map"]),
         (lambda: RIG.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
         (lambda: RIG.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
         (lambda: era.save_rig(RIG, "rig.txt"), ["must end in .yaml"]),

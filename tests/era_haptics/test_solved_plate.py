@@ -84,7 +84,7 @@ def test_solved_plate_with_a_seed_is_another_one(plate: era.SolvedPlate) -> None
     at, peaks = (8 * 0.3048 / 32, 6 * 0.2286 / 24), []  # a point of the raster
     for seed in (None, 1, 1, 2):
         drawn = era.SolvedPlate(replace(plate.rig, fingertip=None), seed=seed)
-        (felt,) = drawn.play(drive, at, duration=2.0).targets
+        (felt,) = drawn.play(drive, at).targets
         centre = np.argmin(np.linalg.norm(felt.points - at, axis=1))
         peak = np.abs(felt.accelerations[-2000:, centre]).max()
         assert peak == pytest.approx(drawn.map(drive, raster=(33, 25)).peak[6, 8], rel=0.02)
@@ -93,8 +93,7 @@ def test_solved_plate_with_a_seed_is_another_one(plate: era.SolvedPlate) -> None
     assert len({round(peak, 3) for peak in peaks}) == 3
     known = replace(plate.rig, uncertainty=era.Uncertainty.none())
     first, second = (
-        era.SolvedPlate(known, seed=seed).play(drive, TARGET, duration=2.0).level_db_sl
-        for seed in (None, 3)
+        era.SolvedPlate(known, seed=seed).play(drive, TARGET).level_db_sl for seed in (None, 3)
     )
     assert second == pytest.approx(first, abs=0.05)
     for wrong in (-1, 0.5, "1"):
@@ -186,13 +185,39 @@ def test_signals_settle_at_the_responses() -> None:
         np.testing.assert_allclose(sine + 1j * cosine, expected, atol=1e-5 * abs(expected).max())
 
 
+def test_play_lasts_until_it_is_steady(plate: era.SolvedPlate) -> None:
+    """The least duration that is accepted is right to 0.3 dB where 0.1 s, refused, is 7 dB off."""
+    weak = {"SW": 40}
+    with pytest.raises(era.InputError, match=r"at least 0.5\d* s.*got 0.1 s"):
+        plate.play(weak, TARGET, quiet=QUIET, duration=0.1)
+    shortest, default, long = (
+        plate.play(weak, TARGET, quiet=QUIET, duration=each).level_db_sl for each in (0.53, None, 3)
+    )
+    assert shortest == pytest.approx(long, abs=0.3)
+    assert default == pytest.approx(long, abs=0.05)
+
+
+@pytest.mark.parametrize("quiet", [[], QUIET])
+def test_signals_of_silence_have_no_contrast(plate: era.SolvedPlate, quiet: Any) -> None:
+    """Nothing is felt, without a warning of numpy's, beside a quiet finger, too.
+
+    What exceeds full stroke by rounding is full stroke.
+    """
+    loud = [np.full((4, 60), level) for level in (1, 1 + 5e-10)]
+    first, second = (plate.play(each, TARGET, sample_rate=4000).level_db_sl for each in loud)
+    assert first == second
+    played = plate.play(np.zeros((4, 60)), TARGET, quiet=quiet, sample_rate=4000)
+    assert played.level_db_sl == -np.inf
+    assert (played.contrast_db, played.transient_contrast_db) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("signals", "rate", "says"),
     [
         (np.zeros((3, 300)), 3000, r"SW, SE, NE, NW, got shape \(3, 300\)"),
         (np.zeros((4, 300)) + 0j, 3000, "real numbers"),
         (np.full((4, 300), np.nan), 3000, "-1 to 1, got nan of SW at sample 0"),
-        (np.eye(4, 300) * 1.5, 3000, "-1 to 1, got 1.5 of SW at sample 0"),
+        (np.eye(4, 300) * 1.00000001, 3000, "-1 to 1, got 1.00000001 of SW at sample 0"),
         (np.zeros((4, 300)), 1000, "above 1000 Hz"),
         (np.zeros((4, 300)), None, "sample_rate"),
         (np.zeros((4, 30)), 6000, "last from 0.01 to 10 s, got 0.005"),
@@ -260,7 +285,8 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     """Judged ones first, in the order of their contrast, then by score, unsupported ones last."""
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
-    found = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2).layouts
+    designed = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2)
+    found = designed.layouts
     assert len(found) == 8
     contrasts = [each.contrast for each in found]
     assert contrasts[2:] == [None] * 6
@@ -268,6 +294,8 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
     scores = [each.expected_contrast for each in found[2:] if each.expected_contrast is not None]
     assert scores == sorted(scores, reverse=True)
     assert all(len(each.eras) == 4 for each in found)
+    best = f"{found[0].name}, 4 ERAs, {contrasts[0]:.1f} dB"
+    assert repr(designed) == f"<Design of 8 layouts: {best}>"
 
 
 @pytest.mark.parametrize(
@@ -280,9 +308,12 @@ def test_design_ranks_given_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch)
         {"layouts": "random:3", "finalists": 0},
         {"lowest": 0.5},
         {"apart": "wide"},
+        {"eras": "six"},
+        {"where": "middle"},
     ],
 )
 def test_design_refuses(wrong: dict[str, object]) -> None:
-    """Too few ERAs, no whole number, no layouts, no file, no finalists, too low a mode, a word."""
-    with pytest.raises(era.InputError):
+    """Arguments are named as they are given, not as flags of the command."""
+    with pytest.raises(era.InputError) as refused:
         era.design(make_paper_rig(12, 9), **wrong)  # type: ignore[arg-type]
+    assert "--" not in str(refused.value)

@@ -212,7 +212,7 @@ def test_area_without_room_is_refused() -> None:
         problem(apart=0.3).random_layout(np.random.default_rng(0))
     plate = rig().plate
     nowhere = Area("none", plate.length, plate.width, lambda points: ~everywhere(points))
-    with pytest.raises(InputError, match=r"--where"):
+    with pytest.raises(InputError, match=r"^where must"):
         candidates_of(nowhere, count=20)
 
 

@@ -64,7 +64,7 @@ def demo(
     import time
 
     from controller.demo.pictures import write_pictures
-    from controller.demo.run import WIRES, Scene, example_scenes, run_demo, run_live
+    from controller.demo.run import WIRES, Scene, check_page, example_scenes, run_demo, run_live
     from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.build import cached_table
@@ -83,6 +83,7 @@ def demo(
         from controller.gateway.settings import require_gateway
 
         require_gateway()
+        check_page(dashboard)
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
         asyncio.run(run_live(rig_file, table, wire=wire, dashboard=dashboard, seed=drawn))
         return

@@ -180,9 +180,8 @@ async def run_live(
     Fingers in each strip of the plate feel a vibration of their own, those between them nothing.
     rig_file, wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses
     the default socket, so that `era status` and others reach it. Raises InputError if one runs
-    already or another program listens there, and LinkError.
+    already, and LinkError.
     """
-    _check_free(page_address(dashboard))
     log = start_log(None, level="warning")
     try:
         layout = example_layout(load_rig(rig_file))
@@ -246,9 +245,9 @@ def _daemon_file(
     return file
 
 
-def _check_free(address: str) -> None:
-    """Raise InputError unless HOST:PORT can be listened on."""
-    host, _, port = address.rpartition(":")
+def check_page(address: str) -> None:
+    """Raise InputError unless HOST:PORT is of the loopback and can be listened on."""
+    host, _, port = page_address(address).rpartition(":")
     family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
     try:
         socket.create_server((host.strip("[]"), int(port)), family=family).close()

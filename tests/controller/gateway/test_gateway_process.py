@@ -13,7 +13,7 @@ from unittest.mock import AsyncMock
 import pytest
 from aiohttp import web
 
-from controller.demo.run import run_live
+from controller.demo.run import check_page
 from controller.gateway.app import Gateway
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
 from controller.gateway.serving import listen, load_certificate, serve
@@ -35,8 +35,6 @@ from gateway_bench import (
 )
 from installed_program import installed_program
 from model.errors import InputError
-from model.rig.file import example_rig_path
-from small_table import small_table
 
 
 def openssl() -> str:
@@ -160,7 +158,7 @@ async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> 
     listening.close()
 
 
-async def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
+def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     """With the port, the reason and the option; a demonstration with its own, at once."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
@@ -168,7 +166,7 @@ async def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
             listen(Settings(socket=tmp_path / "era.sock", port=port))
         page = f"127.0.0.1:{port}"
         with pytest.raises(InputError, match=rf"{page} \(Address already in use\).*--dashboard "):
-            await run_live(example_rig_path(), small_table(), wire="sim", dashboard=page)
+            check_page(page)
 
 
 def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path, Path]) -> None:

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.client_protocol import Notification
+from controller.api.topics import TOPICS
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.cli.shown import show_event
@@ -136,3 +137,9 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
         assert re.search(r"side .*0\.20 s.*rear", errors)
         assert "main" not in errors
     assert run(command, modules) == 3
+
+
+def test_help_of_watch_names_every_topic() -> None:
+    """Those of the API, though help does not load it."""
+    said = CliRunner().invoke(app, ["watch", "--help"]).output
+    assert [topic for topic in TOPICS if topic not in said] == []

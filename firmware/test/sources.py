@@ -34,8 +34,9 @@ Needs = dict[str, set[str]]
 def problems(root: Path) -> Iterator[str]:
     """Yield what is wrong with the sources of a checkout, with its place."""
     checked = {root / folder for folders in PROGRAMS for folder in folders}
+    written = root / "out", root / "docs" / "_build"
     for path in sorted(root.glob("[a-z]*/**/*.[ch]")):
-        if path.parent not in checked and not path.is_relative_to(root / "out"):
+        if path.parent not in checked and not any(map(path.is_relative_to, written)):
             yield f"{path.relative_to(root)}: its folder must be one of PROGRAMS"
     for folders, options in PROGRAMS.items():
         paths = [path for each in folders for path in sorted((root / each).glob("*.[ch]"))]

@@ -129,12 +129,13 @@ class Acceptor:
         bound.listen(_QUEUE)
         self._start_serving()
 
-    def close(self) -> None:
-        """Stop listening."""
+    async def close(self) -> None:
+        """Stop listening; return once what was accepted is open."""
         self._loop.remove_reader(self._bound)
         self._bound.close()
         if self._spare is not None:
             os.close(self._spare)
+        await asyncio.gather(*self._beginning, return_exceptions=True)
 
     def _start_serving(self) -> None:
         if self._bound.fileno() >= 0:

@@ -134,7 +134,7 @@ class ApiServer:
         """Stop listening and close all connections after their pending output."""
         if self._acceptor is None:
             return
-        self._acceptor.close()
+        await self._acceptor.close()
         for connection in list(self._admission.admitted):
             connection.close()
         await asyncio.sleep(0)

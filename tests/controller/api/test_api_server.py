@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import socket
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from controller.api import turns
 from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import StatusResult, TouchParams
+from controller.api.server import ApiServer
 from daemon_bench import PATIENCE
 from served_api import ServedApi, feed, request, serving
 
@@ -43,6 +46,21 @@ async def test_server_closes_when_a_line_exceeds_64_kib() -> None:
         assert ("result" in reply, client.is_open) == (is_served, is_served)
         assert is_served or reply["error"]["code"] == -32700
     assert served.names == ["disarm"]
+
+
+async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path) -> None:
+    """It is not open yet when the server looks at those that are."""
+    server = ApiServer({}, on_disconnect=Mock(), holds_lease=lambda client: False)
+    bound = socket.socket(socket.AF_UNIX)
+    bound.bind(str(tmp_path / "api.sock"))
+    await server.open(bound)
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(tmp_path / "api.sock"))
+        server._acceptor._accept()  # the loop's turn in which closing begins
+        await server.close()
+        await asyncio.sleep(0)  # the turn in which sockets are closed
+        client.setblocking(False)
+        assert client.recv(1) == b""
 
 
 async def test_request_without_id_gets_no_response() -> None:

@@ -274,8 +274,8 @@ async def test_server_refuses_connections_of_a_process_above_a_rate(tmp_path: Pa
         return made[-1]
 
     acceptor = Acceptor(bound, make, clock=lambda: now)
-    with contextlib.ExitStack() as stack:
-        stack.callback(acceptor.close)
+    async with contextlib.AsyncExitStack() as stack:
+        stack.push_async_callback(acceptor.close)
 
         async def is_accepted() -> bool:
             client = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -314,7 +314,7 @@ async def test_server_without_descriptors_closes_new_connections(tmp_path: Path)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
         assert received == b""
-    acceptor.close()
+    await acceptor.close()
 
 
 async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,8 +1,7 @@
 """The reference part of reference/api.md: methods, topics, types and errors of the API."""
 
-import types
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any
 
 from controller.api.jsonrpc import ERROR_MEANINGS
 from controller.api.methods import Method
@@ -10,11 +9,12 @@ from controller.api.registered import METHODS
 from controller.api.schema import Message
 from controller.api.summaries import SUMMARIES
 from controller.api.topics import TOPICS, EventParams
+from message_types import Models, Notation, each_model
 
 
 def api_reference() -> str:
     """All lists, as Markdown."""
-    models: dict[str, type[Message]] = {}
+    models: Models = {}
     lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
     for name, method in METHODS.items():
         rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
@@ -25,12 +25,8 @@ def api_reference() -> str:
         lines += [f"- **{topic}**: {entry.summary}"]
         lines += [f"  {row}" for row in _data(entry.data, models)]
     lines += ["", "### Types"]
-    shown: set[str] = set()
-    while left := [name for name in models if name not in shown]:
-        for name in left:
-            shown.add(name)
-            rows = list(_rows("", models[name], models))
-            lines += ["", f"#### {name}", "", _summary(models[name]), "", *rows]
+    for name, model in each_model(models):
+        lines += ["", f"#### {name}", "", _summary(model), "", *_rows("", model, models)]
     lines += ["", "### Errors", "", "| code | name | meaning |", "|---|---|---|"]
     lines += [
         f"| {code.value} | {code.name} | {meaning} |" for code, meaning in ERROR_MEANINGS.items()
@@ -53,10 +49,10 @@ def _notes(method: Method) -> Iterator[str]:
         yield "Over a lasting connection alone, not over HTTP."
 
 
-def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
+def _rows(prefix: str, model: type[Message], models: Models) -> Iterator[str]:
     """One row per field; collects the models that fields are made of."""
     for name, field in model.model_fields.items():
-        kind = _kind(field.rebuild_annotation(), models)
+        kind = _TYPES.type_of(field.rebuild_annotation(), models)
         optional = "" if field.is_required() else "optional"
         if prefix == "→ " and isinstance(field.default, float):
             optional += f", by default {field.default:g}"
@@ -64,7 +60,7 @@ def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -
         yield f"- {prefix}`{name}` ({kind}){notes and f': {notes}'}"
 
 
-def _data(model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
+def _data(model: type[Message], models: Models) -> Iterator[str]:
     """The rows of a topic; what `status` returns as well is one of them."""
     status = set(_rows("", METHODS["status"].result, models))
     rows = list(_rows("", model, models))
@@ -73,38 +69,6 @@ def _data(model: type[Message], models: dict[str, type[Message]]) -> Iterator[st
         yield f"- {', '.join(same)}: as of [status](#status)"
     yield from (row for row in rows if len(same) < 2 or row not in status)
 
-
-def _kind(annotation: Any, models: dict[str, type[Message]]) -> str:
-    """A type in words."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        bounds = ", ".join(_bounds(arguments[1:]))
-        return _kind(arguments[0], models) + (f" {bounds}" if bounds else "")
-    if origin in (Union, types.UnionType):
-        return " or ".join(_kind(argument, models) for argument in arguments)
-    if origin is Literal:
-        return ", ".join(f"`{argument}`" for argument in arguments)
-    if origin is list:
-        return f"list of {_kind(arguments[0], models)}"
-    if origin is tuple:
-        return f"[{', '.join(_kind(argument, models) for argument in arguments)}]"
-    if origin is dict:
-        return f"object with values: {_kind(arguments[1], models)}"
-    if isinstance(annotation, type) and issubclass(annotation, Message):
-        models[annotation.__name__] = annotation
-        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
-    return _PLAIN[annotation]
-
-
-_PLAIN = {
-    str: "text",
-    int: "whole number",
-    float: "number",
-    bool: "true or false",
-    type(None): "null",
-    Any: "anything",
-    object: "anything",
-}
 
 _SIGNS = {
     "ge": "at least {}",
@@ -123,6 +87,32 @@ def _bounds(metadata: Iterable[object]) -> Iterator[str]:
                 value = getattr(bound, sign, None)
                 if value is not None:
                     yield words.format(f"{value:g}" if isinstance(value, float) else value)
+
+
+def _bounded(metadata: tuple[object, ...]) -> str:
+    bounds = ", ".join(_bounds(metadata))
+    return bounds and f" {bounds}"
+
+
+_TYPES = Notation(
+    plain={
+        str: "text",
+        int: "whole number",
+        float: "number",
+        bool: "true or false",
+        type(None): "null",
+        Any: "anything",
+        object: "anything",
+    },
+    union=" or ",
+    literal="`{}`",
+    literals=", ",
+    items=", ",
+    array="list of {}",
+    mapping="object with values: {}",
+    model=lambda name: f"[{name}](#{name.lower()})",
+    bounds=_bounded,
+)
 
 
 def _summary(model: type[Message]) -> str:

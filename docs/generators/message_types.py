@@ -1,0 +1,57 @@
+"""Types of the API's messages in a notation of a page's or a file's own."""
+
+import types
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from controller.api.schema import Message
+
+Models = dict[str, type[Message]]
+
+
+@dataclass(frozen=True)
+class Notation:
+    """How types are written: formats have `{}` for what is in them.
+
+    plain: names of types that are no messages; union, literals, items: between alternatives, values
+    and the members of a tuple; bounds: of the metadata of an annotated type, appended.
+    """
+
+    plain: Mapping[Any, str]
+    union: str
+    literal: str
+    literals: str
+    items: str
+    array: str
+    mapping: str
+    model: Callable[[str], str]
+    bounds: Callable[[tuple[object, ...]], str] = lambda metadata: ""
+
+    def type_of(self, annotation: Any, models: Models) -> str:
+        """Write a type; collects the models that it is made of."""
+        origin, arguments = get_origin(annotation), get_args(annotation)
+        if origin is Literal:
+            return self.literals.join(map(self.literal.format, arguments))
+        if isinstance(annotation, type) and issubclass(annotation, Message):
+            models[annotation.__name__] = annotation
+            return self.model(annotation.__name__)
+        if origin is Annotated:
+            return self.type_of(arguments[0], models) + self.bounds(arguments[1:])
+        if origin in (list, dict):
+            form = self.array if origin is list else self.mapping
+            return form.format(self.type_of(arguments[-1], models))
+        if origin in (tuple, Union, types.UnionType):
+            written = [self.type_of(argument, models) for argument in arguments]
+            is_tuple = origin is tuple
+            return f"[{self.items.join(written)}]" if is_tuple else self.union.join(written)
+        return self.plain[annotation]
+
+
+def each_model(models: Models) -> Iterator[tuple[str, type[Message]]]:
+    """Every model once, with those that are collected while the ones before are written."""
+    shown: set[str] = set()
+    while left := [name for name in models if name not in shown]:
+        for name in left:
+            shown.add(name)
+            yield name, models[name]

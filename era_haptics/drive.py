@@ -114,7 +114,7 @@ def _layer_of(drive: object, rig: Rig) -> Layer:
 
 
 def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
-    """The tone of an ERA; raises InputError for what is none."""
+    """The tone that an ERA is given; raises InputError for anything else."""
     stroke = rig.era(name).stroke
     if isinstance(given, tuple):
         raise InputError(

@@ -105,8 +105,8 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         read_strengths(strengths)
     except InputError as error:
         validation.add(("strengths",), str(error))
-    if strengths is not None and not strengths.parent.is_dir():
-        validation.add(("strengths",), f"folder not found: {strengths.parent}; create it")
+    if strengths is not None:
+        _check_folder_of(validation, strengths, "strengths")
     _check_learn(validation, learn)
     socket = file_of(document, "socket") or default_socket()
     try:
@@ -272,12 +272,20 @@ def _check_folders(
     """
     if log is not None and log.is_dir():
         validation.add(("log", "file"), f"must be a file, got the folder {log}")
-    elif log is not None and not log.parent.is_dir():
-        validation.add(("log", "file"), f"folder not found: {log.parent}; create it")
+    elif log is not None:
+        _check_folder_of(validation, log, "log", "file")
     if dumps is not None:
         existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
         if not existing.is_dir():
             validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
+
+
+def _check_folder_of(validation: Validation[DaemonSection], file: Path, *place: str) -> bool:
+    """Whether the folder of a file that is written later exists; if not, it is a problem."""
+    is_there = file.parent.is_dir()
+    if not is_there:
+        validation.add(place, f"folder not found: {file.parent}; create it")
+    return is_there
 
 
 def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:
@@ -285,10 +293,7 @@ def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> No
 
     A damaged file, or one of another version, is set aside by the estimator.
     """
-    if file is None:
-        return
-    if not file.parent.is_dir():
-        validation.add(("learn",), f"folder not found: {file.parent}; create it")
+    if file is None or not _check_folder_of(validation, file, "learn"):
         return
     try:
         is_free = not file.exists() or was_learned(file)

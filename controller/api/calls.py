@@ -10,7 +10,7 @@ from typing import Any
 from controller.api.client_protocol import make_params
 from controller.api.methods import Method
 from controller.api.registered import METHODS
-from controller.api.schema import Empty, Message
+from controller.api.schema import BY_PLACE, Empty, Message
 from controller.api.summaries import SUMMARIES
 
 BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
@@ -18,15 +18,15 @@ BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
 
 
 def signature_of(method: Method) -> inspect.Signature:
-    """The parameters of a method after self: required ones by place or name, others by name.
+    """The parameters of a method after self: required and marked ones by place or name.
 
-    What `strength` sets is by place, too.
+    All others by name.
     """
     parameters = [inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)]
     fields = method.params.model_fields.items()
     for name, field in sorted(fields, key=lambda each: not each[1].is_required()):
         kind, default = inspect.Parameter.KEYWORD_ONLY, field.default
-        if field.is_required() or name == "gain_db":
+        if field.is_required() or BY_PLACE in field.metadata:
             kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         if field.is_required():
             default = inspect.Parameter.empty

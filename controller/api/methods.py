@@ -12,6 +12,7 @@ from pydantic import FailFast, Field
 
 from controller.api.amplifier_status import AmplifierStatus
 from controller.api.schema import (
+    BY_PLACE,
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
@@ -224,7 +225,7 @@ class StrengthParams(Message):
     name: Annotated[str, Field(min_length=1, max_length=MAX_SENDER)] = Field(
         description="of an input, a sender there, a source or a client"
     )
-    gain_db: Annotated[float, Field(ge=-40, le=0)] | None = Field(
+    gain_db: Annotated[Annotated[float, Field(ge=-40, le=0)] | None, BY_PLACE] = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )
 

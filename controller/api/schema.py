@@ -94,6 +94,10 @@ Epoch: TypeAlias = Annotated[
 ]
 
 
+BY_PLACE = "by place"
+"""Marks a parameter that may be left out, and that clients in Python take by place all the same."""
+
+
 class Message(BaseModel):
     """Part of a message: no unknown keys, no implicit conversion, no NaN."""
 

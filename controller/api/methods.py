@@ -34,9 +34,9 @@ from controller.api.schema import (
     TouchInputStatus,
     TouchPoint,
 )
+from controller.effects.gains import GainDb, SourceName
 
 DEFAULT_LEASE = 10.0  # s
-MAX_SENDER = 2048  # characters of a sender's name, escaped
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -222,10 +222,8 @@ class PlayParams(Message):
 class StrengthParams(Message):
     """A touch source or client and its gain; without a gain nothing is set."""
 
-    name: Annotated[str, Field(min_length=1, max_length=MAX_SENDER)] = Field(
-        description="of an input, a sender there, a source or a client"
-    )
-    gain_db: Annotated[Annotated[float, Field(ge=-40, le=0)] | None, BY_PLACE] = Field(
+    name: SourceName = Field(description="of an input, a sender there, a source or a client")
+    gain_db: Annotated[GainDb | None, BY_PLACE] = Field(
         None, description="of all that it brings, 0 for what layout and limits allow"
     )
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from controller.effects.gains import GainDb, SourceName
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from registry.regular_file import regular_file
@@ -18,13 +19,7 @@ MAX_NAMES = 64
 UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
 """Clients that no strength is kept for: commands, and browsers that have given no name."""
 
-_Gains = Annotated[
-    dict[  # as over the API
-        Annotated[str, Field(min_length=1, max_length=2048)],
-        Annotated[float, Field(ge=-40, le=0)],
-    ],
-    Field(max_length=MAX_NAMES),
-]
+_Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
 _GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
 
 

@@ -1,4 +1,4 @@
-"""Opens lines and the amplifiers on them, of protocol 3, by their URLs."""
+"""Opens lines and the amplifiers on them, of protocol 4, by their URLs."""
 
 import asyncio
 from collections.abc import Mapping

@@ -98,7 +98,9 @@ class Rigs:
         token = 0
         for name in bench.amplifiers:
             watchdog = QUANTITIES["watchdog"].to_wire(2.0)
-            bench.exchange(name, "Arm", {"session": SESSION, "watchdog": watchdog}, now=0.0)
+            bench.exchange(
+                name, "Arm", {"session": SESSION, "watchdog": watchdog, "shift": 0}, now=0.0
+            )
 
         def go_on(seconds: float) -> None:
             nonlocal token

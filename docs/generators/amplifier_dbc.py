@@ -1,4 +1,4 @@
-"""The DBC file of an amplifier of protocol 3 and its host, for bus monitors.
+"""The DBC file of an amplifier of protocol 4 and its host, for bus monitors.
 
 Frames are words: what a word means depends on the message. ASCII only, as DBC readers need it.
 """

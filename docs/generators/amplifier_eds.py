@@ -1,4 +1,4 @@
-"""The electronic data sheet (CiA 306) of an amplifier of protocol 3: its objects are words."""
+"""The electronic data sheet (CiA 306) of an amplifier of protocol 4: its objects are words."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""The C header of protocol 3, firmware/core/protocol.h.
+"""The C header of protocol 4, firmware/core/protocol.h.
 
 Numbers of states, faults, refusals and messages, ranges of quantities, the place of each field in
 the words of a request, and what those words may be. Replies: `firmware_records.py`.
@@ -34,8 +34,8 @@ from drivers.wires.can_bus.canopen import CANOPEN
 _HEAD = """\
 // SPDX-License-Identifier: MIT
 //
-// Protocol 3 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
-// row of 16-bit words (docs/decisions/0061-protocol-3.md). REQUEST_FIELD is the place of a field in
+// Protocol 4 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
+// row of 16-bit words (docs/decisions/0088-protocol-4.md). REQUEST_FIELD is the place of a field in
 // the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
 // quantities are those of the wire. Replies are in records.h.
 

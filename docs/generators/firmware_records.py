@@ -16,7 +16,7 @@ _HEAD = """\
 // SPDX-License-Identifier: MIT
 //
 // What an amplifier sends, made by docs/generators/firmware_records.py: do not edit it. Each record
-// of protocol 3 is a struct, and a function that appends its words; RECORD_WORDS is their number
+// of protocol 4 is a struct, and a function that appends its words; RECORD_WORDS is their number
 // with so many of what varies. A field that is not filled in is sent as 0. Readings, which a board
 // takes, are a struct of their own.
 

@@ -90,8 +90,8 @@ _STREAM = (
     LayerSet(3, 0, 800, renew=True),
 )
 (_SET,) = parts(pack_layers(_JOINED), session=SESSION, token=TOKEN, now=False)
-_ARM = {"session": SESSION, "watchdog": 250}
-_COMMIT = {"session": SESSION, "token": TOKEN}
+_ARM = {"session": SESSION, "watchdog": 250, "shift": 0}
+_COMMIT = {"session": SESSION, "token": TOKEN, "at": 0}
 _STOP = {"ramp": 5}
 
 
@@ -216,7 +216,7 @@ def _more(page: str) -> str:
     requests: Sequence[tuple[str, str, Values, int]] = (
         ("Hello", "Hello", {}, 1),
         (f"Arm with session {SESSION:04X}, watchdog 250 ms", "Arm", _ARM, 1),
-        ("Ping of another session, refused", "Ping", {"session": 7}, 1),
+        ("Ping of another session, refused", "Ping", {"session": 7, "rate": 0}, 1),
         ("Stop along 5 ms, to all", "Stop", _STOP, 0),
     )
     number, before = _FIRST[page]

@@ -78,7 +78,7 @@ _MEANINGS = {
     **{"events": "it sends Events on this wire"},
     **{"levels_measured": "the levels of Status are measured, not computed"},
     **{"interlock": "it has an interlock", "electrical": "GetMeasured"},
-    **{"sensors": "GetSensors, Measure, GetReading", "address": "SetAddress"},
+    **{"sensors": "GetSensors, Measure, GetReading", "address": "SetAddress", "mark": "Mark"},
     **{"high_voltage": "", "interlock_open": ""},
     **{"limited": "a sum was limited since the last Status"},
 }

@@ -112,7 +112,7 @@ class BlockingAmplifier:
 
     def heartbeat(self) -> dict[str, Any]:
         """Feed the watchdog; CommandRefused if the amplifier is no longer armed."""
-        values = {"session": self._amplifier.session}
+        values = {"session": self._amplifier.session, "rate": 0}
         return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
     def sensors(self) -> tuple[Sensor, ...]:

@@ -1,1 +1,1 @@
-"""The host's side of protocol 3: ledgers, lines, amplifiers, and the group that plays together."""
+"""The host's side of protocol 4: ledgers, lines, amplifiers, and the group that plays together."""

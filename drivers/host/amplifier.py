@@ -1,4 +1,4 @@
-"""One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
+"""One amplifier of protocol 4, whatever its wire: who it is, and its requests."""
 
 import asyncio
 import contextlib
@@ -166,7 +166,7 @@ class Amplifier(Dialogue):
             bounds = f"{_WATCHDOG.from_wire(low):g} to {_WATCHDOG.from_wire(high):g}"
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
         self.feeding.watchdog = max(self.feeding.watchdog, watchdog)
-        values = {"session": session, "watchdog": wire}
+        values = {"session": session, "watchdog": wire, "shift": 0}
         was_armed = self.may_be_armed
         try:
             status = await self.line.submit(self, Priority.ARM, "Arm", values)
@@ -229,7 +229,9 @@ class Amplifier(Dialogue):
 
     def ping(self) -> "asyncio.Future[Values]":
         """Feed the watchdog; the future has the status, CommandRefused if it is not armed."""
-        return self.line.submit(self, Priority.HEARTBEAT, "Ping", {"session": self.session})
+        return self.line.submit(
+            self, Priority.HEARTBEAT, "Ping", {"session": self.session, "rate": 0}
+        )
 
     def read_status(self, priority: Priority = Priority.OTHER) -> "asyncio.Future[Values]":
         """Read the status, which feeds nothing."""

@@ -210,7 +210,7 @@ class Dialogue:
         start: together with the commits of other lines. Or raises Preempted where a stop or
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
-        values = {"session": self.session, "token": token}
+        values = {"session": self.session, "token": token, "at": 0}
         return self.line.submit(self, Priority.SET, "Commit", values, start=start)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:

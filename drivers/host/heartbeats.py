@@ -150,7 +150,7 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            values = {"session": session, "token": token}
+            values = {"session": session, "token": token, "at": 0}
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
                 each.next_request(request, values, Priority.SET)

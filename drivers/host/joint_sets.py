@@ -179,7 +179,7 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
 
 def _commit_of(several: Sequence[Amplifier], token: int) -> list[Values]:
     """Return the commit of all amplifiers of a line; raises unless each may have it now."""
-    values = {"session": several[0].session, "token": token}
+    values = {"session": several[0].session, "token": token, "at": 0}
     for amplifier in several:
         amplifier.next_request("Commit", values, Priority.SET)
     return [values]

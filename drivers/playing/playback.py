@@ -2,7 +2,7 @@
 
 A channel plays the sum of its voices (`drivers.playing.voices`), in a few layers. A simulated
 amplifier asks this for samples, the ledger for the worst case, witness and conformance for what to
-expect. Times [s] are of any one clock and never go back; levels and frequencies are of protocol 3.
+expect. Times [s] are of any one clock and never go back; levels and frequencies are of protocol 4.
 Plain loops and few calls: every set is played by host and far end.
 """
 

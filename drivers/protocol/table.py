@@ -1,8 +1,8 @@
-"""Protocol 3 as data: quantities, messages and sets, each once, for every wire and both ends.
+"""Protocol 4 as data: quantities, messages and sets, each once, for every wire and both ends.
 
 `records` turns the messages into 16-bit words and back; a wire adds its frame. The numbers of
 states, faults and refusals, and the times of the contract, stand here too. What the messages mean
-is written in docs/decisions/0061-protocol-3.md.
+is written in docs/decisions/0088-protocol-4.md.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,13 +25,19 @@ from drivers.protocol.records import (
     WireQuantity,
 )
 
-VERSION: Final = 3
+VERSION: Final = 4
 HELLO: Final = 1
 """Number of the message that every version has."""
 BROADCAST: Final = 0
 """The address of all amplifiers on a line."""
 MAX_WORDS: Final = 120
 """Of a message: what one frame of the serial line and one write of Modbus carry."""
+CLOCK_TURN: Final = 20.0
+"""Seconds in which the clock of an amplifier, of 32 bits, goes round once."""
+CLOCK_UNKNOWN: Final = 0xFFFF
+"""`clock_error` of an amplifier that does not know it, or has no clock that can be steered."""
+AHEAD_MAX: Final = 1638
+"""Steps of the high word of the clock by which a Commit may name a moment ahead: 0.5 s."""
 STAGED_LIFE: Final = 1.0
 """Seconds from the first part of a set after which it is discarded if it was not committed."""
 REACTION: Final = 0.01
@@ -88,7 +94,7 @@ UNKNOWN_PLACE: Final = 0xFFFF
 """Coordinate of a sensor whose place the amplifier does not know."""
 FEATURES: Mapping[str, int] = {
     **{"output": 0, "events": 1, "levels_measured": 2, "interlock": 3},
-    **{"electrical": 4, "sensors": 5, "address": 6},
+    **{"electrical": 4, "sensors": 5, "address": 6, "mark": 7},
 }
 """Bits; output: full level is a linear amplifier's full output, else the stroke of a motion."""
 
@@ -139,6 +145,11 @@ _QUANTITIES = (
     _word("window_left", 0, 10000, 1000, "s"),
     _word("window_start", 0, 0xFFFFFFFF, 1000000, "s"),
     _word("tone_count", 1, 16),
+    _word("clock", 0, 0xFFFFFFFF),
+    _word("shift", 0, 65535),
+    _word("at", 0, 65535),
+    _word("rate", -32768, 32767, 10000000),
+    _word("clock_error", 0, 65535, 10000000, "s"),
 )
 QUANTITIES: dict[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
 """By name, with those of the readings below."""
@@ -187,7 +198,7 @@ STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
     reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
     reading("high_voltage", "of the supply; 0: not measured", 0, 65535, 1, "V", "page"),
-    *_numbers("token:played_token"),
+    *_numbers("clock", "token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
     Numbers("levels", "channels", QUANTITIES["level"]),
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
@@ -203,7 +214,7 @@ _CAPABILITIES = Record(
     *_numbers("features:flags", "frequency_min:frequency", "frequency_max:frequency"),
     *_numbers("frequency_step:frequency", "level_max:level", "level_step:level", "phase_step"),
     *_numbers("ramp_max:ramp", "slew", "watchdog_min:watchdog", "watchdog_max:watchdog"),
-    *_numbers("envelope_step_min:envelope_step", "envelope_step_max:envelope_step"),
+    *_numbers("envelope_step_min:envelope_step", "envelope_step_max:envelope_step", "clock_error"),
     Rows("limits", "channels", _LIMITS),
 )
 _TAKEN = Record(
@@ -258,7 +269,7 @@ _READING = Record(
 
 _MESSAGES = (
     Message("GetCaps", 2, Record(), _CAPABILITIES),
-    Message("Arm", 3, Record(*_numbers("session", "watchdog")), STATUS, feeds=True),
+    Message("Arm", 3, Record(*_numbers("session", "watchdog", "shift")), STATUS, feeds=True),
     # A longer ramp than the longest counts as that one: nothing keeps an amplifier from silence.
     Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), STATUS),
     Message(
@@ -273,7 +284,7 @@ _MESSAGES = (
         feeds=True,
     ),
     Message(
-        *("Commit", 6, Record(*_numbers("session", "token")), STATUS),
+        *("Commit", 6, Record(*_numbers("session", "token", "at")), STATUS),
         is_broadcast=True,
         feeds=True,
     ),
@@ -282,7 +293,7 @@ _MESSAGES = (
     Message("GetStatus", 9, Record(), STATUS),
     Message("GetFaults", 10, Record(), Record(*_numbers("count"), Rows("faults", "count", _FAULT))),
     Message("Clear", 11, Record(*_numbers("latch")), STATUS),
-    Message("Ping", 12, Record(*_numbers("session")), STATUS, feeds=True),
+    Message("Ping", 12, Record(*_numbers("session", "rate")), STATUS, feeds=True),
     Message(
         *("GetAchieved", 13, Record(*_numbers("layer"))),
         Record(*_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)),
@@ -309,6 +320,7 @@ _MESSAGES = (
         _READING,
     ),
     Message("GetReading", 18, Record(*_numbers("first:sensor")), _READING),
+    Message("Mark", 19, Record(), STATUS, is_broadcast=True),
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}

@@ -1,4 +1,4 @@
-"""An amplifier of protocol 3 in front of a device that plays one sine on each channel.
+"""An amplifier of protocol 4 in front of a device that plays one sine on each channel.
 
 The project's simulated amplifier keeps states, sets, watchdog and what each channel plays; here
 that goes to a `Device`, in steps of 5 ms. A second process watches this one, and silences the

@@ -1,4 +1,4 @@
-"""An amplifier of protocol 3 on pymodbus's own server, over TCP or a serial port.
+"""An amplifier of protocol 4 on pymodbus's own server, over TCP or a serial port.
 
     python examples/modbus_server/modbus_server.py tcp 5020
     python examples/modbus_server/modbus_server.py rtu /dev/ttyUSB0 [N, for no parity]

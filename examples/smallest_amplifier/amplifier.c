@@ -1,4 +1,4 @@
-/* The smallest amplifier of protocol 3: two channels on a serial line, in one file.
+/* The smallest amplifier of protocol 4: two channels on a serial line, in one file.
  *
  *     cc -O2 -o amplifier amplifier.c -lm && ./amplifier --pty    (or /dev/ttyUSB0)
  *

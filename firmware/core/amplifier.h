@@ -57,6 +57,9 @@ struct amplifier {
     uint16_t latch;
     uint16_t session;  // held while armed, or the one that ended last; 0: none
     uint64_t sample;   // samples since power-up
+    uint64_t clock;    // of the next sample, 20 s a turn of 2^64
+    uint64_t step;     // of the clock per sample, by the host's rate
+    uint16_t since;    // the last sample have passed so many 2^-16 of one
     uint64_t now;      // us
     uint64_t now_at;   // sample before which it was that time
     uint16_t watchdog; // ms
@@ -92,7 +95,10 @@ void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t chann
 void amplifier_measured(struct amplifier *amplifier, struct measured measured);
 
 // Requests that are allowed in this state, and of this session. Times are in milliseconds.
-void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog);
+void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog,
+                   uint16_t shift);
+// Let the clock run faster by so many tenths of a millionth.
+void amplifier_steer(struct amplifier *amplifier, int16_t rate);
 void amplifier_disarm(struct amplifier *amplifier, uint16_t ramp);
 void amplifier_stop(struct amplifier *amplifier, uint16_t ramp);
 void amplifier_silence(struct amplifier *amplifier, uint16_t ramp);
@@ -105,6 +111,14 @@ void amplifier_play(struct amplifier *amplifier);
 static inline uint64_t amplifier_now(const struct amplifier *amplifier)
 {
     return amplifier->now + (amplifier->sample - amplifier->now_at) * 1000000 / SAMPLE_RATE;
+}
+
+// What its clock is by now: that of the last sample, and what has passed since.
+static inline uint32_t amplifier_clock(const struct amplifier *amplifier)
+{
+    const uint32_t step = (uint32_t)(amplifier->step >> 32);
+    const uint32_t next = (uint32_t)(amplifier->clock >> 32);
+    return next - step + (uint32_t)((uint64_t)step * amplifier->since >> 16);
 }
 
 // Token of a layer that plays, 0 of a silent one.

@@ -113,7 +113,7 @@ static uint64_t magnitude(int64_t re, int64_t im)
     return (uint64_t)square_root((uint64_t)(re * re) + (uint64_t)(im * im)) * VOICES_KEPT;
 }
 
-uint16_t channel_level(const struct channel *channel)
+uint16_t channel_level(const struct channel *channel, uint32_t clock)
 {
     uint64_t size = 0;
     bool is_counted[VOICES_KEPT] = {false};
@@ -124,7 +124,7 @@ uint16_t channel_level(const struct channel *channel)
             if (is_counted[j] || !voice->is_playing ||
                 voice->frequency != channel->voices[i].frequency)
                 continue;
-            struct complex pointer = voice_pointer(voice);
+            struct complex pointer = voice_pointer(voice, clock);
             re += pointer.re;
             im += pointer.im;
             is_counted[j] = true;
@@ -135,11 +135,11 @@ uint16_t channel_level(const struct channel *channel)
     return level > LEVEL_PER_UNIT ? LEVEL_PER_UNIT : (uint16_t)level;
 }
 
-int64_t channel_sum(struct channel *channel)
+int64_t channel_sum(struct channel *channel, uint32_t clock)
 {
     int64_t sum = 0;
     for (unsigned i = 0; i < VOICES_KEPT; i++)
         if (channel->voices[i].is_playing)
-            sum += voice_sample(&channel->voices[i]);
+            sum += voice_sample(&channel->voices[i], clock);
     return sum;
 }

@@ -32,9 +32,9 @@ void channel_stop_silent(struct channel *channel);
 bool channel_is_silent(const struct channel *channel);
 
 // Present level: the largest amplitude of the sum.
-uint16_t channel_level(const struct channel *channel);
+uint16_t channel_level(const struct channel *channel, uint32_t clock);
 
 // Sum of the voices at this sample in units of 2^-30 of full level; then move on by one sample.
-int64_t channel_sum(struct channel *channel);
+int64_t channel_sum(struct channel *channel, uint32_t clock);
 
 #endif

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// Protocol 3 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
-// row of 16-bit words (docs/decisions/0061-protocol-3.md). REQUEST_FIELD is the place of a field in
+// Protocol 4 in numbers, made by docs/generators/firmware_header.py: do not edit it. A message is a
+// row of 16-bit words (docs/decisions/0088-protocol-4.md). REQUEST_FIELD is the place of a field in
 // the words of a request; small fields share a word, out of which FIELD_OF takes one. Ranges of
 // quantities are those of the wire. Replies are in records.h.
 
@@ -14,7 +14,7 @@
 #define FIELD_OF(bits, field) ((bits) >> field##_SHIFT & field##_MASK)
 
 enum {
-    PROTOCOL_VERSION = 3, WORDS_MAX = 120, NO_CHANNEL = 255, STAGED_LIFE_MS = 1000,
+    PROTOCOL_VERSION = 4, WORDS_MAX = 120, NO_CHANNEL = 255, STAGED_LIFE_MS = 1000,
     SHORTENED_FADE_MS = 2, FREQUENCY_PER_UNIT = 20, WIRE_LEVEL_MAX = 10000, LEVEL_PER_UNIT = 10000,
     WIRE_PHASE_MIN = -18000, WIRE_PHASE_MAX = 17999, PHASE_PER_UNIT = 100, WIRE_RAMP_MAX = 1000,
     WIRE_VALID_FOR_MAX = 60000, WIRE_WATCHDOG_MIN = 100, WIRE_WATCHDOG_MAX = 2000,
@@ -43,7 +43,8 @@ enum message {
     MESSAGE_COMMIT = 6, MESSAGE_SILENCE = 7, MESSAGE_STOP = 8, MESSAGE_GET_STATUS = 9,
     MESSAGE_GET_FAULTS = 10, MESSAGE_CLEAR = 11, MESSAGE_PING = 12, MESSAGE_GET_ACHIEVED = 13,
     MESSAGE_GET_MEASURED = 14, MESSAGE_SET_ADDRESS = 15, MESSAGE_GET_SENSORS = 16,
-    MESSAGE_MEASURE = 17, MESSAGE_GET_READING = 18, MESSAGE_EVENT = 30, MESSAGE_NAK = 31,
+    MESSAGE_MEASURE = 17, MESSAGE_GET_READING = 18, MESSAGE_MARK = 19, MESSAGE_EVENT = 30,
+    MESSAGE_NAK = 31,
 };
 
 enum {
@@ -52,20 +53,20 @@ enum {
 
 enum {
     FEATURE_OUTPUT = 1, FEATURE_EVENTS = 2, FEATURE_LEVELS_MEASURED = 4, FEATURE_INTERLOCK = 8,
-    FEATURE_ELECTRICAL = 16, FEATURE_SENSORS = 32, FEATURE_ADDRESS = 64,
+    FEATURE_ELECTRICAL = 16, FEATURE_SENSORS = 32, FEATURE_ADDRESS = 64, FEATURE_MARK = 128,
 };
 
 enum {
-    ARM_SESSION = 0, ARM_WATCHDOG = 1,
+    ARM_SESSION = 0, ARM_WATCHDOG = 1, ARM_SHIFT = 2,
     DISARM_RAMP = 0,
     SET_SESSION = 0, SET_TOKEN = 1, SET_BITS = 2, SET_STREAM = 3, SET_INDEX_SHIFT = 8,
     SET_INDEX_MASK = 255, SET_PARTS_SHIFT = 1, SET_PARTS_MASK = 127, SET_NOW_SHIFT = 0,
     SET_NOW_MASK = 1, SET_BITS_MAX = 65535,
-    COMMIT_SESSION = 0, COMMIT_TOKEN = 1,
+    COMMIT_SESSION = 0, COMMIT_TOKEN = 1, COMMIT_AT = 2,
     SILENCE_SESSION = 0, SILENCE_RAMP = 1,
     STOP_RAMP = 0,
     CLEAR_LATCH = 0,
-    PING_SESSION = 0,
+    PING_SESSION = 0, PING_RATE = 1,
     GET_ACHIEVED_LAYER = 0,
     SET_ADDRESS_ADDRESS = 0, SET_ADDRESS_SERIAL_NUMBER = 1,
     GET_SENSORS_FIRST = 0,
@@ -87,22 +88,24 @@ enum {
 #define WITHIN(lowest, highest, code) {.low = lowest, .high = highest, .nak = NAK_##code}
 #define REQUEST_TABLE \
     [MESSAGE_GET_CAPS] = {.fields = 0}, \
-    [MESSAGE_ARM] = {.feeds = true, .session = ARM_SESSION, .fields = 2, \
-        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(100, 2000, BAD_VALUE)}}, \
+    [MESSAGE_ARM] = {.feeds = true, .session = ARM_SESSION, .fields = 3, \
+        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(100, 2000, BAD_VALUE), \
+        WITHIN(0, 65535, BAD_VALUE)}}, \
     [MESSAGE_DISARM] = {.fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
     [MESSAGE_SET] = {.feeds = true, .has_tail = true, .session = SET_SESSION, .fields = 3, \
         .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(1, 65535, BAD_TOKEN), \
         WITHIN(0, 65535, BAD_VALUE)}}, \
     [MESSAGE_COMMIT] = {.is_broadcast = true, .feeds = true, .session = COMMIT_SESSION, \
-        .fields = 2, .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(1, 65535, BAD_TOKEN)}}, \
+        .fields = 3, .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(1, 65535, BAD_TOKEN), \
+        WITHIN(0, 65535, BAD_VALUE)}}, \
     [MESSAGE_SILENCE] = {.feeds = true, .session = SILENCE_SESSION, .fields = 2, \
         .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(0, 1000, BAD_VALUE)}}, \
     [MESSAGE_STOP] = {.is_broadcast = true, .fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
     [MESSAGE_GET_STATUS] = {.fields = 0}, \
     [MESSAGE_GET_FAULTS] = {.fields = 0}, \
     [MESSAGE_CLEAR] = {.fields = 1, .field = {WITHIN(0, 65535, BAD_VALUE)}}, \
-    [MESSAGE_PING] = {.feeds = true, .session = PING_SESSION, .fields = 1, \
-        .field = {WITHIN(1, 65535, BAD_VALUE)}}, \
+    [MESSAGE_PING] = {.feeds = true, .session = PING_SESSION, .fields = 2, \
+        .field = {WITHIN(1, 65535, BAD_VALUE), WITHIN(-32768, 32767, BAD_VALUE)}}, \
     [MESSAGE_GET_ACHIEVED] = {.fields = 1, .field = {WITHIN(0, 15, BAD_VALUE)}}, \
     [MESSAGE_GET_MEASURED] = {.fields = 0}, \
     [MESSAGE_SET_ADDRESS] = {.is_broadcast = true, .has_tail = true, .fields = 1, \
@@ -110,7 +113,8 @@ enum {
     [MESSAGE_GET_SENSORS] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}}, \
     [MESSAGE_MEASURE] = {.has_tail = true, .fields = 3, .field = {WITHIN(1, 65535, BAD_VALUE), \
         WITHIN(1, 10000, BAD_VALUE), WITHIN(1, 16, BAD_VALUE)}}, \
-    [MESSAGE_GET_READING] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}},
+    [MESSAGE_GET_READING] = {.fields = 1, .field = {WITHIN(0, 31, BAD_VALUE)}}, \
+    [MESSAGE_MARK] = {.is_broadcast = true, .fields = 0},
 
 // Of each fault: code of the emergency, and the error register meanwhile (CiA 301).
 #define EMERGENCY_TABLE \

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
 // What an amplifier sends, made by docs/generators/firmware_records.py: do not edit it. Each record
-// of protocol 3 is a struct, and a function that appends its words; RECORD_WORDS is their number
+// of protocol 4 is a struct, and a function that appends its words; RECORD_WORDS is their number
 // with so many of what varies. A field that is not filled in is sent as 0. Readings, which a board
 // takes, are a struct of their own.
 
@@ -21,16 +21,17 @@ static inline void put_limit(struct words *words, const struct wire_limit *from)
 struct wire_capabilities {
     uint16_t channels, layers, voices, set_words, knots, features, frequency_min, frequency_max,
         frequency_step, level_max, level_step, phase_step, ramp_max, slew, watchdog_min,
-        watchdog_max, envelope_step_min, envelope_step_max;
+        watchdog_max, envelope_step_min, envelope_step_max, clock_error;
     const struct wire_limit *limits;
 };
-#define CAPABILITIES_WORDS(channels) (18 + 3 * (channels))
+#define CAPABILITIES_WORDS(channels) (19 + 3 * (channels))
 static inline void put_capabilities(struct words *words, const struct wire_capabilities *from)
 {
     PUT(words, from->channels, from->layers, from->voices, from->set_words, from->knots,
         from->features, from->frequency_min, from->frequency_max, from->frequency_step,
         from->level_max, from->level_step, from->phase_step, from->ramp_max, from->slew,
-        from->watchdog_min, from->watchdog_max, from->envelope_step_min, from->envelope_step_max);
+        from->watchdog_min, from->watchdog_max, from->envelope_step_min, from->envelope_step_max,
+        from->clock_error);
     for (unsigned i = 0; i < from->channels; i++)
         put_limit(words, &from->limits[i]);
 }
@@ -44,18 +45,21 @@ struct readings {
 #define WORD_OF_HIGH_VOLTAGE(value) ((value) * 1)
 
 struct wire_status {
-    uint16_t state, fault, flags, latch, watchdog_left, token;
+    uint16_t state, fault, flags, latch, watchdog_left;
+    uint32_t clock;
+    uint16_t token;
     uint8_t channels, layers;
     const uint16_t *levels;
     const uint16_t *tokens;
     struct readings readings;
 };
-#define STATUS_WORDS(channels, layers) (9 + (channels) + (layers))
+#define STATUS_WORDS(channels, layers) (11 + (channels) + (layers))
 static inline void put_status(struct words *words, const struct wire_status *from)
 {
     PUT(words, from->state, from->fault, from->flags, from->latch, from->watchdog_left,
-        (uint16_t)from->readings.temperature, from->readings.high_voltage, from->token,
-        (uint16_t)(from->channels << 8 | from->layers));
+        (uint16_t)from->readings.temperature, from->readings.high_voltage, (uint16_t)(from->clock
+        >> 16), (uint16_t)from->clock, from->token, (uint16_t)(from->channels << 8 |
+        from->layers));
     put_all(words, from->levels, from->channels);
     put_all(words, from->tokens, from->layers);
 }

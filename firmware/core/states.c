@@ -37,6 +37,13 @@ void amplifier_init(struct amplifier *amplifier, const char *serial_number,
     amplifier->serial_number = serial_number;
     amplifier->notify = notify;
     amplifier->state = SWITCH_ON_DISABLED;
+    amplifier_steer(amplifier, 0);
+}
+
+void amplifier_steer(struct amplifier *amplifier, int16_t rate)
+{
+    const int64_t step = (int64_t)(UINT64_C(0xCCCCCCCCCCCCCCD) / SAMPLE_RATE); // 2^64 in 20 s
+    amplifier->step = (uint64_t)(step + step / 10000000 * rate);
 }
 
 void amplifier_restart(struct amplifier *amplifier)
@@ -86,6 +93,7 @@ static void leave(struct amplifier *amplifier, enum state next, uint16_t ramp, u
 {
     amplifier_silence(amplifier, ramp);
     timer_stop(&amplifier->fed);
+    amplifier_steer(amplifier, 0);
     enter(amplifier, next, channel);
     settle(amplifier);
 }
@@ -128,7 +136,7 @@ void amplifier_feed(struct amplifier *amplifier)
         timer_start(&amplifier->fed, amplifier->watchdog, amplifier->now);
 }
 
-void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog)
+void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog, uint16_t shift)
 {
     amplifier->watchdog = watchdog;
     if (amplifier->state == OPERATION_ENABLED) // the same again: its reply was lost
@@ -136,6 +144,7 @@ void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watch
     amplifier_silence(amplifier, SAFETY_RAMP);
     amplifier->committed = 0;
     amplifier->session = session;
+    amplifier->clock += (uint64_t)shift << 48;
     enter(amplifier, OPERATION_ENABLED, NO_CHANNEL);
 }
 
@@ -168,12 +177,14 @@ enum nak amplifier_clear(struct amplifier *amplifier, uint16_t latch)
 
 void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
 {
+    uint32_t clock = (uint32_t)(amplifier->clock >> 32);
     for (unsigned i = 0; i < CHANNELS; i++) {
-        int64_t sum = channel_sum(&amplifier->channels[i]);
+        int64_t sum = channel_sum(&amplifier->channels[i], clock);
         amplifier->is_limited |= sum > LIMIT || sum < -LIMIT;
         forces[i] = sum > ONE ? ONE : sum < -ONE ? -ONE : (int32_t)sum;
     }
     amplifier->sample++;
+    amplifier->clock += amplifier->step;
     layers_sample(amplifier);
     for (unsigned i = 0; i < CHANNELS; i++)
         channel_stop_silent(&amplifier->channels[i]);

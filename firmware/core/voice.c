@@ -73,13 +73,10 @@ static void send(struct voice *voice, const struct envelope *shape, uint16_t ram
 void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number)
 {
     static const struct complex silence = {.re = 0, .im = 0};
-    const uint64_t rate = (uint64_t)SAMPLE_RATE * FREQUENCY_PER_UNIT;
     voice->is_playing = true;
     voice->layer = layer;
     voice->has_ended = false;
     voice->frequency = frequency;
-    voice->angle = 0;
-    voice->pace = (uint32_t)((frequency * WHOLE + rate / 2) / rate);
     voice->to = silence;
     voice->stride = 0;
     voice->number = number;
@@ -141,20 +138,20 @@ static void move_on(struct voice *voice)
     voice->next++;
 }
 
-int32_t voice_sample(struct voice *voice)
+int32_t voice_sample(struct voice *voice, uint32_t clock)
 {
+    uint32_t angle = voice->frequency * clock; // a turn of the clock is 20 s, a whole number of periods
     struct complex amplitude = present(voice);
-    int32_t value = times(amplitude.re, sine(voice->angle)) +
-                    times(amplitude.im, cosine(voice->angle));
-    voice->angle += voice->pace;
+    int32_t value = times(amplitude.re, sine(angle)) + times(amplitude.im, cosine(angle));
     move_on(voice);
     return value;
 }
 
-struct complex voice_pointer(const struct voice *voice)
+struct complex voice_pointer(const struct voice *voice, uint32_t clock)
 {
     struct complex amplitude = present(voice);
-    int32_t re = cosine(voice->angle), im = sine(voice->angle);
+    uint32_t angle = voice->frequency * clock;
+    int32_t re = cosine(angle), im = sine(angle);
     struct complex turned = {.re = times(amplitude.re, re) - times(amplitude.im, im),
                              .im = times(amplitude.re, im) + times(amplitude.im, re)};
     return turned;

@@ -23,7 +23,6 @@ struct voice {
     uint16_t frequency;
     uint16_t level;           // to which it leads; its phase, 0 without a level
     int16_t phase;
-    uint32_t angle, pace;     // of the oscillator, and its step per sample
     struct complex from, to;  // ends of the present line
     uint32_t along, stride;   // position on it, a whole turn being its end; stride 0: it stands at `to`
     uint8_t next;             // knot behind this line; path.knots: the final amplitude
@@ -34,7 +33,7 @@ struct voice {
     uint32_t number;          // of voices, in the order of their beginnings
 };
 
-// Begin in a layer at t = 0, silent.
+// Begin in a layer, silent.
 void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number);
 
 // Send it from its present amplitude to the tone of a command: along its onset, or a ramp [ms].
@@ -56,10 +55,10 @@ uint32_t voice_samples_left(const struct voice *voice);
 // Whether it is not silent within a time [ms] by itself.
 bool voice_outlasts(const struct voice *voice, uint16_t milliseconds);
 
-// Value at this sample in units of 2^-30 of full level; then move on by one sample.
-int32_t voice_sample(struct voice *voice);
+// Value at this sample, at a time of the clock, in units of 2^-30 of full level; then move on by one.
+int32_t voice_sample(struct voice *voice, uint32_t clock);
 
 // Its present amplitude, turned by the angle of its oscillator: those of one frequency add up.
-struct complex voice_pointer(const struct voice *voice);
+struct complex voice_pointer(const struct voice *voice, uint32_t clock);
 
 #endif

@@ -88,9 +88,10 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
     int flags = (amplifier->high_voltage ? FLAG_HIGH_VOLTAGE : 0) |
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
+    const uint32_t clock = (uint32_t)(amplifier->clock >> 32);
     amplifier->is_limited = false;
     for (unsigned i = 0; i < CHANNELS; i++)
-        levels[i] = channel_level(&amplifier->channels[i]);
+        levels[i] = channel_level(&amplifier->channels[i], clock);
     for (uint8_t i = 0; i < LAYERS; i++)
         tokens[i] = amplifier_token(amplifier, i);
     struct wire_status status = {
@@ -100,6 +101,7 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
         .latch = amplifier->latch,
         .watchdog_left = amplifier_watchdog_left(amplifier),
         .readings = amplifier->measured.readings,
+        .clock = amplifier_clock(amplifier),
         .token = amplifier->committed,
         .channels = CHANNELS,
         .layers = LAYERS,
@@ -131,6 +133,7 @@ static void reply_capabilities(struct words *reply)
         .slew = UINT16_MAX,
         .watchdog_min = WATCHDOG_MIN, .watchdog_max = WATCHDOG_MAX,
         .envelope_step_min = ENVELOPE_STEP_MIN, .envelope_step_max = ENVELOPE_STEP_MAX,
+        .clock_error = CLOCK_ERROR,
         .limits = limits,
     };
     put_capabilities(reply, &capabilities);
@@ -247,7 +250,7 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
         if (words[ARM_WATCHDOG] < WATCHDOG_MIN || words[ARM_WATCHDOG] > WATCHDOG_MAX)
             verdict.nak = NAK_BAD_VALUE;
         else
-            amplifier_arm(amplifier, words[ARM_SESSION], words[ARM_WATCHDOG]);
+            amplifier_arm(amplifier, words[ARM_SESSION], words[ARM_WATCHDOG], words[ARM_SHIFT]);
         break;
     case MESSAGE_DISARM:
         amplifier_disarm(amplifier, words[DISARM_RAMP]);
@@ -278,7 +281,11 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
     case MESSAGE_SET_ADDRESS:
         verdict.nak = check_name(amplifier, words + SET_ADDRESS_SERIAL_NUMBER);
         break;
-    default: // GetStatus and Ping
+    case MESSAGE_PING:
+        if (amplifier->state == OPERATION_ENABLED)
+            amplifier_steer(amplifier, (int16_t)words[PING_RATE]);
+        break;
+    default: // GetStatus
         break;
     }
     return verdict;

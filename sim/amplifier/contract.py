@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
+from drivers.protocol.clock import clock_at
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import (
@@ -24,6 +25,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     STATES,
     STATUS_FLAGS,
+    VERSION,
 )
 from sim.amplifier.readings import (
     DERATE_ABOVE,
@@ -79,7 +81,7 @@ class Amplifier:
 
     def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
         self.identity: Values = {
-            **{"versions": 1 << 3, "vendor": "era-haptics", "product": "simulated amplifier"},
+            **{"versions": 1 << VERSION, "vendor": "era-haptics", "product": "simulated amplifier"},
             **{"serial_number": f"SIM-{name}", "firmware": "1"},
         }
         self.capabilities = capabilities(channels, is_output=is_output)
@@ -186,6 +188,7 @@ class Amplifier:
                 "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
                 "latch": self.latch,
                 "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
+                "clock": clock_at(now),
                 **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
                 "levels": [_Q["level"].to_wire(level) for level in levels],
                 "tokens": [tokens.get(layer, 0) for layer in range(layers)],

@@ -63,6 +63,7 @@ def capabilities(channels: int, *, is_output: bool = False) -> Values:
         **{"ramp_max": full["ramp"], "watchdog_min": QUANTITIES["watchdog"].minimum},
         **{"watchdog_max": full["watchdog"]},
         **{"envelope_step_min": 10, "envelope_step_max": full["envelope_step"]},
+        "clock_error": QUANTITIES["clock_error"].to_wire(1e-6),
         "limits": [dict(limits) for _ in range(channels)],
     }
 

@@ -1,4 +1,4 @@
-"""The pages of protocol 3: a frame of each wire by hand, the files for masters and monitors."""
+"""The pages of protocol 4: a frame of each wire by hand, the files for masters and monitors."""
 
 import re
 import textwrap

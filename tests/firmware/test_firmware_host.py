@@ -1,4 +1,4 @@
-"""The firmware as a program, on terminals and TCP, and the host of protocol 3."""
+"""The firmware as a program, on terminals and TCP, and the host of protocol 4."""
 
 import asyncio
 import os

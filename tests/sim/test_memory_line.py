@@ -1,4 +1,4 @@
-"""A host of protocol 3 on a simulated rig in this process: what fingers feel, faults, URLs."""
+"""A host of protocol 4 on a simulated rig in this process: what fingers feel, faults, URLs."""
 
 import asyncio
 import json

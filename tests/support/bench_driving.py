@@ -13,7 +13,7 @@ _Q = QUANTITIES
 
 def arm(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:
     """Arm an amplifier at a time [s], with a watchdog [s]."""
-    values = {"session": SESSION, "watchdog": _Q["watchdog"].to_wire(watchdog)}
+    values = {"session": SESSION, "watchdog": _Q["watchdog"].to_wire(watchdog), "shift": 0}
     bench.exchange(name, "Arm", values, now=now)
 
 
@@ -49,5 +49,5 @@ def keep_alive(
     """Advance to a time [s], with heartbeats to these amplifiers, None for all."""
     while (now := bench.time + every) < until:
         for name in names or bench.amplifiers:
-            bench.exchange(name, "Ping", {"session": SESSION}, now=now)
+            bench.exchange(name, "Ping", {"session": SESSION, "rate": 0}, now=now)
     bench.advance(until)

@@ -1,6 +1,6 @@
 """Stops of groups: is an amplifier silent whenever a stop says so? `make stop-test` has thousands.
 
-Over every wire of protocol 3, in virtual time. First frames are lost, late and doubled at random
+Over every wire of protocol 4, in virtual time. First frames are lost, late and doubled at random
 while all is stopped, at any moment of what a host does. Then one exception is raised on the way of
 each stop, at a line of the drivers that is drawn at random. Last the host is killed, and one of its
 amplifiers stopped by `era amp stop`. Whatever happens, a stop ends in time, and what it reports of

@@ -1,4 +1,4 @@
-"""Serial frames of protocol 3 written by hand from docs/decisions/0061-protocol-3.md.
+"""Serial frames of protocol 4 written by hand from docs/decisions/0061-protocol-3.md.
 
 None of the product's codecs is used: a frame is 00, COBS of (type, version, address, sequence as
 u16, payload, CRC-32), 00; words are little-endian.

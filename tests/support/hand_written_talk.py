@@ -1,4 +1,4 @@
-"""A host and an amplifier on a serial line, written by hand, before a witness of protocol 3."""
+"""A host and an amplifier on a serial line, written by hand, before a witness of protocol 4."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias

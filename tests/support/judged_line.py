@@ -1,4 +1,4 @@
-"""An amplifier of protocol 3 in memory, on a virtual clock, and its conformance.
+"""An amplifier of protocol 4 in memory, on a virtual clock, and its conformance.
 
 It is a simulated one, or any other far end of a wire: the firmware, an example.
 """

@@ -1,4 +1,4 @@
-"""The amplifiers of a rig on a real wire, as version 3 speaks, in the test's own event loop."""
+"""The amplifiers of a rig on a real wire, as version 4 speaks, in the test's own event loop."""
 
 import asyncio
 import contextlib

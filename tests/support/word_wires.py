@@ -1,4 +1,4 @@
-"""Simulated amplifiers of protocol 3 on real wires: terminals, TCP, CAN servers and adapters."""
+"""Simulated amplifiers of protocol 4 on real wires: terminals, TCP, CAN servers and adapters."""
 
 import asyncio
 import socket

@@ -1,4 +1,4 @@
-"""A line of protocol 3 in virtual time, of any kind of wire: hosts and simulated amplifiers."""
+"""A line of protocol 4 in virtual time, of any kind of wire: hosts and simulated amplifiers."""
 
 import asyncio
 import functools

@@ -1,4 +1,4 @@
-"""The contract of every amplifier of protocol 3, on whatever wire, as checks.
+"""The contract of every amplifier of protocol 4, on whatever wire, as checks.
 
 Run against hardware by its URL, and by the project's tests over every wire in virtual time. Checks
 that only read come first; the others arm the amplifier and drive its channels.

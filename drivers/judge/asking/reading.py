@@ -47,7 +47,7 @@ _FEATURE_OF = {
 
 @reading("protocol.md#messages", greets=True)
 async def identity(client: Client) -> None:
-    """It says who it is, always the same, and that it speaks version 3."""
+    """It says who it is, always the same, and that it speaks version 4."""
     first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
         expect(bool(first[name]), name, expected="a text", seen="none")
@@ -237,7 +237,7 @@ async def broadcasts(subject: Subject) -> None:
         ("Set", subject.parts(half, token=2)[0]),
         *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
         ("Clear", {"latch": subject.latch}),
-        ("Commit", {"session": 77, "token": 2}),
+        ("Commit", {"session": 77, "token": 2, "at": 0}),
     ):
         await subject.run([subject.one(), subject.ping])
         await send_to_all(name, **values)

@@ -191,7 +191,7 @@ class Subject(Material):
 
     async def ping(self) -> Answer:
         """Feed the watchdog."""
-        return await self.request("Ping")
+        return await self.request("Ping", rate=0)
 
     async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible.
@@ -202,7 +202,7 @@ class Subject(Material):
         self.token, self.is_starving = 0, not is_fed
         shortest = self.shortest_watchdog if is_fed else self.can["watchdog_min"]
         milliseconds = min(max(round(1000 * watchdog), shortest), self.can["watchdog_max"])
-        return await self.request("Arm", session=self.session, watchdog=milliseconds)
+        return await self.request("Arm", session=self.session, watchdog=milliseconds, shift=0)
 
     @property
     def next_session(self) -> int:

@@ -1,4 +1,4 @@
-"""Messages of protocol 3 as CAN frames of eight bytes, and back; no I/O.
+"""Messages of protocol 4 as CAN frames of eight bytes, and back; no I/O.
 
 Byte 0 is the sequence number, 0 in broadcasts and events; byte 1 the index of the frame. Frame 0
 goes on with type, number of words and two words, the others with three words each, low byte first.

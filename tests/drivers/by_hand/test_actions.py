@@ -1,4 +1,4 @@
-"""Actions of `era amp` on real wires, at simulated amplifiers of version 3."""
+"""Actions of `era amp` on real wires, at simulated amplifiers of version 4."""
 
 import asyncio
 import re

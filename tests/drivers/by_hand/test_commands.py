@@ -116,7 +116,7 @@ def result_of(*args: str) -> dict[str, Any]:
     ],
 )
 def test_results_have_the_documented_keys(command: str, more: set[str]) -> None:
-    """Those of docs/reference/commands.md, and what version 3 has besides."""
+    """Those of docs/reference/commands.md, and what version 4 has besides."""
     assert set(result_of(command, URL)) == COMMON | more
 
 
@@ -168,7 +168,7 @@ def test_conformance_reads_first_and_reports_what_is_left() -> None:
 async def test_conformance_stops_after_a_failed_reading_check() -> None:
     """An amplifier that is armed already: exit status 1, nothing is driven, nor advised."""
     async with WORD_WIRES["serial"](1) as far:
-        far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000}, monotonic())
+        far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic())
         arguments = ("conformance", far.url(1), "--write", "--json")
         result = await asyncio.to_thread(invoke, *arguments)
         assert result.exit_code == 1, result.output
@@ -191,7 +191,9 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
 
         async def judged(url: str, *, drives: bool, **others: Any) -> Report:
             if drives:
-                far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000}, monotonic())
+                far.amplifiers[1].handle(
+                    "Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic()
+                )
                 raise end
             return Report(url, 0.0, (), 1)
 

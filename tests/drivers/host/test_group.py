@@ -1,4 +1,4 @@
-"""Lines, amplifiers and their group on every kind of wire of protocol 3, in virtual time.
+"""Lines, amplifiers and their group on every kind of wire of protocol 4, in virtual time.
 
 What a person would feel is read from the simulated amplifiers themselves.
 """
@@ -111,12 +111,12 @@ async def test_host_that_drives_already_is_seen_and_left_alone(wire: str) -> Non
     """Its heartbeats raise the watchdog unasked; without them the amplifier is taken over."""
     end = MemoryLine(wire, "a")
     far = end.far["a"]
-    far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
+    far.handle("Arm", {"session": 5, "watchdog": 2000, "shift": 0}, end.loop.time())
 
     async def feed() -> None:
         while True:
             await asyncio.sleep(0.07)
-            far.handle("Ping", {"session": 5}, end.loop.time())
+            far.handle("Ping", {"session": 5, "rate": 0}, end.loop.time())
 
     other = asyncio.ensure_future(feed())
     with pytest.raises(LinkError):

@@ -1,4 +1,4 @@
-"""Amplifiers of protocol 3 by their URLs, on real terminals, TCP connections and CAN adapters."""
+"""Amplifiers of protocol 4 by their URLs, on real terminals, TCP connections and CAN adapters."""
 
 import asyncio
 from collections.abc import AsyncIterator

@@ -1,4 +1,4 @@
-"""Messages of protocol 3 as words, against rows written by hand from their definition."""
+"""Messages of protocol 4 as words, against rows written by hand from their definition."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""The simulated amplifier of protocol 3 against docs/decisions/0061 and arithmetic by hand."""
+"""The simulated amplifier of protocol 4 against docs/decisions/0061 and arithmetic by hand."""
 
 import math
 
@@ -9,7 +9,7 @@ from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import FAULTS, STATES
 from sim.amplifier.contract import Amplifier
 
-ARM = {"session": 7, "watchdog": 250}
+ARM = {"session": 7, "watchdog": 250, "shift": 0}
 OFF, *_, ENABLED = list(STATES)[1:5]
 _, REACTION, FAULT = list(STATES)[5:]
 
@@ -62,10 +62,10 @@ def test_heat_derates_and_then_trips() -> None:
 def test_temperature_follows_the_mean_square_level() -> None:
     """Half level on both channels: a quarter of 30 K, 1 - 1/e of it after 120 s."""
     amplifier = Amplifier("a", channels=2)
-    amplifier.handle("Arm", {"session": 7, "watchdog": 2000}, 0.0)
+    amplifier.handle("Arm", {"session": 7, "watchdog": 2000, "shift": 0}, 0.0)
     play(amplifier, 1, 0.0, tone(0), tone(1), ramp=0)
     for second in range(1, 121):
-        status = amplifier.handle("Ping", {"session": 7}, float(second))
+        status = amplifier.handle("Ping", {"session": 7, "rate": 0}, float(second))
     assert status["temperature"] == pytest.approx(250 + 75 * (1 - 1 / math.e), abs=1)
 
 
@@ -79,7 +79,10 @@ def test_interlock_trips_and_keeps_disarmed() -> None:
     assert amplifier.handle("Clear", {"latch": 1}, 0.2)["state"] == STATES[FAULT]
     amplifier.set_interlock(0.3, is_open=False)
     amplifier.handle("Clear", {"latch": 1}, 0.3)
-    assert amplifier.handle("Arm", {"session": 8, "watchdog": 250}, 0.3)["state"] == STATES[ENABLED]
+    assert (
+        amplifier.handle("Arm", {"session": 8, "watchdog": 250, "shift": 0}, 0.3)["state"]
+        == STATES[ENABLED]
+    )
 
 
 def test_restart_forgets_all_but_its_faults() -> None:

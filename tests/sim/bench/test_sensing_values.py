@@ -1,4 +1,4 @@
-"""Sensors of amplifiers of protocol 3: what they measure, what disturbs, what is refused."""
+"""Sensors of amplifiers of protocol 4: what they measure, what disturbs, what is refused."""
 
 import cmath
 import math
@@ -27,7 +27,7 @@ def bench_of(rig: Rig) -> Bench:
     """A bench whose amplifiers are armed at 5 s, for 2 s at a time."""
     bench = Bench(rig, now=5.0)
     for name in bench.amplifiers:
-        bench.exchange(name, "Arm", {"session": SESSION, "watchdog": 2000}, now=5.0)
+        bench.exchange(name, "Arm", {"session": SESSION, "watchdog": 2000, "shift": 0}, now=5.0)
     return bench
 
 
@@ -109,7 +109,7 @@ def test_reading_without_a_set_counts_from_its_window(coarse_rig: Rig) -> None:
     bench = bench_of(coarse_rig)
     play(bench, 7, LayerSet(0, 0, 0, (Command(0, 2200, 1000, 0),)), now=5.1)
     bench.exchange("main", "Disarm", {"ramp": 0}, now=5.2)
-    bench.exchange("main", "Arm", {"session": SESSION + 1, "watchdog": 2000}, now=5.3)
+    bench.exchange("main", "Arm", {"session": SESSION + 1, "watchdog": 2000, "shift": 0}, now=5.3)
     found = measure(bench, 1, 110.0, now=5.4, window=100)
     assert (found["token"], found["window_start"]) == (0, 0)
     bench.amplifiers["main"].restart(5.45)

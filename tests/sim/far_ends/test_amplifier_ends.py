@@ -1,4 +1,4 @@
-"""Far ends of protocol 3 on real ports, asked with bytes written by hand."""
+"""Far ends of protocol 4 on real ports, asked with bytes written by hand."""
 
 import asyncio
 import contextlib

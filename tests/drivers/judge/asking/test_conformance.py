@@ -1,4 +1,4 @@
-"""Conformance of protocol 3: sound amplifiers pass on every wire, and no verdict is missing."""
+"""Conformance of protocol 4: sound amplifiers pass on every wire, and no verdict is missing."""
 
 import asyncio
 import math
@@ -428,7 +428,7 @@ def armed(watchdog: int) -> Judge:
     """Return the judge of an amplifier that is armed at 0 s with a watchdog [ms]."""
     start = When(0.0, 0.0)
     judge = Judge(capabilities(4), OFF, start)
-    judge.granted("Arm", {"session": 1, "watchdog": watchdog}, {}, start)
+    judge.granted("Arm", {"session": 1, "watchdog": watchdog, "shift": 0}, {}, start)
     return judge
 
 

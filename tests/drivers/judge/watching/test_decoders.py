@@ -43,7 +43,7 @@ def rtu(adu: str) -> bytes:
 Heard = tuple[str, bytes, str, dict[str, Any]]
 """A direction, bytes, and the message that they complete: "" for none."""
 PING: tuple[Heard, ...] = (
-    (">", tcp(5, "10 0C00 0002 04 0008 0007"), "Ping", {"session": 7}),
+    (">", tcp(5, "10 0C00 0002 04 0008 0007"), "Ping", {"session": 7, "rate": 0}),
     ("<", tcp(5, "10 0C00 0002"), "carried out", {}),
     (">", tcp(6, "04 0C80 0002"), "read on", {}),
 )
@@ -97,7 +97,12 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "parts, the first with a checksum of its own": (
         "modbus-rtu",
         (
-            (">", rtu(f"01 10 0C00 0002 04 {PART[3:].hex()} 0007"), "Ping", {"session": 7}),
+            (
+                ">",
+                rtu(f"01 10 0C00 0002 04 {PART[3:].hex()} 0007"),
+                "Ping",
+                {"session": 7, "rate": 0},
+            ),
             ("<", rtu("01 10 0C00 0002"), "carried out", {}),
             (">", rtu("01 04 0C80 0002"), "read on", {}),
             ("<", PART, "", {}),
@@ -125,7 +130,7 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "echo, and another host": (
         "slcan",
         (
-            (">", can("201 01 00 0C 01 07 00 00 00"), "Ping", {"session": 7}),
+            (">", can("201 01 00 0C 01 07 00 00 00"), "Ping", {"session": 7, "rate": 0}),
             ("<", can("201 01 00 0C 01 07 00 00 00"), "", {}),
             ("<", can("201 02 00 03 02 17 2A FA 00"), "other host", {"text": "Arm"}),
         ),

@@ -1,4 +1,4 @@
-"""Messages of protocol 3 in CAN frames: bytes worked out by hand from the decision, and losses."""
+"""Messages of protocol 4 in CAN frames: bytes worked out by hand from the decision, and losses."""
 
 import pytest
 
@@ -17,7 +17,7 @@ SET = ("1300050a34120700", "1301020081000100", "130200002000d007", "13038813d8dc
 """Session 1234, token 7, part 0 of 1; layer 1 along 1 ms: channel 2, 100 Hz, 0.5, -90 degrees."""
 REQUESTS: dict[str, tuple[int, Values, tuple[str, ...]]] = {
     "GetStatus": (0x11, {}, ("1100090000000000",)),
-    "Arm": (0x12, {"session": 0x1234, "watchdog": 250}, ("120003023412fa00",)),
+    "Arm": (0x12, {"session": 0x1234, "watchdog": 250, "shift": 0}, ("120003023412fa00",)),
     "Set": (
         0x13,
         {

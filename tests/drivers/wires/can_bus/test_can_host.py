@@ -112,7 +112,7 @@ def test_request_that_needs_a_session_is_another_hosts(
 
 def test_echo_of_own_frames_is_none(wire: CanWire) -> None:
     """An adapter may hand over what it sent."""
-    echo = wire.request(NODE, "Ping", {"session": 9})
+    echo = wire.request(NODE, "Ping", {"session": 9, "rate": 0})
     assert wire.received(echo) == []
     assert wire.counters.unexpected_frames == 0
 
@@ -156,7 +156,7 @@ def test_amplifier_that_another_host_drives_is_never_armed() -> None:
 
     async def test(group: Group, end: MemoryLine) -> None:
         far = end.far["a"]
-        values = {"session": 5, "watchdog": 250}
+        values = {"session": 5, "watchdog": 250, "shift": 0}
         far.handle("Arm", values, end.loop.time())
         heard(end)
         sent = len(end.sent)
@@ -192,7 +192,7 @@ async def test_another_host_is_heard_while_opening() -> None:
     """Its frames show it where its watchdog has not been seen to rise."""
     end = MemoryLine("can", "a")
     far = end.far["a"]
-    far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
+    far.handle("Arm", {"session": 5, "watchdog": 2000, "shift": 0}, end.loop.time())
     end.loop.call_later(0.1, heard, end)
     with pytest.raises(LinkError):
         await end.hosts["a"].open()

@@ -124,7 +124,7 @@ def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
 
 def test_request_of_all_units_has_no_reply() -> None:
     """Unit 0 on a line; over TCP a write to each unit that is known, whose responses pass."""
-    commit = ("Commit", {"session": 9, "token": 7})
+    commit = ("Commit", {"session": 9, "token": 7, "at": 0})
     wire = ModbusWire(0, is_rtu=True, number=0)
     frame = wire.request(0, *commit)
     assert frame[:-2] == bytes.fromhex("00 10 0600 0003 06 0001 0009 0007")
@@ -168,7 +168,9 @@ def test_number_of_an_unanswered_broadcast_can_be_used_again() -> None:
     """Transactions come again after 65 535: then one is a healthy unit's."""
     wire, peer = ModbusWire(0, is_rtu=False, number=0), Peer(is_rtu=False)
     wire.request(1, "GetStatus", {})
-    wire.request(0, "Commit", {"session": 9, "token": 7})  # transaction 2, without a response
+    wire.request(
+        0, "Commit", {"session": 9, "token": 7, "at": 0}
+    )  # transaction 2, without a response
     wire._number = 1
     assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
 
@@ -222,7 +224,7 @@ def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
 
     Each echo may begin 10 ms late. A network has no time of its own.
     """
-    commit = ("Commit", {"session": 9, "token": 7})
+    commit = ("Commit", {"session": 9, "token": 7, "at": 0})
     wire = ModbusWire(9600, is_rtu=False, number=0)
     for unit in (1, 2, 3):
         wire.request(unit, "GetStatus", {})

@@ -1,4 +1,4 @@
-"""Amplifiers of protocol 3 on a CAN bus: bytes by hand, of which some are lost.
+"""Amplifiers of protocol 4 on a CAN bus: bytes by hand, of which some are lost.
 
 Frames are written as identifier and data in hexadecimal digits.
 """

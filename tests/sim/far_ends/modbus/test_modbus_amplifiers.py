@@ -1,4 +1,4 @@
-"""The amplifiers' side of Modbus in protocol 3, driven by masters that are not ours."""
+"""The amplifiers' side of Modbus in protocol 4, driven by masters that are not ours."""
 
 import asyncio
 from collections.abc import AsyncIterator

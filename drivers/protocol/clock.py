@@ -1,0 +1,25 @@
+"""The clock of an amplifier as integers of the wire: 32 bits that go round once in 20 s.
+
+A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
+"""
+
+from drivers.protocol.table import CLOCK_TURN
+
+SPAN = 1 << 32
+_PER_SECOND = SPAN / CLOCK_TURN
+_HIGH = 16  # bits below the high word
+
+
+def clock_at(seconds: float) -> int:
+    """Return what a clock shows that many seconds after it showed 0."""
+    return round(seconds % CLOCK_TURN * _PER_SECOND) % SPAN
+
+
+def ahead(clock: int, of: int) -> float:
+    """Return by how much [s] a clock is ahead of another, at most half a turn either way."""
+    return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
+
+
+def high_word(clock: int) -> int:
+    """Return the high word of a clock, as a Commit names a moment."""
+    return clock >> _HIGH

@@ -97,13 +97,13 @@ static void check_commands(struct reader *reader, uint8_t count)
 
 void check_set(struct reader *reader)
 {
-    struct reader whole = *reader;
     uint16_t layers = 0;
-    while (whole.left > 0 && whole.nak == NAK_NONE)
+    while (reader->left > 0 && reader->nak == NAK_NONE) {
+        struct reader whole = *reader;
         for (uint8_t left = read_layer(&whole).count; left > 0; left--)
             read_command(&whole);
-    reader->nak = whole.nak;
-    while (reader->left > 0 && reader->nak == NAK_NONE) {
+        if (whole.nak != NAK_NONE)
+            reader_refuse(reader, whole.nak, NO_CHANNEL);
         struct layer_head head = read_layer(reader);
         if (head.bits > LAYER_BITS_MAX || (layers >> head.layer & 1) ||
             (head.count > 0 ? head.renew : head.after) || head.layer >= LAYERS ||

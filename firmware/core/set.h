@@ -39,7 +39,7 @@ struct layer_head {
 struct layer_head read_layer(struct reader *reader);
 struct command read_command(struct reader *reader);
 
-// Refuse a stream that ends amid a layer, then, in its order, what this amplifier does not play.
+// Refuse what ends amid a layer, or is not what this amplifier plays, the first that is found.
 void check_set(struct reader *reader);
 
 #define PARTS_MAX 127

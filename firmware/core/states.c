@@ -42,8 +42,8 @@ void amplifier_init(struct amplifier *amplifier, const char *serial_number,
 
 void amplifier_steer(struct amplifier *amplifier, int16_t rate)
 {
-    // 2^64 in 20 s, rounded by less than 2 for each sample: by 4 us in a year at 48 kHz.
-    const int64_t step = (int64_t)(UINT64_MAX / (CLOCK_TURN * SAMPLE_RATE));
+    // 2^64 in 20 s, too much by less than 1 for each sample: by 2 us in a year at 48 kHz.
+    const int64_t step = (int64_t)(UINT64_MAX / (CLOCK_TURN * SAMPLE_RATE) + 1);
     amplifier->step = (uint64_t)(step + step * rate / 10000000);
 }
 

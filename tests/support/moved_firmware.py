@@ -141,7 +141,7 @@ class Pair:
     @property
     def moment(self) -> float:
         """The time, a little later with each request, so that what is due then has happened."""
-        return self.time + 1e-9 * self._requests
+        return self.time + 1e-10 * self._requests
 
     def ask(self, number: int, words: Sequence[int]) -> tuple[list[Sent], list[Sent]]:
         """Return what each sends upon a request with a message's number."""

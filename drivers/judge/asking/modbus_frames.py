@@ -145,6 +145,11 @@ class ModbusClient(Client):
             return self.refusal(*when, number, (number, *divmod(result, 256)))
         return Answer("", None, tuple(reply), when)
 
+    async def part(self, number: int, words: Sequence[int]) -> None:
+        """Write a message, whose reply area is not read."""
+        response, _ = await self.transact(self.write_of(number, words))
+        expect_equal(response[0], WRITE, f"function of the response to {message_name(number)}")
+
     def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
         """Return the PDU that writes a message, tagged with the number of its frame."""
         tag = self.number % 0xFFFF + 1 if tag is None else tag

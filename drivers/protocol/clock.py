@@ -3,11 +3,9 @@
 A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
 """
 
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.table import AHEAD_MAX, CLOCK_TURN
 
 SPAN = 1 << 32
-AT_MOST = 1638
-"""Steps of the high word by which a Commit may name a moment ahead: 0.5 s."""
 _PER_SECOND = SPAN / CLOCK_TURN
 _HIGH = 16  # bits below the high word
 
@@ -33,8 +31,8 @@ def moment_of(at: int, seconds: float) -> float | None:
     at: the high word of a clock of `clock_at`.
     """
     now = clock_at(seconds)
-    left = ((at << 16) - now) % SPAN
-    return seconds + left / _PER_SECOND if 0 < left <= AT_MOST << 16 else None
+    left = ((at << _HIGH) - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX << _HIGH else None
 
 
 def high_word(clock: int) -> int:

@@ -6,8 +6,12 @@ A voice of frequency word n has the angle n times clock modulo 2^32, in turns of
 from drivers.protocol.table import AHEAD_MAX, CLOCK_TURN
 
 SPAN = 1 << 32
+HIGH_STEPS = 1 << 16
+"""Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+HIGH_WORDS = SPAN // HIGH_STEPS
+HIGH_TIME = CLOCK_TURN / HIGH_WORDS
+"""Seconds of a step of the high word."""
 _PER_SECOND = SPAN / CLOCK_TURN
-_HIGH = 16  # bits below the high word
 
 
 def clock_at(seconds: float) -> int:
@@ -22,7 +26,7 @@ def ahead(clock: int, of: int) -> float:
 
 def at_behind(seconds: float) -> int:
     """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
-    return high_word(clock_at(seconds) - 1) + 1 & 0xFFFF
+    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
 
 
 def moment_of(at: int, seconds: float) -> float | None:
@@ -31,10 +35,10 @@ def moment_of(at: int, seconds: float) -> float | None:
     at: the high word of a clock of `clock_at`.
     """
     now = clock_at(seconds)
-    left = ((at << _HIGH) - now) % SPAN
-    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX << _HIGH else None
+    left = at * HIGH_STEPS - now % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
 
 
 def high_word(clock: int) -> int:
     """Return the high word of a clock, as a Commit names a moment."""
-    return clock >> _HIGH
+    return clock // HIGH_STEPS

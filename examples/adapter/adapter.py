@@ -36,15 +36,14 @@ _LEVEL = QUANTITIES["level"]
 
 @dataclass(frozen=True)
 class Tone:
-    """A sine: frequency [Hz], amplitude 0..1 of full level, phase [degrees], its start [s].
+    """A sine: frequency [Hz], amplitude 0..1 of full level, phase [degrees].
 
-    Tones with one origin start together; one that has it already goes on.
+    One of the frequency that a channel plays already goes on.
     """
 
     frequency: float
     amplitude: float
     phase: float
-    origin: float
 
 
 class Device(Protocol):
@@ -73,13 +72,15 @@ class AdaptedAmplifier(Amplifier):
         self.device_levels = [1.0] * channels
         self.is_lost = True
 
-    def handle(self, name: str, values: Values, now: float) -> Values:
+    def handle(
+        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
+    ) -> Values:
         """Reply to a request; armed only while the device is known to be well."""
         if name in ("GetMeasured", "SetAddress"):
             raise Refusal(f"there is no {name}", "UNKNOWN_TYPE")
         if name == "Arm" and self.is_lost:
             raise Refusal("the device must reply first", "WRONG_STATE")
-        return super().handle(name, values, now)
+        return super().handle(name, values, now, is_broadcast=is_broadcast)
 
     def status(self, now: float) -> Values:
         """Return the status with what the device may still play, without what is not measured."""
@@ -182,7 +183,7 @@ def tone_of(voices: tuple[Voice, ...], now: float) -> Tone | None:
     if loudest is None or not level:
         return None
     phase = math.degrees(cmath.phase(amplitude))
-    return Tone(loudest.frequency, level, round(phase, 2), loudest.origin)
+    return Tone(loudest.frequency, level, round(phase, 2))
 
 
 def watch(silence: Callable[[], None]) -> Callable[[bytes], None]:

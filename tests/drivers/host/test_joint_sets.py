@@ -46,7 +46,7 @@ async def started(*ends: MemoryLine) -> list[list[float]]:
         starts.append([])
         for far in end.far.values():
             far.tick(end.loop.time())
-            starts[-1] += [voice.transition.start for voice in far.playback.all_voices[0]]
+            starts[-1] += [voice.began for voice in far.playback.all_voices[0]]
     return starts
 
 
@@ -199,8 +199,8 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
         await group.apply({"a": [loud(0, 0.5)]})
         await group.beat()
     after = ends[1].far["b"].playback.all_voices[0]
-    assert [(each.origin, each.layer) for each in after] == [
-        (each.origin, each.layer) for each in before
+    assert [(each.began, each.layer) for each in after] == [
+        (each.began, each.layer) for each in before
     ]
     await group.apply({name: [loud(0, 0.2)] for name in group.amplifiers})
     await group.silence(0.0)

@@ -35,7 +35,7 @@ def moment_of(at: int, seconds: float) -> float | None:
     at: the high word of a clock of `clock_at`.
     """
     now = clock_at(seconds)
-    left = at * HIGH_STEPS - now % SPAN
+    left = (at * HIGH_STEPS - now) % SPAN
     return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
 
 

@@ -51,6 +51,7 @@ _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
+_PLAIN = {"shift": 0, "rate": 0, "at": 0}  # words of the clock, where they are not named
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
 
@@ -123,7 +124,7 @@ class Subject(Material):
     async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
         """Send a request by its values, or raw words, and return what became of it."""
         self._check_fed()
-        message, values = MESSAGES[name], {"session": self.session, **values}
+        message, values = MESSAGES[name], {"session": self.session, **_PLAIN, **values}
         if raw is None:
             try:
                 raw = message.request.pack(values)
@@ -191,7 +192,7 @@ class Subject(Material):
 
     async def ping(self) -> Answer:
         """Feed the watchdog."""
-        return await self.request("Ping", rate=0)
+        return await self.request("Ping")
 
     async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible.
@@ -202,7 +203,7 @@ class Subject(Material):
         self.token, self.is_starving = 0, not is_fed
         shortest = self.shortest_watchdog if is_fed else self.can["watchdog_min"]
         milliseconds = min(max(round(1000 * watchdog), shortest), self.can["watchdog_max"])
-        return await self.request("Arm", session=self.session, watchdog=milliseconds, shift=0)
+        return await self.request("Arm", session=self.session, watchdog=milliseconds)
 
     @property
     def next_session(self) -> int:

@@ -57,6 +57,7 @@ _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
+_HIGH_WORDS = _Q["at"].maximum + 1
 
 
 class SensorPort(Protocol):
@@ -121,7 +122,7 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
-        self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], its Commit
+        self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
         self._watchdog = 0.0
         self._last_fed = 0.0
@@ -287,7 +288,10 @@ class Amplifier:
                     raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
             case "Ping" if self.state == _ENABLED:
-                self._steer(values["rate"], now)
+                self.clock.steer(values["rate"], now)
+                if self._waiting is not None:
+                    _, commit, layers = self._waiting
+                    self._waiting = self.clock.reaches(commit["at"], now), commit, layers
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -370,9 +374,9 @@ class Amplifier:
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
-        steps = (commit["at"] - high_word(self.clock.reading(now))) % (1 << 16)
-        if 1 <= steps <= AHEAD_MAX:
-            self._waiting = self.clock.reaches(commit["at"], now), commit, layers
+        at = commit["at"]
+        if 1 <= (at - high_word(self.clock.reading(now))) % _HIGH_WORDS <= AHEAD_MAX:
+            self._waiting = self.clock.reaches(at, now), commit, layers
         else:
             self._play(layers, commit["token"], now)
 
@@ -382,13 +386,6 @@ class Amplifier:
             _, commit, layers = self._waiting
             self._waiting = None
             self._play(layers, commit["token"], moment)
-
-    def _steer(self, rate: int, now: float) -> None:
-        """Let its clock run faster from now on, and what waits for it start as much sooner."""
-        self.clock.steer(rate, now)
-        if self._waiting is not None:
-            _, commit, layers = self._waiting
-            self._waiting = self.clock.reaches(commit["at"], now), commit, layers
 
     def _play(self, layers: Layers, token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers

@@ -32,6 +32,7 @@ from drivers.protocol.table import (
     REACTION,
     STATES,
     STATUS_FLAGS,
+    VERSION,
     has_flag,
     name_of,
 )
@@ -150,13 +151,13 @@ async def reading_changes_nothing(subject: Subject) -> None:
 async def hello_for_ever(subject: Subject) -> None:
     """It answers a Hello of any version and length, and no other version of anything else."""
     client = cast(SerialClient, subject.client)
-    for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
+    for payload, version in ((b"", VERSION), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
         shown = await client.hello(payload, version)
         expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
-    for version in (0, 2, 4, 255):
+    for version in (0, 2, 3, 255):
         answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
         expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
-    answer = await client.exchange(MESSAGES["Ping"].number, [1], behind=b"\0")
+    answer = await client.exchange(MESSAGES["Ping"].number, [1, 0], behind=b"\0")
     expect_equal(answer.code, "BAD_LENGTH", "refusal of three bytes")
 
 
@@ -164,7 +165,17 @@ def _shortest(name: str) -> list[int]:
     """Return the words of a request that is right but for the state."""
     values = {
         **{"session": 1, "watchdog": 250, "ramp": 5, "token": 1, "index": 0, "parts": 1},
-        **{"now": 0, "stream": [], "latch": 0, "layer": 0, "address": 9, "serial_number": "?"},
+        **{
+            "now": 0,
+            "shift": 0,
+            "rate": 0,
+            "at": 0,
+            "stream": [],
+            "latch": 0,
+            "layer": 0,
+            "address": 9,
+            "serial_number": "?",
+        },
         **{"first": 0, "reading": 1, "window": 1000, "tones": 1},
         "frequencies": [QUANTITIES["frequency"].to_wire(100.0)],
     }

@@ -250,7 +250,7 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Commit", token=1, session=77, code="WRONG_SESSION"),
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
-        send("Ping", raw=(1, 0), code="BAD_LENGTH"),
+        send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
         partial(subject.client.exchange, 63, ()),
     ]
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]

@@ -48,6 +48,8 @@ _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
+_UNMOVED = {"shift": 0, "rate": 0, "at": 0}
+"""Of clocks, where a row says nothing of them."""
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
@@ -123,7 +125,7 @@ class Subject(Material):
     async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
         """Send a request by its values, or raw words, and return what became of it."""
         self._check_fed()
-        message, values = MESSAGES[name], {"session": self.session, **values}
+        message, values = MESSAGES[name], {"session": self.session, **_UNMOVED, **values}
         if raw is None:
             try:
                 raw = message.request.pack(values)

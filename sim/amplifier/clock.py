@@ -8,6 +8,7 @@ Sums are whole numbers, so that nothing adds up over hours of steering.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.protocol.clock import HIGH_STEPS, SPAN, clock_at
 from drivers.protocol.table import CLOCK_TURN, QUANTITIES
@@ -45,16 +46,34 @@ class Crystal:
         """Return the seconds that it counts in a second, at an age [s]."""
         return 1 + self.error - self.warm_up * SETTLING * math.expm1(-age / SETTLING)
 
+    def drift(self, age: float) -> float:
+        """Return by how much its pace grows in a second, at an age [s]."""
+        return self.warm_up * math.exp(-age / SETTLING)
+
+
+class StraightClock(NamedTuple):
+    """A clock that runs straight on: what it shows [s] at a time [s], and its seconds a second."""
+
+    time: float
+    shown: float
+    pace: float
+
+    def at(self, time: float) -> float:
+        """Return what it shows at a time [s], within a turn."""
+        return (self.shown + (time - self.time) * self.pace) % CLOCK_TURN
+
 
 class AmplifierClock:
     """A clock of 32 bits that goes round once in 20 s, with supply since a time [s].
 
-    Times [s] are the bench's, not before the last change; rate: in units of the wire.
+    Times [s] are the bench's, not before the last change; rate: in units of the wire; changes:
+    counts those of its rate, and those of what it shows.
     """
 
     def __init__(self, crystal: Crystal = Crystal(), *, since: float = 0.0) -> None:
         self.crystal = crystal
         self.rate = 0
+        self.changes = 0
         self._since = since
         # Parts of a second that crystal and clock had counted when its rate changed last.
         self._crystal, self._clock = 0, round((since + crystal.ahead) * _PER_SECOND)
@@ -67,23 +86,32 @@ class AmplifierClock:
         """Return the clock [s] at a time [s], where it does not go round."""
         return self._parts(time) / _PER_SECOND
 
-    def pace(self, time: float) -> float:
-        """Return the seconds that it counts in a second, at a time [s]."""
-        return self.crystal.pace(time - self._since) * (1 + self.rate / _PER_RATE)
+    def straight(self, time: float) -> StraightClock:
+        """Return it as it runs at a time [s], as if it went on so."""
+        pace = self.crystal.pace(time - self._since) * (1 + self.rate / _PER_RATE)
+        return StraightClock(time, self._parts(time) % _TURN / _PER_SECOND, pace)
+
+    def steady(self, time: float, change: float) -> float:
+        """Return for how long its crystal's drift changes it by less than a time [s]."""
+        drift = abs(self.crystal.drift(time - self._since))
+        return math.sqrt(2 * change / drift) if drift else math.inf
 
     def steer(self, rate: int, time: float) -> None:
         """Let it run faster than its crystal by a rate, from a time [s] on."""
-        self._clock, self._crystal = self._parts(time), self._counted(time)
-        self.rate = rate
+        if rate != self.rate:
+            self._clock, self._crystal = self._parts(time), self._counted(time)
+            self.rate = rate
+            self.changes += 1
 
     def shift(self, steps: int) -> None:
         """Move it on by steps of its high word."""
         self._clock += steps * HIGH_STEPS * _TURN // SPAN
+        self.changes += 1
 
     def restart(self, time: float) -> None:
         """Let it show 0 at a time [s], as fast as its crystal, which stays as warm as it is."""
-        self.steer(0, time)
-        self._clock = 0
+        self._clock, self._crystal, self.rate = 0, self._counted(time), 0
+        self.changes += 1
 
     def reaches(self, high: int, time: float) -> float:
         """Return when its high word becomes this one next [s], as it runs at a time [s].

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _FTDI_PACKET = 62  # bytes beside two of status
+_ORDER = 1e-9  # s; between what arrives, since timers of one moment run in any order
 _FRAME_ERROR = 50e-6  # of a USB host's crystal against its machine's clock; it may be 500e-6
 
 
@@ -68,14 +69,14 @@ class LineDelays:
 
     def leave(self, time: float, size: int) -> float:
         """Return when so many bytes that a host writes at a time begin on the line [s]."""
-        ready = time + self._kind.writing.draw(self._rng)
-        self._left = max(self._left, self._next_frame(ready) + size * self._kind.usb_byte)
+        ready = self._next_frame(time + self._kind.writing.draw(self._rng))
+        self._left = max(self._left + _ORDER, ready + size * self._kind.usb_byte)
         return self._left
 
     def arrive(self, time: float, size: int) -> float:
         """Return when a host has so many bytes, the last of which is off the line at a time [s]."""
         ready = self._next_frame(self._packet_end(time, size)) + size * self._kind.usb_byte
-        self._arrived = max(self._arrived, ready + self._kind.waking.draw(self._rng))
+        self._arrived = max(self._arrived + _ORDER, ready + self._kind.waking.draw(self._rng))
         return self._arrived
 
     def _next_frame(self, time: float) -> float:
@@ -118,6 +119,8 @@ def _ftdi(latency_timer: float) -> LineKind:
     return LineKind(_WRITING, _WAKING, frame, usb_byte, latency_timer)
 
 
+PROMPT = "prompt"
+"""The name of a line that adds nothing."""
 LINE_KINDS: Mapping[str, LineKind] = {
     "native": LineKind(_WRITING, _WAKING),
     "usb-high-speed": _HIGH_SPEED,
@@ -128,7 +131,7 @@ LINE_KINDS: Mapping[str, LineKind] = {
     "can-usb": _FULL_SPEED,
     "ethernet": LineKind(_SENDING, _RECEIVING),
 }
-"""Kinds of lines by name.
+"""Kinds of lines by name, beside `PROMPT`.
 
 native: a UART of the board; ftdi: with the chip's timer of 16 ms, or as the host's driver sets it
 where it can; can: a controller of the board, can-usb: an adapter; ethernet: Modbus TCP, servers.

@@ -26,7 +26,7 @@ _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
 _SHIFTS = 1 << 16
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _SILENT = 0.2, 3e-3  # longer than a Ping is late
-_SEEN = 5e-5  # error of a rate below which it is judged
+_SURELY = 4.0  # standard errors
 _UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
 _SLACK = 50e-6  # s; what is computed of bits and read of clocks, at the most
 _logger = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ class HeldClock:
             return "not_steered"
         if time - self._jumped_at < SETTLING:
             return "jumped"
-        if self._fit and self._fit.rate_error < _SEEN and abs(self._fit.rate) > MAX_RATE:
+        if self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_RATE:
             return "crystal"
         return "unsettled" if time - self._led_from > SETTLING else None
 

@@ -13,7 +13,7 @@ import math
 from typing import Literal
 
 from drivers.host.clock_fit import ClockFit
-from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead, clock_at
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, ahead, clock_at
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
@@ -21,9 +21,7 @@ SETTLING = 3.0
 """Seconds within which a clock must follow, and for which one that has jumped is not trusted."""
 MAX_RATE = 2e-4
 """Of a crystal against the host's; one that is faster or slower is broken."""
-_STEP = HIGH_STEPS * CLOCK_TURN / SPAN  # s; of shift
 _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
-_SHIFTS = 1 << 16
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _SILENT = 0.2, 3e-3  # longer than a Ping is late
 _SURELY = 4.0  # standard errors
@@ -127,7 +125,7 @@ class HeldClock:
         """Return the shift of an Arm that is sent at a time [s]."""
         if not self.can_be_steered:
             return 0
-        return round(-self.lead(time) / _STEP) % _SHIFTS
+        return round(-self.lead(time) / HIGH_TIME) % HIGH_WORDS
 
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
@@ -157,8 +155,8 @@ class HeldClock:
         is_armed = status["state"] == ENABLED
         has_left = self._is_armed and not is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and is_armed:
-            steps = (values["shift"] + _SHIFTS // 2) % _SHIFTS - _SHIFTS // 2
-            self._added += steps * _STEP
+            steps = (values["shift"] + HIGH_WORDS // 2) % HIGH_WORDS - HIGH_WORDS // 2
+            self._added += steps * HIGH_TIME
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0

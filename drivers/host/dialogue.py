@@ -110,7 +110,7 @@ class Dialogue:
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
         """What it may play by what is known beside its statuses and what fed it."""
-        self.clock = HeldClock(name)
+        self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
@@ -341,7 +341,7 @@ class Dialogue:
             self.latch = latch
         self.status, self.status_at = reply, now
         self.clock.replied(name, values, reply, now, bits=self.status_time)
-        for kind in reports_of(reply):
+        for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:

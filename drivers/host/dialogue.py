@@ -33,7 +33,7 @@ from drivers.host.reports import (
 from drivers.playing.contents import Layer
 from drivers.protocol.clock import clock_at, high_word, moment_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
+from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
@@ -310,10 +310,10 @@ class Dialogue:
             self._admitted = None
             self.played_at = now if name == "Silence" else self.played_at
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
-            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
-            if name == "Commit" or is_last:
+            is_now = name == "Set" and values["now"] and is_last(values)
+            if name == "Commit" or is_now:
                 self.played_at = now
-                starts = None if is_last else moment_of(values["at"], now)
+                starts = None if is_now else moment_of(values["at"], now)
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:

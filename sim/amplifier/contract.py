@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import clock_at
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import (
@@ -27,6 +26,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     VERSION,
 )
+from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.readings import (
     DERATE_ABOVE,
     DERATED,
@@ -74,12 +74,20 @@ class Amplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: others hold
-    from the next restart. session: held while armed, or the one that ended last.
+    from the next restart. session: held while armed, or the one that ended last. clock: on which
+    phases count, by default without errors.
     """
 
     is_answering = True
 
-    def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        channels: int,
+        is_output: bool = False,
+        clock: AmplifierClock | None = None,
+    ) -> None:
         self.identity: Values = {
             **{"versions": 1 << VERSION, "vendor": "era-haptics", "product": "simulated amplifier"},
             **{"serial_number": f"SIM-{name}", "firmware": "1"},
@@ -93,7 +101,7 @@ class Amplifier:
         self._faults: deque[FaultRecord] = deque(maxlen=_FAULTS_KEPT)
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
-        self.committed_at = -math.inf  # s; see `token`
+        self.clock = AmplifierClock() if clock is None else clock
         self._sensing: SensorPort | None = None
         self._start()
 
@@ -114,7 +122,7 @@ class Amplifier:
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
-        """Of the set since arming that changed last what plays, and began t; 0: none."""
+        """Of the set since arming that changed last what plays; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
@@ -188,7 +196,7 @@ class Amplifier:
                 "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
                 "latch": self.latch,
                 "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
-                "clock": clock_at(now),
+                "clock": self.clock.reading(now),
                 **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
                 "levels": [_Q["level"].to_wire(level) for level in levels],
                 "tokens": [tokens.get(layer, 0) for layer in range(layers)],
@@ -239,6 +247,7 @@ class Amplifier:
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
         self._start()
+        self.clock.restart(moment)
         if self._sensing is not None:
             self._sensing.forget()
         self._enter("SWITCH_ON_DISABLED", moment)
@@ -251,7 +260,7 @@ class Amplifier:
             case "GetFaults":
                 return fault_list(self._faults, now)
             case "Arm":
-                self._arm(values["session"], values["watchdog"], now)
+                self._arm(values, now)
             case "Disarm" | "Stop":
                 if name == "Stop":
                     self.latch = token_after(self.latch)
@@ -264,6 +273,8 @@ class Amplifier:
                     limit = self.capabilities["ramp_max"]
                     raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+            case "Ping" if self.state == _ENABLED:
+                self.clock.steer(values["rate"], now)
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -295,7 +306,8 @@ class Amplifier:
             return session != self.session
         return name == "Arm" and session == self.session
 
-    def _arm(self, session: int, watchdog: int, now: float) -> None:
+    def _arm(self, values: Values, now: float) -> None:
+        watchdog = values["watchdog"]
         low, high = self.capabilities["watchdog_min"], self.capabilities["watchdog_max"]
         if not low <= watchdog <= high:
             raise Refusal(f"watchdog must be {low} to {high}, got {watchdog}")
@@ -306,7 +318,8 @@ class Amplifier:
         self._silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
         self.token = 0
-        self.session = session
+        self.session = values["session"]
+        self.clock.shift(values["shift"])
         self._last_fed = now
         self._enter(_ENABLED, now)
 
@@ -338,7 +351,7 @@ class Amplifier:
         self.playback.commit(wanted, token, now)
         if all(layer.renew for layer in layers):
             return
-        self.token, self.committed_at = token, now
+        self.token = token
         self._is_limited |= any(
             exceeds_full(self.playback, channel, now) for channel in self._channels
         )
@@ -357,6 +370,8 @@ class Amplifier:
         """Enter a state, and notify the listeners of a change."""
         if state == self.state:
             return
+        if self.state == _ENABLED:
+            self.clock.steer(0, moment)
         self.state = state
         event = {
             **{"state": STATES[state], "fault": FAULTS[self.fault], "latch": self.latch},

@@ -67,6 +67,8 @@ class HeldClock:
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
         self.is_alone = True
         """Whether it is held together with no other one."""
+        self.takes_marks = False
+        """Whether only readings of a Mark count, whose delay all on a line have in common."""
         self._said: set[ClockProblem] = set()
         self._rate = 0
         self._arrives = 0.0  # of the last request
@@ -95,16 +97,17 @@ class HeldClock:
         lead = self._fit.lead(time) + self._added_until(time)
         return math.remainder(lead, CLOCK_TURN)
 
-    def error(self, time: float) -> float:
+    def error(self, time: float, *, is_common: bool = False) -> float:
         """Return its error [s rms] against the host's, with what it states; infinite if unknown.
 
-        While armed with what is still to be led to zero.
+        While armed with what is still to be led to zero. is_common: against those of others whose
+        readings have the same errors.
         """
         if not (self.can_be_steered and self._fit) or self.problem(time) == "jumped":
             return math.inf
         lead = self.lead(time) if self._is_armed else 0.0
         stated = _ERROR.from_wire(self.stated) / math.sqrt(3)
-        return math.hypot(stated, self._fit.error(time), lead)
+        return math.hypot(stated, 0.0 if is_common else self._fit.error(time), lead)
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its readings [s]; infinite before the first."""
@@ -149,6 +152,7 @@ class HeldClock:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
         time = self._arrives if self._marked is None else self._marked
         time = min(time, received)
+        is_kept = self._marked is not None or not self.takes_marks
         self._marked = None
         is_armed = status["state"] == ENABLED
         has_left = self._is_armed and not is_armed and name not in ("Stop", "Disarm")
@@ -159,12 +163,13 @@ class HeldClock:
             self._forget(time)
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
-        self._read(status["clock"], time, received, is_told=is_armed and self._is_armed)
+        was_armed, self._is_armed = self._is_armed, is_armed
+        if is_kept or not self._fit:
+            self._read(status["clock"], time, received, is_told=is_armed and was_armed)
         if name == "Ping" and is_armed:
             self._run(values["rate"])
         elif not is_armed:
             self._run(0)
-        self._is_armed = is_armed
         self._watch(time)
 
     def _read(self, clock: int, time: float, received: float, *, is_told: bool) -> None:

@@ -8,6 +8,8 @@ from drivers.protocol.table import CLOCK_TURN
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
 """Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+AT_MOST = 1638
+"""Steps of the high word by which a Commit may name a moment ahead: 0.5 s."""
 _PER_SECOND = SPAN / CLOCK_TURN
 
 
@@ -19,6 +21,21 @@ def clock_at(seconds: float) -> int:
 def ahead(clock: int, of: int) -> float:
     """Return by how much [s] a clock is ahead of another, at most half a turn either way."""
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
+
+
+def at_behind(seconds: float) -> int:
+    """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
+    return high_word(clock_at(seconds) - 1) + 1 & 0xFFFF
+
+
+def moment_of(at: int, seconds: float) -> float | None:
+    """Return the moment [s] that a Commit names which is sent at a time; None for at once.
+
+    at: the high word of a clock of `clock_at`.
+    """
+    now = clock_at(seconds)
+    left = ((at << 16) - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AT_MOST << 16 else None
 
 
 def high_word(clock: int) -> int:

@@ -286,7 +286,7 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        self.clock.sent(name, values, arrives)
+        self.clock.sent(name, values, now, arrives)
         if name == "Hello":
             return
         feeding = self.feeding

@@ -13,7 +13,6 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier as FarEnd
-from virtual_loop import in_virtual_time
 from words_line import MemoryLine, grouped, layer, losing, tone
 
 

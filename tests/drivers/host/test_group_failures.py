@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -21,7 +22,9 @@ def altered(
 ) -> None:
     """Have a far end reply by a function of the request, its time, and what it does itself."""
     handle = far.handle
-    far.handle = lambda name, values, now: change(name, values, now, handle)  # type: ignore[method-assign]
+    far.handle = lambda name, values, now, **options: change(  # type: ignore[method-assign]
+        name, values, now, partial(handle, **options)
+    )
 
 
 @grouped(("a",), ("b",), wire="serial")

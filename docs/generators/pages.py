@@ -81,7 +81,10 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     },
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
-    "docs/reference/metrics.md": [part("docs/generators/metrics_page.py", metrics)],
+    "docs/reference/metrics.md": [
+        part("docs/generators/metrics_page.py", metrics),
+        *_parts("protocol_tables.py", TABLES["metrics"]),
+    ],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),

@@ -247,7 +247,7 @@ async def broadcasts(subject: Subject) -> None:
     await send_to_all("Stop", is_obeyed=True, ramp=0)
 
 
-@driving("protocol.md#set-the-address")
+@driving("protocol.md#messages")
 async def addresses(subject: Subject) -> None:
     """It takes a new address by its serial number while it is disarmed, and replies there alone."""
     subject.require("address")

@@ -55,7 +55,7 @@ _OTHERS: Mapping[str, Record] = {
 _MEANINGS = {
     **{"NOT_READY": "starting, replies if it can"},
     **{"SWITCH_ON_DISABLED": "**disarmed**, high voltage off"},
-    **{"READY_TO_SWITCH_ON": "passed through at once, or left out"},
+    **{"READY_TO_SWITCH_ON": "passed at once"},
     **{"SWITCHED_ON": "high voltage on, falling silent after a Disarm"},
     **{"OPERATION_ENABLED": "**armed**: plays, watchdog running"},
     **{"QUICK_STOP_ACTIVE": "**stopped**, latched; high voltage off once silent"},
@@ -74,7 +74,7 @@ _MEANINGS = {
     **{"UNSUPPORTED_VERSION": "of the frame: serial lines alone"},
     **{"WRONG_SESSION": "another's, or one that has ended"},
     **{"WRONG_LATCH": "Clear names another stop or fault than the last"},
-    **{"INCOMPLETE": "Commit of a set of which parts are missing"},
+    **{"INCOMPLETE": "of a set under Commit"},
     **{"output": "full level is a linear amplifier's output, not the stroke of a motion"},
     **{"events": "it sends Events on this wire"},
     **{"levels_measured": "the levels of Status are measured, not computed"},

@@ -68,7 +68,8 @@ class AdaptedAmplifier(Amplifier):
     def __init__(self, name: str, *, channels: int) -> None:
         super().__init__(name, channels=channels, is_output=True)
         self.identity = {**self.identity, "product": "adapter", "serial_number": name}
-        self.capabilities["features"] = 1 << FEATURES["output"] | 1 << FEATURES["events"]
+        features = (FEATURES[name] for name in ("output", "events", "mark"))
+        self.capabilities["features"] = sum(1 << bit for bit in features)
         self.device_levels = [1.0] * channels
         self.is_lost = True
 

@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import clock_at
+from drivers.protocol.clock import ahead, clock_at, high_word
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.sets import is_last, token_after
 from drivers.protocol.table import (
+    AHEAD_MAX,
     FAULTS,
     FEATURES,
     MESSAGES,
@@ -43,7 +44,7 @@ from sim.amplifier.readings import (
     measured,
     with_readings,
 )
-from sim.amplifier.set_intake import SetIntake, derated
+from sim.amplifier.set_intake import Layers, SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
@@ -111,6 +112,8 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
+        self._waiting: tuple[float, int, Layers] | None = None  # moment [s], token
+        self._marked: int | None = None  # clock of a Mark that no status has shown
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
@@ -129,6 +132,8 @@ class Amplifier:
     def next_event(self) -> float:
         """Time of the next event [s], until which what plays is known."""
         due = self.playback.next_due
+        if self._waiting is not None:
+            due = min(due, self._waiting[0])
         if self.state != _ENABLED:
             return min(due, self._silent_from if self.state in _ENDING else math.inf)
         hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
@@ -137,7 +142,9 @@ class Amplifier:
     def tick(self, now: float) -> None:
         """Process the events due by now, in order."""
         while (moment := self.next_event) <= now:
-            if moment == self.playback.next_due:
+            if self._waiting is not None and moment == self._waiting[0]:
+                self._start_waiting(moment)
+            elif moment == self.playback.next_due:
                 self.playback.advance(moment)
                 self._changed(moment)
             elif self.state == _ENABLED and moment == self._last_fed + self._watchdog:
@@ -152,11 +159,14 @@ class Amplifier:
             self.is_derated = False
 
     def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s].
+        """Return the values of the reply to a request at a time [s]; none to a part but the last.
 
         Raises Refusal, which means that nothing was applied.
         """
         self.tick(now)
+        if name == "Set" and not is_last(values):
+            self._keep(values, now)
+            return {}
         message, following = MESSAGES[name], TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
             raise Refusal(f"{name} must not come in state {self.state}", "WRONG_STATE")
@@ -180,6 +190,8 @@ class Amplifier:
             "limited": self._is_limited,
         }
         self._is_limited = False
+        clock = clock_at(now) if self._marked is None else self._marked
+        self._marked = None
         tokens = self.playback.tokens
         layers = self.capabilities["layers"]
         return with_readings(
@@ -188,7 +200,7 @@ class Amplifier:
                 "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
                 "latch": self.latch,
                 "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
-                "clock": clock_at(now),
+                "clock": clock,
                 **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
                 "levels": [_Q["level"].to_wire(level) for level in levels],
                 "tokens": [tokens.get(layer, 0) for layer in range(layers)],
@@ -271,7 +283,10 @@ class Amplifier:
             case "Commit":
                 layers = self._intake.commit(values["token"], now)
                 if layers is not None:
-                    self._play(layers, values["token"], now)
+                    self._start_waiting(now)
+                    self._play_when(layers, values, now)
+            case "Mark":
+                self._marked = clock_at(now)
             case "GetAchieved":
                 layer, count = values["layer"], self.capabilities["layers"]
                 if layer >= count:
@@ -317,23 +332,45 @@ class Amplifier:
             self.fault = "NONE"
             self._enter(following, now)
 
+    def _keep(self, part: Values, now: float) -> None:
+        """Keep a part of a set but the last, or drop it without a word."""
+        is_held = self.state == _ENABLED and part["session"] == self.session
+        if is_held and self._intake.keep(part, now):
+            self._last_fed = now
+
     def _take(self, part: Values, now: float) -> Values:
-        """Take a part of a set, and play it where it is whole and says so."""
+        """Take the last part of a set, and play it where it is whole and says so."""
         token = part["token"]
-        is_played = token == self._intake.committed
-        layers = None if is_played else self._intake.add(part, now)
-        if layers is not None and part["now"]:
+        taken = None if token == self._intake.committed else self._intake.take(part, now)
+        is_missing = isinstance(taken, int)
+        is_staged = not (taken is None or is_missing or part["now"])
+        if isinstance(taken, tuple) and part["now"]:
             self._intake.commit(token, now)
-            self._play(layers, token, now)
-            is_played = True
-        is_staged = layers is not None and not is_played
+            self._start_waiting(now)
+            self._play(taken, token, now)
         return {
-            **{"token": token, "exact": not self.is_derated},
-            **{"staged": is_staged, "played": is_played},
-            "missing": 0 if is_staged or is_played else self._intake.missing,
+            **{"token": token, "exact": not (is_missing or self.is_derated)},
+            **{"staged": is_staged, "played": not (is_missing or is_staged)},
+            "missing": taken if is_missing else 0,
         }
 
-    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+    def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
+        """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
+        clock = clock_at(now)
+        if 1 <= (commit["at"] - high_word(clock)) % (1 << 16) <= AHEAD_MAX:
+            moment = now + ahead(commit["at"] << 16, clock)
+            self._waiting = moment, commit["token"], layers
+        else:
+            self._play(layers, commit["token"], now)
+
+    def _start_waiting(self, moment: float) -> None:
+        """Play the set that waits for a moment, if there is one."""
+        if self._waiting is not None:
+            _, token, layers = self._waiting
+            self._waiting = None
+            self._play(layers, token, moment)
+
+    def _play(self, layers: Layers, token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(wanted, token, now)
         if all(layer.renew for layer in layers):
@@ -345,12 +382,13 @@ class Amplifier:
         self._changed(now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
-        """Silence every channel within the ramp [s], and discard what is staged."""
+        """Silence every channel within the ramp [s], and discard what is staged or waits."""
         self.playback.silence(moment, ramp)
         self._silent_from = max(self.playback.silent_from, moment)
         if self.state in ("SWITCHED_ON", _ENABLED):
             self._discharged_from = self._silent_from
         self._intake.drop()
+        self._waiting = None
         self._changed(moment)
 
     def _enter(self, state: str, moment: float, *, channel: int | None = None) -> None:

@@ -84,8 +84,17 @@ def _joined() -> list[LayerSet]:
     return [changed, begun, LayerSet(2, 10, 0), LayerSet(3, 0, 800, renew=True)]
 
 
-_JOINED = _joined()
-(_SET,) = parts(pack_layers(_JOINED), session=SESSION, token=TOKEN, now=False)
+def _parts() -> list[tuple[Values, Sequence[LayerSet]]]:
+    """Return the parts of the set, each with its layers: cut behind the first one."""
+    first, *others = _joined()
+    head = {"session": SESSION, "token": TOKEN, "parts": 2, "now": 0}
+    return [
+        ({**head, "index": index, "stream": pack_layers(layers)}, layers)
+        for index, layers in enumerate(([first], others))
+    ]
+
+
+_PARTS = _parts()
 _ARM = {"session": SESSION, "watchdog": 250, "shift": 0}
 _COMMIT = {"session": SESSION, "token": TOKEN, "at": high_word(clock_at(_NOW))}
 _STOP = {"ramp": 5}
@@ -150,7 +159,7 @@ def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
     (part,) = parts(pack_layers(_wire_set(layers)), session=SESSION, token=TOKEN - 1, now=True)
     exchange.amplifier.handle("Set", part, _NOW)
     for name in before:
-        exchange.request(name, _SET if name == "Set" else {})
+        exchange.request(name, {})
     return exchange
 
 
@@ -175,19 +184,23 @@ def _join(page: str) -> str:
     """Return the set and its commit."""
     number, before = _FIRST[page]
     exchange = _vibrating(_KINDS[page], number, *before.split())
-    frames = exchange.request("Set", _SET)
-    sent = [frame for frame in frames if frame.startswith(">")]
-    title = {
-        "serial": f"Set: {len(sent[0].split()) - 1} bytes",
-        "modbus": "Set: written, then its reply read",
-        "can": f"Set: {len(sent)} frames",
-    }
-    return _block({title[page]: frames, "Commit": exchange.request("Commit", _COMMIT)})
+    first, last = (exchange.request("Set", part) for part, _ in _PARTS)
+    if page == "modbus":
+        first = first[:2]  # its reply area need not be read
+    return _block(
+        {
+            "Set, part 0 of 2, without a reply": first,
+            "Set, part 1 of 2": last,
+            "Commit": exchange.request("Commit", _COMMIT),
+        }
+    )
 
 
 def _rtu() -> str:
     """Return the commit on Modbus RTU, and a broadcast."""
-    exchange = _vibrating("rtu", 65531, "GetCaps", "Set")
+    exchange = _vibrating("rtu", 65533, "GetCaps")
+    for part, _ in _PARTS:
+        exchange.amplifier.handle("Set", part, _NOW)
     return _block(
         {
             "The commit on RTU": exchange.request("Commit", _COMMIT),
@@ -325,23 +338,25 @@ def _in_lines(rows: Iterable[tuple[Sequence[int], str]]) -> Iterator[tuple[Seque
 
 def _join_words() -> str:
     """Return the words of the set, of its reply, of the commit and of the reply to that."""
-    amplifier = _vibrating("serial", 7).amplifier
-    taken, status = (
-        amplifier.handle(name, values, _NOW) for name, values in (("Set", _SET), ("Commit", _COMMIT))
-    )
-    shown = {
-        "Set": [*_fields(MESSAGES["Set"].request, _SET)],
-        "Taken": [*_fields(MESSAGES["Set"].reply, taken)],
-        "Commit": [*_fields(MESSAGES["Commit"].request, _COMMIT)],
-        "Status": [*_fields(MESSAGES["Commit"].reply, status)],
-    }
+    handle = _vibrating("serial", 7).amplifier.handle
     rows = list[tuple[Sequence[int], str]]()
-    for title, fields in shown.items():
-        (words, text), *others = _in_lines(fields)
-        rows += [(words, f"{title}: {text}"), *others]
-        if title == "Set":
-            rows += _stream(_JOINED)
-    return _words(rows)
+    for part, layers in _PARTS:
+        taken = handle("Set", part, _NOW)
+        rows += [*_titled("Set", MESSAGES["Set"].request, part), *_stream(layers)]
+    status = handle("Commit", _COMMIT, _NOW)
+    return _words(
+        [
+            *rows,
+            *_titled("Taken", MESSAGES["Set"].reply, taken),
+            *_titled("Commit", MESSAGES["Commit"].request, _COMMIT),
+            *_titled("Status", MESSAGES["Commit"].reply, status),
+        ]
+    )
+
+
+def _titled(title: str, record: Record, values: Values) -> list[tuple[Sequence[int], str]]:
+    (words, text), *others = _in_lines(_fields(record, values))
+    return [(words, f"{title}: {text}"), *others]
 
 
 BYTES: Mapping[str, Mapping[str, Callable[[], str]]] = {

@@ -14,7 +14,7 @@ from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_o
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
-from drivers.protocol.clock import HIGH_BITS, ahead
+from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from drivers.protocol.table import (
@@ -50,7 +50,7 @@ _ONLY_IN = {
 _NEVER: Interval = (-math.inf, math.inf)
 _NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
 """Refusals of a part by what it does not hold."""
-_MAX_AHEAD = AHEAD_MAX * CLOCK_TURN / (1 << HIGH_BITS)
+_MAX_AHEAD = AHEAD_MAX * HIGH_STEPS * CLOCK_TURN / SPAN  # s
 _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
 """A committed set: its moment, token and layers, and whether it plays to the word."""
 
@@ -300,7 +300,7 @@ class ExpectedAmplifier:
         if self._clock is None:
             return when[0], when[1] + _MAX_AHEAD
         clock, read = self._clock
-        left = ahead(at << HIGH_BITS, clock)
+        left = ahead(at * HIGH_STEPS, clock)
         drift = DRIFT * (when[1] - read[0] + _MAX_AHEAD)
         early, late = read[0] + left - drift, read[1] + left + drift
         if early > when[1] and late <= when[0] + _MAX_AHEAD:

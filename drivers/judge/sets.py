@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Assembly, LayerSet, is_last, is_newer_token, unpack_layers
+from drivers.protocol.sets import Assembly, LayerSet, is_newer_token, unpack_layers
 from drivers.protocol.table import STAGED_LIFE
 
 
@@ -90,9 +90,9 @@ class ExpectedSet:
     def refused(self, last: Values) -> None:
         """Note that a last part was refused, with its set where all others are there."""
         is_own = last["token"] == self._parts.token and not self.staged
-        if is_own and last["index"] < last["parts"] == self._parts.count:
-            if not isinstance(self._parts.whole(last), int):
-                self.drop()
+        is_one = last["index"] < last["parts"] == self._parts.count
+        if is_own and is_one and not isinstance(self._parts.whole(last), int):
+            self.drop()
 
     def _expire(self, when: Interval) -> None:
         """Drop what has expired by an interval."""

@@ -6,8 +6,9 @@ A voice of frequency word n has the angle n times clock modulo 2^32, in turns of
 from drivers.protocol.table import CLOCK_TURN
 
 SPAN = 1 << 32
+HIGH_STEPS = 1 << 16
+"""Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
 _PER_SECOND = SPAN / CLOCK_TURN
-_HIGH = 16  # bits below the high word
 
 
 def clock_at(seconds: float) -> int:
@@ -22,4 +23,4 @@ def ahead(clock: int, of: int) -> float:
 
 def high_word(clock: int) -> int:
     """Return the high word of a clock, as a Commit names a moment."""
-    return clock >> _HIGH
+    return clock // HIGH_STEPS

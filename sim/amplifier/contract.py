@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import ahead, clock_at, high_word
+from drivers.protocol.clock import high_word
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last, token_after
 from drivers.protocol.table import (
@@ -28,6 +28,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     VERSION,
 )
+from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.readings import (
     DERATE_ABOVE,
     DERATED,
@@ -56,6 +57,7 @@ _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
+_HIGH_WORDS = _Q["at"].maximum + 1
 
 
 class SensorPort(Protocol):
@@ -75,12 +77,20 @@ class Amplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: others hold
-    from the next restart. session: held while armed, or the one that ended last.
+    from the next restart. session: held while armed, or the one that ended last. clock: on which
+    phases count, by default without errors.
     """
 
     is_answering = True
 
-    def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        channels: int,
+        is_output: bool = False,
+        clock: AmplifierClock | None = None,
+    ) -> None:
         self.identity: Values = {
             **{"versions": 1 << VERSION, "vendor": "era-haptics", "product": "simulated amplifier"},
             **{"serial_number": f"SIM-{name}", "firmware": "1"},
@@ -94,7 +104,7 @@ class Amplifier:
         self._faults: deque[FaultRecord] = deque(maxlen=_FAULTS_KEPT)
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
-        self.committed_at = -math.inf  # s; see `token`
+        self.clock = AmplifierClock() if clock is None else clock
         self._sensing: SensorPort | None = None
         self._start()
 
@@ -112,12 +122,12 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
-        self._waiting: tuple[float, int, Layers] | None = None  # moment [s], token
+        self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
-        """Of the set since arming that changed last what plays, and began t; 0: none."""
+        """Of the set since arming that changed last what plays; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
@@ -190,7 +200,7 @@ class Amplifier:
             "limited": self._is_limited,
         }
         self._is_limited = False
-        clock = clock_at(now) if self._marked is None else self._marked
+        clock = self.clock.reading(now) if self._marked is None else self._marked
         self._marked = None
         tokens = self.playback.tokens
         layers = self.capabilities["layers"]
@@ -251,6 +261,7 @@ class Amplifier:
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
         self._start()
+        self.clock.restart(moment)
         if self._sensing is not None:
             self._sensing.forget()
         self._enter("SWITCH_ON_DISABLED", moment)
@@ -263,7 +274,7 @@ class Amplifier:
             case "GetFaults":
                 return fault_list(self._faults, now)
             case "Arm":
-                self._arm(values["session"], values["watchdog"], now)
+                self._arm(values, now)
             case "Disarm" | "Stop":
                 if name == "Stop":
                     self.latch = token_after(self.latch)
@@ -276,6 +287,11 @@ class Amplifier:
                     limit = self.capabilities["ramp_max"]
                     raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+            case "Ping" if self.state == _ENABLED:
+                self.clock.steer(values["rate"], now)
+                if self._waiting is not None:
+                    _, commit, layers = self._waiting
+                    self._waiting = self.clock.reaches(commit["at"], now), commit, layers
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -286,7 +302,7 @@ class Amplifier:
                     self._start_waiting(now)
                     self._play_when(layers, values, now)
             case "Mark":
-                self._marked = clock_at(now)
+                self._marked = self.clock.reading(now)
             case "GetAchieved":
                 layer, count = values["layer"], self.capabilities["layers"]
                 if layer >= count:
@@ -310,7 +326,8 @@ class Amplifier:
             return session != self.session
         return name == "Arm" and session == self.session
 
-    def _arm(self, session: int, watchdog: int, now: float) -> None:
+    def _arm(self, values: Values, now: float) -> None:
+        watchdog = values["watchdog"]
         low, high = self.capabilities["watchdog_min"], self.capabilities["watchdog_max"]
         if not low <= watchdog <= high:
             raise Refusal(f"watchdog must be {low} to {high}, got {watchdog}")
@@ -321,7 +338,8 @@ class Amplifier:
         self._silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
         self.token = 0
-        self.session = session
+        self.session = values["session"]
+        self.clock.shift(values["shift"])
         self._last_fed = now
         self._enter(_ENABLED, now)
 
@@ -356,26 +374,25 @@ class Amplifier:
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
-        clock = clock_at(now)
-        if 1 <= (commit["at"] - high_word(clock)) % (1 << 16) <= AHEAD_MAX:
-            moment = now + ahead(commit["at"] << 16, clock)
-            self._waiting = moment, commit["token"], layers
+        at = commit["at"]
+        if 1 <= (at - high_word(self.clock.reading(now))) % _HIGH_WORDS <= AHEAD_MAX:
+            self._waiting = self.clock.reaches(at, now), commit, layers
         else:
             self._play(layers, commit["token"], now)
 
     def _start_waiting(self, moment: float) -> None:
         """Play the set that waits for a moment, if there is one."""
         if self._waiting is not None:
-            _, token, layers = self._waiting
+            _, commit, layers = self._waiting
             self._waiting = None
-            self._play(layers, token, moment)
+            self._play(layers, commit["token"], moment)
 
     def _play(self, layers: Layers, token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(wanted, token, now)
         if all(layer.renew for layer in layers):
             return
-        self.token, self.committed_at = token, now
+        self.token = token
         self._is_limited |= any(
             exceeds_full(self.playback, channel, now) for channel in self._channels
         )
@@ -395,6 +412,8 @@ class Amplifier:
         """Enter a state, and notify the listeners of a change."""
         if state == self.state:
             return
+        if self.state == _ENABLED:
+            self.clock.steer(0, moment)
         self.state = state
         event = {
             **{"state": STATES[state], "fault": FAULTS[self.fault], "latch": self.latch},

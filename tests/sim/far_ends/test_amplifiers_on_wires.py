@@ -129,7 +129,7 @@ async def test_broadcast_commit_starts_all_at_one_moment(
                 await rig.group.amplifiers["east"].read_status()
             played = [layer((0, 100.0 + number, 0.1 * number))]
             await rig.group.apply({"east": played, "west": played})
-            origins = [one.outputs[0][-1].origin for one in rig.bench.amplifiers.values()]
+            origins = [one.outputs[0][-1].began for one in rig.bench.amplifiers.values()]
             assert abs(origins[0] - origins[1]) <= (0.005 if wire.kind == "modbus-tcp" else 0.0)
         await rig.group.disarm()
 

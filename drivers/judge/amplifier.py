@@ -14,12 +14,11 @@ from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_o
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
-from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from drivers.protocol.table import (
     AHEAD_MAX,
-    CLOCK_TURN,
     ENABLED,
     FAULTS,
     LATCHED,
@@ -50,7 +49,7 @@ _ONLY_IN = {
 _NEVER: Interval = (-math.inf, math.inf)
 _NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
 """Refusals of a part by what it does not hold."""
-_MAX_AHEAD = AHEAD_MAX * HIGH_STEPS * CLOCK_TURN / SPAN  # s
+_MAX_AHEAD = AHEAD_MAX * HIGH_TIME  # s
 _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
 """A committed set: its moment, token and layers, and whether it plays to the word."""
 
@@ -119,6 +118,11 @@ class ExpectedAmplifier:
             self.can = capabilities
             self._settle("what was not heard")
             self.outputs.forget()
+
+    @property
+    def present(self) -> int:
+        """The high word of the clock that was read last, which names no moment ahead."""
+        return high_word(self._clock[0]) if self._clock is not None else 0
 
     @property
     def is_enabled(self) -> bool:
@@ -504,9 +508,11 @@ class ExpectedAmplifier:
                 is_exact=outputs.is_exact,
                 can_scale=outputs.may_derate or not outputs.is_exact,
             )
-            lasting = outputs.lasting.get(number, {0})
-            if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
+            lasting = outputs.lasting.get(number, {0}) if reply["commands"] else {0}
+            if problem is None and reply["valid_for"] not in lasting:
                 problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
+            if problem is None and reply["ramp"] and not reply["commands"]:
+                problem = "plays", "ramp of a silent layer", 0, reply["ramp"]
         if problem is not None:
             rule, what, must, seen = problem
             report = self.report if reply["commands"] else self.report_silence

@@ -5,7 +5,6 @@ or later it may have begun, and a radius by which its first amplitude may differ
 any one clock; intervals are two times.
 """
 
-import math
 from collections.abc import Sequence
 from itertools import chain
 from typing import TypeAlias

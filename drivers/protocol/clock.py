@@ -8,6 +8,9 @@ from drivers.protocol.table import CLOCK_TURN
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
 """Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+HIGH_WORDS = SPAN // HIGH_STEPS
+HIGH_TIME = CLOCK_TURN / HIGH_WORDS
+"""Seconds of a step of the high word."""
 _PER_SECOND = SPAN / CLOCK_TURN
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import high_word
+from drivers.protocol.clock import HIGH_WORDS, high_word
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last, token_after
 from drivers.protocol.table import (
@@ -57,7 +57,6 @@ _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
-_HIGH_WORDS = _Q["at"].maximum + 1
 
 
 class SensorPort(Protocol):
@@ -168,10 +167,13 @@ class Amplifier:
         if self.is_derated and self._heat.at(now) < GOOD_BELOW:
             self.is_derated = False
 
-    def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s]; none to a part but the last.
+    def handle(
+        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
+    ) -> Values:
+        """Return the values of the reply to a request at a time [s].
 
-        Raises Refusal, which means that nothing was applied.
+        None to a broadcast, nor to a part of a set but the last. Raises Refusal, which means that
+        nothing was applied.
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
@@ -185,6 +187,8 @@ class Amplifier:
         reply = self._carry_out(name, values, following, now)
         if message.feeds and self.state == _ENABLED:
             self._last_fed = now
+        if is_broadcast:
+            return {}
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
 
@@ -375,7 +379,7 @@ class Amplifier:
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
         at = commit["at"]
-        if 1 <= (at - high_word(self.clock.reading(now))) % _HIGH_WORDS <= AHEAD_MAX:
+        if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
             self._waiting = self.clock.reaches(at, now), commit, layers
         else:
             self._play(layers, commit["token"], now)

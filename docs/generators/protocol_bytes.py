@@ -38,6 +38,7 @@ _BEFORE = ((0, 110.0, (0.22, 0.1)), (2, 150.0, (0.04, 0.2)), (3, 190.0, (0.07, 0
 _ONSET = (0.005, ((0.1, 90.0), (0.3, -0.01)))
 """Of the new tone on channel 0: step, knots."""
 
+
 def _integer(name: str, value: float) -> int:
     return QUANTITIES[name].to_wire(value)
 

@@ -85,6 +85,7 @@ def shown(page: str, title: str) -> list[str]:
 def listed_words() -> dict[str, list[int]]:
     """The words that protocol.md lists, by message: of the set those of its last part."""
     messages: dict[str, list[int]] = {}
+    name = ""
     for words, text in re.findall(
         r"^    ((?:[0-9A-F]{4} )+) +(.*)$", BYTES["protocol"]["join"](), re.MULTILINE
     ):

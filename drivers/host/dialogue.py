@@ -18,7 +18,7 @@ from drivers.errors import (
 )
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import JointStart, Priority
+from drivers.host.jobs import Make, Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -30,11 +30,13 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
+from drivers.protocol.clock import clock_at, high_word, moment_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
+from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
+from registry import clock
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -64,6 +66,19 @@ class Staged:
     is_exact: bool
     since: float
     until: float
+
+
+def commit_of(session: int, token: int, at: int | None) -> Make:
+    """Return a commit; at: high word of the clock when the set starts, None for the present one.
+
+    Which is at once: it has passed when the commit arrives.
+    """
+
+    def make() -> list[Values]:
+        present = high_word(clock_at(clock.now())) if at is None else at
+        return [{"session": session, "token": token, "at": present}]
+
+    return make
 
 
 class Dialogue:
@@ -160,7 +175,7 @@ class Dialogue:
             problem = f"a set with token {token} must be taken, got token {taken['token']}"
             # No refusal: all are stopped.
             raise FrameError(str(contradicted(self.name, problem)))
-        if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
+        if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
 
@@ -204,14 +219,15 @@ class Dialogue:
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         return delay, (admitted, stream)
 
-    def commit(self, token: int, *, start: JointStart | None = None) -> asyncio.Future[Values]:
+    def commit(self, token: int, at: int | None = None) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
 
-        start: together with the commits of other lines. Or raises Preempted where a stop or
-        disarm came first, CommandRefused where it is too late for what the ledger has admitted.
+        at: high word of the clock when it starts, None for at once. Or raises Preempted where a
+        stop or disarm came first, CommandRefused where it is too late for what the ledger has
+        admitted.
         """
-        values = {"session": self.session, "token": token, "at": 0}
-        return self.line.submit(self, Priority.SET, "Commit", values, start=start)
+        make = commit_of(self.session, token, at)
+        return self.line.submit(self, Priority.SET, "Commit", make)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -281,10 +297,11 @@ class Dialogue:
             self._admitted = None
             self.played_at = now if name == "Silence" else self.played_at
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
-            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
-            if name == "Commit" or is_last:
+            is_now = name == "Set" and values["now"] and is_last(values)
+            if name == "Commit" or is_now:
                 self.played_at = now
-                self._ledger.sent(admitted.token, admitted.layers, now)
+                starts = None if is_now else moment_of(values["at"], now)
+                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].

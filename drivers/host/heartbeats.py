@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
+from drivers.host.dialogue import commit_of
 from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
@@ -150,10 +151,10 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            values = {"session": session, "token": token, "at": 0}
+            messages = commit_of(session, token, None)()
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
-                each.next_request(request, values, Priority.SET)
-            return [values]
+                each.next_request(request, messages[0], Priority.SET)
+            return messages
 
         return make

@@ -3,7 +3,7 @@
 A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
 """
 
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.table import AHEAD_MAX, CLOCK_TURN
 
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
@@ -22,6 +22,21 @@ def clock_at(seconds: float) -> int:
 def ahead(clock: int, of: int) -> float:
     """Return by how much [s] a clock is ahead of another, at most half a turn either way."""
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
+
+
+def at_behind(seconds: float) -> int:
+    """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
+    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
+
+
+def moment_of(at: int, seconds: float) -> float | None:
+    """Return the moment [s] that a Commit names which is sent at a time; None for at once.
+
+    at: the high word of a clock of `clock_at`.
+    """
+    now = clock_at(seconds)
+    left = (at * HIGH_STEPS - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
 
 
 def high_word(clock: int) -> int:

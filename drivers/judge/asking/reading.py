@@ -32,6 +32,7 @@ from drivers.protocol.table import (
     REACTION,
     STATES,
     STATUS_FLAGS,
+    VERSION,
     has_flag,
     name_of,
 )
@@ -150,7 +151,7 @@ async def reading_changes_nothing(subject: Subject) -> None:
 async def hello_for_ever(subject: Subject) -> None:
     """It answers a Hello of any version and length, and no other version of anything else."""
     client = cast(SerialClient, subject.client)
-    for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
+    for payload, version in ((b"", VERSION), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
         shown = await client.hello(payload, version)
         expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
     for version in (0, 2, 3, 255):

@@ -118,9 +118,9 @@ async def test_broadcast_commit_starts_all_at_one_moment(
         loop, exchange = asyncio.get_running_loop(), rig.bench.exchange
         assert isinstance(loop, VirtualLoop)
 
-        def exchange_slowly(name: str, *request: Any, now: float) -> Any:
+        def exchange_slowly(name: str, *request: Any, now: float, is_broadcast: bool) -> Any:
             loop.now += 0.002
-            return exchange(name, *request, now=now)
+            return exchange(name, *request, now=now, is_broadcast=is_broadcast)
 
         monkeypatch.setattr(rig.bench, "exchange", exchange_slowly)
         await rig.group.arm()

@@ -1,4 +1,4 @@
-"""Sets in one exchange with the firmware, against docs/decisions/0088, by frames written by hand."""
+"""Sets in one exchange with the firmware, against docs/decisions/0088, by hand-written frames."""
 
 import struct
 from collections.abc import Sequence

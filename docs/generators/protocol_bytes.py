@@ -110,7 +110,7 @@ class _Exchange:
     def __init__(self, kind: str, number: int) -> None:
         self.amplifier = Amplifier("a", channels=4)
         self._lines: list[str] = []
-        self._is_can = kind == "can"
+        self._is_can, self._is_tcp = kind == "can", kind == "tcp"
         far = {1: self.amplifier}
         self._wire: Wire
         self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers
@@ -145,8 +145,11 @@ class _Exchange:
         frames = [(each.id, each.data) for each in unpack_frames(data)] if self._is_can else []
         for identifier, content in frames:
             self._lines.append(f"{direction} {identifier:03X} {content.hex(' ').upper()}")
-        if not self._is_can:
-            self._lines.append(f"{direction} {data.hex(' ').upper()}")
+        while data and not self._is_can:
+            # Over TCP several may go out together: each says how many bytes follow the sixth.
+            size = 6 + int.from_bytes(data[4:6], "big") if self._is_tcp else len(data)
+            self._lines.append(f"{direction} {data[:size].hex(' ').upper()}")
+            data = data[size:]
 
 
 def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
@@ -186,8 +189,6 @@ def _join(page: str) -> str:
     number, before = _FIRST[page]
     exchange = _vibrating(_KINDS[page], number, *before.split())
     first, last = (exchange.request("Set", part) for part, _ in _PARTS)
-    if page == "modbus":
-        first = first[:2]  # its reply area need not be read
     return _block(
         {
             "Set, part 0 of 2, without a reply": first,

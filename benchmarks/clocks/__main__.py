@@ -68,6 +68,7 @@ async def taps(lines: Lines3, seed: int, names: tuple[str, ...]) -> list[tuple[f
 
 def _starts(session: Session, since: float) -> list[float]:
     """When each amplifier began to play what it plays [s]; none before a time."""
+    session.far.bench.advance(clock.now())
     return [
         min(begun)
         for each in session.far.bench.amplifiers.values()

@@ -8,19 +8,14 @@ crystal's and leads the rest to zero: soon while nothing plays, else within what
 clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
 """
 
-import logging
 import math
-from typing import Literal
 
 from drivers.host.clock_fit import ClockFit
+from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, ahead, clock_at
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
-SETTLING = 3.0
-"""Seconds within which a clock must follow, and for which one that has jumped is not trusted."""
-MAX_RATE = 2e-4
-"""Of a crystal against the host's; one that is faster or slower is broken."""
 _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _SILENT = 0.2, 3e-3  # longer than a Ping is late
@@ -28,39 +23,15 @@ _COMMON = 0.2  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
 _SLACK = 50e-6  # s; what is computed of bits and read of clocks, at the most
-_logger = logging.getLogger(__name__)
-
-ClockProblem = Literal["not_steered", "jumped", "crystal", "unsettled"]
-
-PROBLEMS: dict[ClockProblem, tuple[str, str]] = {
-    "not_steered": (
-        "its clock cannot be steered: what its ERAs play is not held to the other amplifiers",
-        "none is needed for a plate on one amplifier; else update its firmware, or exchange it",
-    ),
-    "jumped": (
-        "its clock jumps, stands still, or is read wrong by more than it states",
-        "check its clock and clock_error (era amp conformance); the promise is lowered meanwhile",
-    ),
-    "crystal": (
-        f"its clock runs more than {MAX_RATE * 1e6:g} ppm too fast or too slow",
-        "check its crystal and what it counts; the promise is lowered meanwhile",
-    ),
-    "unsettled": (
-        f"its clock does not follow the host within {SETTLING:g} s",
-        "check its rate and shift (era amp conformance); the promise is lowered meanwhile",
-    ),
-}
-"""Cause and remedy of what ails a clock, by kind."""
 
 
 class HeldClock:
-    """The clock of an amplifier of a name, by its messages; times [s] are of the host's clock.
+    """The clock of an amplifier, by its messages; times [s] are of the host's clock.
 
     stated: its `clock_error` as of the wire, known once it is identified.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self) -> None:
         self.stated = CLOCK_UNKNOWN
         self.shortest = math.inf
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
@@ -68,7 +39,6 @@ class HeldClock:
         """Whether it is held together with no other one."""
         self.takes_marks = False
         """Whether only readings of a Mark count, whose delay all on a line have in common."""
-        self._said: set[ClockProblem] = set()
         self._rate = 0
         self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
         self._mark: tuple[float, float] | None = None
@@ -102,7 +72,7 @@ class HeldClock:
         While armed with what is still to be led to zero. is_common: against those of others whose
         readings have the same errors.
         """
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "jumped":
+        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return math.inf
         lead = self.lead(time) if self._is_armed else 0.0
         stated = _ERROR.from_wire(self.stated) / math.sqrt(3)
@@ -116,12 +86,12 @@ class HeldClock:
     def problem(self, time: float) -> ClockProblem | None:
         """Return what ails it at a time [s]; None if nothing."""
         if not self.can_be_steered:
-            return "not_steered"
-        if time - self._jumped_at < SETTLING:
-            return "jumped"
-        if self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_RATE:
-            return "crystal"
-        return "unsettled" if time - self._led_from > SETTLING else None
+            return None if self.is_alone else "clock_not_steered"
+        if time - self._jumped_at < CLOCK_SETTLING:
+            return "clock_jumped"
+        if self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_CLOCK_RATE:
+            return "clock_rate"
+        return "clock_unsettled" if time - self._led_from > CLOCK_SETTLING else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -131,7 +101,7 @@ class HeldClock:
 
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "jumped":
+        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return self._rate
         within, most = _PLAYING if is_playing else _SILENT
         rate = min(max(-self.lead(time) / within, -most), most) - self._fit.rate
@@ -183,7 +153,7 @@ class HeldClock:
         expected = self._fit.lead(time) + added if self._fit else 0.0
         lead = expected + ahead(clock, clock_at(time + expected)) - added
         slack = _SLACK + (_ERROR.from_wire(self.stated) if self.can_be_steered else 0.0)
-        drift = 2 * MAX_RATE * (time - self._bounded_at)
+        drift = 2 * MAX_CLOCK_RATE * (time - self._bounded_at)
         lowest = max(self._low - drift, lead - later - slack)
         highest = min(self._high + drift, lead + earlier + slack)
         has_jumped = lowest > highest
@@ -207,16 +177,9 @@ class HeldClock:
             self._rate = rate
 
     def _watch(self, time: float) -> None:
-        """Note if it follows, and say once what ails it."""
+        """Note since when it does not follow."""
         least, errors = _UNSETTLED
         if not self._is_armed or abs(self.lead(time)) <= max(least, errors * self.scatter(time)):
             self._led_from = math.inf
         else:
             self._led_from = min(self._led_from, time)
-        problem = self.problem(time)
-        if self.is_alone and problem == "not_steered":
-            return
-        if problem is not None and problem not in self._said:
-            self._said.add(problem)
-            cause, remedy = PROBLEMS[problem]
-            _logger.warning("amplifier %s: %s", self._name, cause, extra={"remedy": remedy})

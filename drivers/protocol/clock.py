@@ -26,7 +26,7 @@ def ahead(clock: int, of: int) -> float:
 
 def at_behind(seconds: float) -> int:
     """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
-    return high_word(clock_at(seconds) - 1) + 1 & 0xFFFF
+    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
 
 
 def moment_of(at: int, seconds: float) -> float | None:
@@ -35,8 +35,8 @@ def moment_of(at: int, seconds: float) -> float | None:
     at: the high word of a clock of `clock_at`.
     """
     now = clock_at(seconds)
-    left = ((at << 16) - now) % SPAN
-    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX << 16 else None
+    left = (at * HIGH_STEPS - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
 
 
 def high_word(clock: int) -> int:

@@ -180,8 +180,8 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
         ],
     }
     handle = far.handle
-    far.handle = lambda name, given, now: (  # type: ignore[method-assign]
-        values if name == "GetMeasured" else handle(name, given, now)
+    far.handle = lambda name, given, now, **options: (  # type: ignore[method-assign]
+        values if name == "GetMeasured" else handle(name, given, now, **options)
     )
     await host.open()
     assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]

@@ -370,10 +370,14 @@ class ExpectedAmplifier:
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
         self._note_clock(shown["clock"], when)
-        if self._waiting is None or when[1] < self._waiting[0][0] - self.slack:
+        if not self.may_start(when):
             self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
+
+    def may_start(self, when: Interval) -> bool:
+        """Whether a set that waits may have started by the end of an interval."""
+        return self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
 
     def _note_clock(self, clock: int, when: Interval) -> None:
         """Note the clock that a status shows, or compare it with that of a Mark before it."""
@@ -504,8 +508,7 @@ class ExpectedAmplifier:
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
         outputs = self.outputs
-        is_starting = self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
-        if is_starting or not (sure := outputs.sure(when)):
+        if self.may_start(when) or not (sure := outputs.sure(when)):
             return
         possible = outputs.tokens_of(number, sure)
         problem: Problem | None = None

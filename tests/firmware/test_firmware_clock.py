@@ -148,7 +148,11 @@ def test_voices_count_on_the_clock(rate: int, built: Path) -> None:
     """
     firmware = MovedFirmware(built)
     firmware.receive(SERIAL, arm(65535))
-    plays = [(0.0001, (333.35, 0.3, 0.0)), (0.01713, (100.0, 0.5, 90.0)), (0.0331, (333.35, 0.4, -45.0))]
+    plays = [
+        (0.0001, (333.35, 0.3, 0.0)),
+        (0.01713, (100.0, 0.5, 90.0)),
+        (0.0331, (333.35, 0.4, -45.0)),
+    ]
     for token, (time, tone) in enumerate(plays, 1):
         firmware.move(time)
         firmware.receive(SERIAL, apply(token, hand.tone(0, *tone)))

@@ -128,6 +128,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         rim=CENTRE_AND_RIM,
         threshold=table.thresholds,
         error=table.error_power,
+        shares=table.attached.power_shares,
         frequencies=table.frequencies,
     )
     return plates_structure(table.on_eras), given_raster(table), rules, {}

@@ -19,7 +19,7 @@ typedef struct {
     phases phases;
     method one_finger, several, within[3];
     const int *rim;
-    const float *threshold, *error, *frequencies; /* (f); (f, n); (f) [Hz] */
+    const float *threshold, *error, *shares, *frequencies; /* (f); (f, n); (f, n, n) or NULL, as of `grouped`; (f) [Hz] */
 } rules;
 
 /* Fingers (k) and contents, as given. */

@@ -17,9 +17,13 @@ from model.ensemble.draws import Draws, standard_normal
 from model.errors import InputError
 from model.rig.rig import Channel
 
-MAX_COUNTED = 0.01
-"""Error of a clock [s] beyond which it is as good as unknown: a period of 100 Hz."""
+MAX_HELD = 0.0003
+"""Error of a clock [s] up to which its amplifier plays contents together with others.
 
+Of 12 identified ERAs on three amplifiers, those of one alone promise more beyond it.
+"""
+
+_AS_GOOD_AS_UNKNOWN = 0.01  # s; a period of 100 Hz
 _MAX_VARIANCE = 4.0  # of a phase [rad²]; more is no phase at all
 
 
@@ -61,7 +65,7 @@ class ClockErrors:
 
         Empty where all are held together. One content plays on the ERAs of one group only.
         """
-        alone = [number for number, each in enumerate(self.errors) if each > MAX_COUNTED]
+        alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
         if not alone:
             return ()
         held = [number for number in range(len(self.errors)) if number not in alone]
@@ -92,15 +96,13 @@ EXACT_CLOCKS = ClockErrors()
 
 
 def _phases(clocks: ClockErrors, frequencies: FloatArray) -> FloatArray:
-    """Phases by the errors of all amplifiers, (f, a) [rad], at most those of MAX_COUNTED."""
-    errors = np.minimum(clocks.errors, MAX_COUNTED)
+    """Phases by the errors of all amplifiers, (f, a) [rad], an unknown one any."""
+    errors = np.minimum(clocks.errors, _AS_GOOD_AS_UNKNOWN)
     return np.asarray(2 * math.pi * np.multiply.outer(frequencies, errors))
 
 
 @lru_cache(maxsize=64)
-def delayed(
-    draws: Draws, clocks: ClockErrors, frequencies: tuple[float, ...], seed: int
-) -> Draws:
+def delayed(draws: Draws, clocks: ClockErrors, frequencies: tuple[float, ...], seed: int) -> Draws:
     """Drawn plates whose amplifiers' clocks are off, too, with gains at each frequency.
 
     frequencies (f,) [Hz]. The plates are the same otherwise.

@@ -38,8 +38,8 @@ class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
     loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
-    masses, load of each finger; gains (1, a, d): relative change of each ERA's, complex, or (f, a, d)
-    at f frequencies; errors (k, d): of discretisation at each finger, complex of mean square 1;
+    masses, load of each finger; gains (1, a, d): relative change of each ERA's, complex, or (f, a,
+    d) at f frequencies; errors (k, d): of discretisation at each finger, complex of mean square 1;
     node (d,): which of the thicknesses each has.
     """
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.protocol.sets import Assembly, unpack_layers
-from drivers.protocol.table import MAX_WORDS, MESSAGES, read_request
+from drivers.protocol.sets import Assembly, is_last, unpack_layers
+from drivers.protocol.table import MESSAGES, read_request
 from drivers.wires.serial_line.frames import Frame, FrameReader, frame_length, unpack_words
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
@@ -133,8 +133,11 @@ class _Device:
         _, values = read_request(frame.kind, unpack_words(frame.payload))
         token = values["token"]
         if frame.kind == _SET:
-            stream = self._assembly.add(values, now, MAX_WORDS * values["parts"])
-            if stream is None:
+            if not is_last(values):
+                self._assembly.keep(values, now)
+                return
+            stream = self._assembly.whole(values)
+            if isinstance(stream, int):
                 return
             driven = (
                 each.layer

@@ -15,6 +15,7 @@ from drivers.playing.playback import Voice
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
+from sim.amplifier.clock import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.loaded_plates import Placement
@@ -35,12 +36,17 @@ class _Part(Bench):
         self.is_heard = is_heard
         self.owners: Mapping[int, int] = {}
 
-    def _motion(self, index: int, playing: Sequence[Voice]) -> Any:
+    def _motion(self, index: int, playing: Sequence[Voice], clock: StraightClock) -> Any:
         errors, terms = self._errors[index], []
         for voice in playing:
             if self.is_heard(self.owners.get(voice.layer)):
                 threshold = float(detection_threshold(np.array([voice.frequency]))[0])
-                motion = motion_of([voice], stroke=self.rig.eras[index].stroke)
+                motion = motion_of(
+                    [voice],
+                    clock,
+                    stroke=self.rig.eras[index].stroke,
+                    delay=self._delays[index],
+                )
                 terms += realised(motion, replace(errors, gain=errors.gain / threshold))
         return tuple(terms)
 
@@ -58,9 +64,9 @@ class Log:
         """Note the voices of a bench from now on, and its fingers, with the plate under them."""
         apply, place = bench._apply, bench._place
 
-        def applied(index: int, playing: tuple[Voice, ...]) -> None:
-            self.steps.append((bench.time, lambda part: part._apply(index, playing)))
-            apply(index, playing)
+        def applied(index: int, playing: tuple[Voice, ...], clock: StraightClock) -> None:
+            self.steps.append((bench.time, lambda part: part._apply(index, playing, clock)))
+            apply(index, playing, clock)
 
         def placed(placement: Placement) -> None:
             self.steps.append((placement.time, lambda part: part._place(placement)))

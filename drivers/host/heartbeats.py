@@ -14,6 +14,8 @@ from typing import TypeAlias
 
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
+from drivers.host.clocks import Clocks
+from drivers.host.dialogue import commit_of
 from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
@@ -34,8 +36,11 @@ Feed: TypeAlias = Callable[[], Awaitable[object]]
 class Heartbeats:
     """Feeds the watchdogs of a group. restored: called where one that was mute replies again."""
 
-    def __init__(self, members: Members, sets: JointSets, restored: Callable[[], None]) -> None:
+    def __init__(
+        self, members: Members, sets: JointSets, clocks: Clocks, restored: Callable[[], None]
+    ) -> None:
         self._members, self._sets, self._restored = members, sets, restored
+        self._clocks = clocks
         self._running_due: dict[Amplifier, float] = {}  # statuses just before a heartbeat
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
 
@@ -63,6 +68,8 @@ class Heartbeats:
                 mute.add(each.line)
         feeds: list[tuple[float, Feed]] = []
         for line, of_line in by_line.items():
+            if line not in mute:
+                self._clocks.look(line, of_line)
             feeds += self._feeds(line, of_line, may_read=line not in mute)
         feeds.sort(key=itemgetter(0))
         return self._members.all([feed() for _, feed in feeds])
@@ -150,10 +157,10 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            values = {"session": session, "token": token, "at": 0}
+            messages = commit_of(session, token, None)()
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
-                each.next_request(request, values, Priority.SET)
-            return [values]
+                each.next_request(request, messages[0], Priority.SET)
+            return messages
 
         return make

@@ -9,84 +9,12 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from operator import itemgetter
-from typing import Protocol, TypeAlias, final
+from typing import Protocol, TypeAlias
 
 from drivers.counters import LinkStatistics
-from drivers.errors import CommandRefused, Preempted
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
 from drivers.wires.wire import Event, OtherHost, Several
-
-_SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
-
-Release: TypeAlias = Callable[[Exception | None], None]
-"""Sends a commit that was held, or fails it with an error."""
-
-
-@final
-class JointStart:
-    """Where so many lines wait, each free for its commit; the slowest one sends first.
-
-    until: latest time [s] at which the commits must arrive. Where one cannot send, none does that
-    has not sent before.
-    """
-
-    def __init__(self, count: int, until: float) -> None:
-        self._count, self._until = count, until
-        self._ready: list[tuple[float, Release]] = []  # how long each takes to arrive
-        self._failure: Exception | None = None
-        self._arrival = 0.0
-        self._looked_at = 0.0
-        self._loop = asyncio.get_running_loop()
-        self._timer = self._loop.call_at(until, self._give_up)
-
-    def arrive(self, takes: float, release: Release) -> None:
-        """Note that a line is free for a commit, which takes a time [s] to arrive.
-
-        release: called once; calls `fail` where that does not succeed.
-        """
-        self._ready.append((takes, release))
-        if self._failure is not None:
-            self._keep_back(self._failure)
-        elif len(self._ready) == self._count:
-            self._ready.sort(key=itemgetter(0))
-            self._arrival = self._loop.time() + self._ready[-1][0]
-            if self._arrival > self._until:
-                self._give_up()
-                return
-            self._timer.cancel()
-            self._loop.call_soon(self._send_due)  # none behind the pump of the line that came last
-
-    def fail(self, error: Exception) -> None:
-        """Note that one will not be sent: those that were not sent yet are not sent either."""
-        self._keep_back(Preempted(f"one of several commits failed: {error}"))
-
-    def _give_up(self) -> None:
-        text = "commits must be sent together; one of the lines is too busy"
-        self._keep_back(CommandRefused(text, until=self._loop.time()))
-
-    def _keep_back(self, error: Exception) -> None:
-        """Send none that waits or comes later: each fails with the first error of them."""
-        self._timer.cancel()
-        self._failure = self._failure or error
-        ready, self._ready = self._ready, []
-        for _, release in ready:
-            release(self._failure)
-
-    def _send_due(self) -> None:
-        now = self._loop.time()
-        while self._ready and self._arrival - self._ready[-1][0] <= now:
-            self._ready.pop()[1](None)
-        if not self._ready:
-            return
-        due = self._arrival - self._ready[-1][0]
-        if now == self._looked_at or due - now > 2 * _SLACK:  # virtual time: its timers are exact
-            self._loop.call_at(due if now == self._looked_at else due - _SLACK, self._send_due)
-        else:
-            self._loop.call_soon(self._send_due)
-        self._looked_at = now
-
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 
@@ -147,9 +75,9 @@ class Member(Protocol):
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    values: of the message on the line, or next. make: until its turn has come; parts: what it made
-    that has no reply yet. attempts: left. start: of a commit that goes out together
-    with those of other lines, until it was sent: is_held for them, then is_released. started_at
+    values: of the message on the line, or next. make: until its turn has come; parts: the messages
+    that it made, the last of which is replied to; part: number of the one on the line, or next.
+    reached: the first part that was missing when the last reply came. attempts: left. started_at
     [s]: when it went out behind what was sent before. longer: than on a fast wire its reply may
     take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
     attempt.
@@ -163,11 +91,10 @@ class Job:
     queued_at: float
     result: "asyncio.Future[Values]"
     make: Make | None = None
-    start: JointStart | None = None
     parts: Sequence[Values] = ()
+    part: int = 0
+    reached: int = 0
     attempts: int = ATTEMPTS
-    is_held: bool = False
-    is_released: bool = False
     not_before: float = 0.0
     sent_at: float = 0.0
     started_at: float = 0.0
@@ -176,6 +103,29 @@ class Job:
     delays: int = 0
     is_last_look: bool = False
     had_no_reply: bool = False
+
+    @property
+    def has_further_parts(self) -> bool:
+        """Whether the message on the line is no last part, and so has no reply."""
+        return self.part < len(self.parts) - 1
+
+    def go_to(self, part: int) -> None:
+        """Go on with a part of its set."""
+        self.part, self.values = part, self.parts[part]
+
+    def reach(self, part: int) -> None:
+        """Note that all before a part have arrived: one that is farther than ever begins anew."""
+        if part > self.reached:
+            self.reached, self.attempts = part, ATTEMPTS
+
+    def is_missing(self, taken: Values) -> bool:
+        """Go back to the first part that a reply to the last says is missing; False if none is."""
+        missing = taken["missing"]
+        if taken["staged"] or taken["played"] or missing >= self.part:
+            return False
+        self.go_to(missing)
+        self.reach(missing)
+        return True
 
     @property
     def is_stop_class(self) -> bool:
@@ -212,16 +162,16 @@ class JobQueue:
         self._had_waited = job.has_waited(now)
 
     def _rank(self, job: Job, now: float) -> tuple[int, int]:
-        """Place at a time [s]: a commit held for other lines goes before heartbeats and sets.
-
-        Of those that have waited for long one goes before a heartbeat that waits, not several.
-        """
-        if job.is_held and job.priority > Priority.HEARTBEAT:
-            return Priority.HEARTBEAT, 0
+        """Place at a time [s]: of those that have waited for long one before a heartbeat."""
         if job.has_waited(now):
             return Priority.HEARTBEAT, 2 if self._had_waited else 1
         is_reading = job.priority is Priority.READING
         return job.priority if is_reading else min(job.priority, Priority.ARM), 1
+
+    def has_before(self, job: Job, now: float) -> bool:
+        """Whether a job that waits goes before another one at a time [s]."""
+        first = self.next(now) if self.jobs else None
+        return first is not None and self._rank(first, now) < self._rank(job, now)
 
     def next(self, now: float) -> Job | None:
         """Return the job whose turn it is; None while all pause, or a stop does."""

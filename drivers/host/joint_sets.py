@@ -1,6 +1,7 @@
 """What amplifiers play together: a set is staged on all that it names, then committed on them.
 
-At one moment on all, or on none. A token is newer than another by less than half of 2^16 (RFC
+At one moment on all, or on none: by one broadcast on a line that they share, on several lines at a
+moment that is ahead for the slowest. On one alone it plays with its last part. A token is newer than another by less than half of 2^16 (RFC
 1982): an amplifier that was left out of 40 000 sets would take the next one for an older one. It
 commits one that changes nothing before.
 """
@@ -8,25 +9,27 @@ commits one that changes nothing before.
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged
-from drivers.host.jobs import JointStart, Priority
+from drivers.host.dialogue import Staged, commit_of
+from drivers.host.jobs import Make, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
+from drivers.protocol.clock import at_behind
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
-from drivers.protocol.table import LATCHED, STATES, name_of
+from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
 from drivers.protocol.timing import STOP_RAMP
+from registry import clock
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
 _MAX_GAP = 1 << 14
 _SPAN = 1 << 16
+_COMMIT_WORDS = MESSAGES["Commit"].request.words
 
 
 @dataclass(frozen=True)
@@ -73,39 +76,36 @@ class JointSets:
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
-        is_silent = all(map(is_silence, layers.values()))
+        is_now = len(layers) == 1 or all(map(is_silence, layers.values()))
+        began = clock.now()
         amplifiers: list[Amplifier] = []
         staging: list[Awaitable[Staged]] = []
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                staging.append(each.stage(token, layers[each.name], now=is_silent))
+                staging.append(each.stage(token, layers[each.name], now=is_now))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
-        has_failed = is_silent
+        has_failed = is_now and len(layers) > 1
         for each, result in zip(amplifiers, results, strict=True):
-            if isinstance(result, CommandRefused) and not result.is_disarmed:
+            if isinstance(result, CommandRefused) and not (result.is_disarmed or result.may_play):
                 if not isinstance(result, Preempted):
                     refusals[each.name] = result
             elif isinstance(result, BaseException):
                 has_failed = True
         if refusals and not has_failed:
-            return _merged(refusals)
+            refusal = _merged(refusals)
+            return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
-        if not is_silent:
+        if not is_now:
             self._members.check_none_since(before)
-            self.is_incomplete = len(layers) > 1
+            self.is_incomplete = True
             try:
                 await self._commit(staged)
             except CommandRefused as refusal:
                 if refusal.until is None or self._members.epoch != before:
                     raise
-                # Too late for what the ledgers have admitted.
-                if any(each.played_at >= one.since for each, one in staged.items()):
-                    await self.silence(STOP_RAMP)
-                    return Preempted(str(refusal))
-                self.is_incomplete = False
-                return refusal
+                return await self._silenced(refusal, amplifiers, began)
         self.is_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
@@ -119,6 +119,17 @@ class JointSets:
             played.update(zip(reading, achieved, strict=True))
         return Played(token, played, sent_at)
 
+    async def _silenced(
+        self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
+    ) -> CommandRefused:
+        """Silence a set that may play on some since a time [s], too late for others; why it ended."""
+        has_played = any(each.played_at >= began for each in amplifiers)
+        self.is_incomplete = False
+        if refusal.until is None or not has_played:
+            return refusal
+        await self.silence(STOP_RAMP)
+        return Preempted(str(refusal))
+
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
         # On a line that they share none waits for one that does not reply: that comes last.
@@ -128,24 +139,24 @@ class JointSets:
         self.is_incomplete = False
 
     async def _commit(self, staged: Mapping[Amplifier, Staged]) -> None:
-        """Commit on every line at one moment, by one broadcast where amplifiers share it.
+        """Commit on every line for one moment, by one broadcast where amplifiers share it.
 
         Raises CommandRefused where one does not play its set then.
         """
-        token, until = self.token, math.inf
         by_line: dict[Line, list[Amplifier]] = {}
-        for each, one in staged.items():
+        for each in staged:
             by_line.setdefault(each.line, []).append(each)
-            until = min(until, one.until)
-        start = JointStart(len(by_line), until=until) if len(by_line) > 1 else None
+        token, at = self.token, None
+        if len(by_line) > 1:
+            at = at_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
             if len(sharing) == 1:
-                requests[sharing[0]] = sharing[0].commit(token, start=start)
+                requests[sharing[0]] = sharing[0].commit(token, at)
                 continue
-            make = partial(_commit_of, sharing, token)
-            broadcasts.append(line.submit(None, Priority.SET, "Commit", make, start=start))
+            make = _commit_of(sharing, token, at)
+            broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
         # With the broadcasts: one that waits is not sent where this is given up.
@@ -177,12 +188,16 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
-def _commit_of(several: Sequence[Amplifier], token: int) -> list[Values]:
-    """Return the commit of all amplifiers of a line; raises unless each may have it now."""
-    values = {"session": several[0].session, "token": token, "at": 0}
-    for amplifier in several:
-        amplifier.next_request("Commit", values, Priority.SET)
-    return [values]
+def _commit_of(several: Sequence[Amplifier], token: int, at: int | None) -> Make:
+    """Return the commit of all amplifiers of a line; it raises unless each may have it then."""
+
+    def make() -> list[Values]:
+        messages = commit_of(several[0].session, token, at)()
+        for amplifier in several:
+            amplifier.next_request("Commit", messages[0], Priority.SET)
+        return messages
+
+    return make
 
 
 async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:

@@ -32,6 +32,7 @@ from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_START_ERROR = 0.001  # s; of a moment at which a set starts
 _STEPS = 2  # of levels, by which a status may differ
 _MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, relative to a weak level
@@ -71,6 +72,7 @@ class Ledger:
         # Which fades the amplifier cuts short depends on when it plays: for upper bounds, none.
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
+        self._starts = -math.inf  # s; the moment that the last commit named
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""
         self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
@@ -106,16 +108,19 @@ class Ledger:
             _logger.exception("a set could not be checked")
             raise CommandRefused(f"a set could not be checked: {error!r}; silence it") from error
 
-    def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
+    def sent(
+        self, token: int, layers: tuple[LayerSet, ...], now: float, *, starts: float | None = None
+    ) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt.
 
-        Again, where its commit is repeated: it may have played since the first time, also where a
+        starts: the moment [s] that its commit names, None for at once. Again, where its commit is repeated: it may have played since the first time, also where a
         status said that it did not, which may have overtaken the commit.
         """
         if self.doubt is not None and self.doubt.token == token:
             return
         if self._first_sent[0] != token:
-            self._first_sent = token, now
+            self._first_sent = token, now if starts is None else starts
+            self._starts = -math.inf if starts is None else starts
         before: Vibration | None = None
         if is_vibrating(*layers):
             lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
@@ -137,7 +142,7 @@ class Ledger:
         playback = self.playback
         if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
-        self.lag = playback.uncertainty = max(self.lag, now - sent_at)
+        self.lag = playback.uncertainty = max(self.lag, abs(now - sent_at))
         if playback.next_due - 2 * self.lag <= now:
             for one in layers:
                 ends = playback.end_of(one.layer)
@@ -173,6 +178,8 @@ class Ledger:
         from above alone: their commit is known as an interval.
         """
         playback = self.playback
+        if sent_at < self._starts + _START_ERROR:  # it may show what played before
+            return None
         if now - self.lag >= playback.changes_at:
             playback.advance(now - self.lag)
         if len(status["levels"]) != playback.channels:

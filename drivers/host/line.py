@@ -2,7 +2,8 @@
 
 The pump is a function, called by whoever submits, receives or is the timer; nothing waits for a
 turn in a task of its own. A request is made when its turn has come, so that it is checked once,
-against what really went out before. Times [s] are of the event loop's clock.
+against what really went out before. The parts of a set go out without a pause, and the last alone
+is replied to, and repeated. Times [s] are of the event loop's clock.
 """
 
 import asyncio
@@ -13,16 +14,28 @@ from functools import partial
 from drivers import trace
 from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.failures import no_reply, refused_by_amplifier
-from drivers.host.jobs import Job, JobQueue, JointStart, Make, Member, Priority
+from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
 from drivers.protocol.table import BROADCAST
 from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.trace import Direction
-from drivers.wires.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
+from drivers.wires.wire import (
+    Broken,
+    Event,
+    More,
+    Nak,
+    OtherHost,
+    Reply,
+    Several,
+    Wire,
+    Written,
+)
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
+_AHEAD = 0.005  # s; what is on its way when the next part of a set follows: a stop waits for it
+_FULL_PAUSE = 0.0005  # s; before a port that is blocked is looked at again
 _LOOK_INTERVAL = 0.01  # s; in which a delay of this process is noticed
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
 MAX_LATE = 0.032
@@ -31,8 +44,9 @@ MAX_LATE = 0.032
 An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
+_MAX_COMMIT_LATE = 0.003  # s; frames of USB at full speed, 1 ms, of port, hub and adapter
+_SENDING = 0.0005  # s; until this process has written to all lines
 _DELAYS = 4  # of this process that prolong the wait for one reply
-_COMMIT_WORDS = 2
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
@@ -77,24 +91,23 @@ class Line:
         name: str,
         values: Values | Make,
         *,
-        start: JointStart | None = None,
         timeout: float = REPLY_TIMEOUT,
     ) -> "asyncio.Future[Values]":
         """Queue a request of an amplifier; the future has the values of its last reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
-        it was sent. start: of a commit that goes out together with those of other lines.
+        it was sent.
         """
         future, now = self._loop.create_future(), self.time()
         make, values = (values, Values()) if callable(values) else (None, values)
-        job = Job(member, priority, name, values, timeout, now, future, make, start)
+        job = Job(member, priority, name, values, timeout, now, future, make)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
-        if self._current is None and not (self._queue.jobs or self._is_pumping or start):
+        if self._current is None and not (self._queue.jobs or self._is_pumping):
             self._start(job)
             return future
         for queued in [*self._queue.jobs]:
@@ -105,6 +118,17 @@ class Line:
             self._preempt(self._current)
         self.pump()
         return future
+
+    def arrival(self, words: int) -> float:
+        """Return by when [s] a request of so many words arrives that is sent next.
+
+        Behind what is on the line, and as late as replies have come: by the longest frame of USB,
+        no more. One that is lost is not waited for: it is repeated 30 ms later.
+        """
+        free, job = max(self.time(), self._free_at), self._current
+        if job is not None and job.member is not None:
+            free = max(free, job.started_at + job.member.exchange_time(job.name))
+        return free + self.wire.transit(words) + min(self.late, _MAX_COMMIT_LATE) + _SENDING
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
@@ -130,6 +154,9 @@ class Line:
                     self._start(job, arrival.data)
                 continue
             self._current = member.silence_cause = None
+            if isinstance(arrival, Written):
+                self._go_on(job)
+                continue
             late = self.time() - job.started_at - member.exchange_time(job.name)
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
@@ -145,16 +172,14 @@ class Line:
                 continue
             if job.result.done():  # its caller has gone
                 continue
-            if len(job.parts) <= 1:
-                job.result.set_result(arrival.values)
+            if len(job.parts) > 1 and job.is_missing(arrival.values):
+                if job.attempts > 0:
+                    self._repeat(job, member)
+                else:
+                    self.wire.counters.remark = f"part {job.part} of a set does not arrive"
+                    self._give_up(job, member)
                 continue
-            job.parts = job.parts[1:]
-            job.values, job.attempts = job.parts[0], ATTEMPTS
-            job.queued_at, job.had_no_reply = self.time(), False
-            if self._queue.jobs:
-                self._queue_again(job)
-            else:
-                self._start(job)
+            job.result.set_result(arrival.values)
         if self._queue.jobs:
             self.pump()
         elif self._current is None and self._timer is not None:
@@ -180,14 +205,6 @@ class Line:
                 job = self._queue.next(self.time())
                 if job is None:
                     break
-                if job.start is not None and not job.is_held:
-                    # The line is kept for a commit until all others are free.
-                    job.is_held = True
-                    takes = self.wire.transit(_COMMIT_WORDS)
-                    job.start.arrive(takes, partial(self._release, job))
-                    continue  # it may have failed at once
-                if job.start is not None and not job.is_released:
-                    break
                 self._queue.take(job, self.time())
                 if job.result.done():
                     self._fail(job, Preempted(SUPERSEDED))  # its caller has gone: so have others
@@ -195,13 +212,6 @@ class Line:
                     self._start(job)
         finally:
             self._is_pumping = False
-
-    def _release(self, job: Job, error: Exception | None) -> None:
-        """Send a commit that was held, or fail it."""
-        job.is_released = True
-        if error is not None:
-            self._fail(job, error)
-        self.pump()
 
     def _start(self, job: Job, rest: bytes = b"") -> None:
         """Make a request in its turn and send it, noted for all that it reaches: no other way.
@@ -212,7 +222,7 @@ class Line:
         address = BROADCAST if member is None else member.address
         try:
             if not rest:
-                if self.ahead is not None and member is not None and job.start is None:
+                if self.ahead is not None and member is not None and not job.part:
                     ahead = self.ahead(job.name, job.priority)
                     if ahead is not None:
                         now, result = self.time(), self._loop.create_future()
@@ -252,7 +262,6 @@ class Line:
             self.wire.withdraw()
             self._fail(job, error)
             return
-        job.start = None
         if member is None:
             job.result.set_result({})
             return
@@ -264,8 +273,31 @@ class Line:
         job.due = max(job.due, begins + job.longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self._current = job
-        if self._timer is None:
+        if job.has_further_parts and not self.wire.confirms_parts:
+            self._send_further(job)
+        elif self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)
+
+    def _send_further(self, job: Job) -> None:
+        """Send the next part of a set once what is under way has nearly arrived, or give way."""
+        now = self.time()
+        due = max(self._sent_until - _AHEAD, now + _FULL_PAUSE * self._port.is_blocked)
+        if due <= now or self._queue.has_before(job, now):
+            self._go_on(job)
+        else:
+            self._look_by(due)
+
+    def _go_on(self, job: Job) -> None:
+        """Go on with the next part of a set, unless a request that waits comes before it."""
+        self._current = None
+        job.attempts += 1  # this part has not been awaited in vain
+        job.go_to(job.part + 1)
+        if self.wire.confirms_parts:
+            job.reach(job.part)
+        if self._queue.has_before(job, self.time()):
+            self._queue_again(job)
+        else:
+            self._start(job)
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
@@ -312,13 +344,13 @@ class Line:
         if not job.result.done():
             job.result.set_exception(error)
             job.result.exception()  # retrieved, where nobody waits for it
-        if job.start is not None:
-            start, job.start = job.start, None
-            start.fail(error)
 
     def _preempt(self, current: Job) -> None:
         """Shorten the time of the request on the line for one that must not wait."""
         if current.is_stop_class:
+            return
+        if current.has_further_parts and not self.wire.confirms_parts:  # no reply is due
+            self._send_further(current)
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         free_at = max(self.time(), self._free_at)
@@ -328,9 +360,14 @@ class Line:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
-        if self._timer is not None and self._timer.when() > current.due:
-            self._timer.cancel()
-            self._timer = self._loop.call_at(current.due, self._look)
+        self._look_by(current.due)
+
+    def _look_by(self, due: float) -> None:
+        """Look at the request on the line at a time [s], or before."""
+        if self._timer is None or self._timer.when() > due:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = self._loop.call_at(due, self._look)
 
     def _look(self) -> None:
         """Give up the request on the line if it is due, once the port was read once more.
@@ -347,6 +384,10 @@ class Line:
             job.delays += 1
             left = 0.0 if self._must_yield(job) else job.due - since
             job.due = now + max(left, _LATE)
+        if now < job.due and job.has_further_parts and not self.wire.confirms_parts:
+            self._send_further(job)
+            self.pump()
+            return
         if now >= job.due:
             self._port.poll()
             if self._current is job and self.time() >= job.due:
@@ -379,6 +420,11 @@ class Line:
         if job.attempts > 0 or (is_first and self.time() < self._boots_until):
             self._repeat(job, member)
             return
+        self._give_up(job, member)
+
+    def _give_up(self, job: Job, member: Member) -> None:
+        """End a request that has had no reply, or whose parts do not arrive."""
+        is_first = job.name == "Hello" and self._boots_until > -math.inf
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
         member.silence_cause = no_reply(
             self.name,

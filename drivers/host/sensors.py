@@ -59,14 +59,14 @@ class SensorReading:
 class Reading:
     """A reading: its number, its state (a name of READING_STATES), and what is left of it [s].
 
-    start [s]: of its window, from the commit of token on; of itself without a token. sensors: empty
-    until it is complete.
+    start: the amplifier's clock at the start of its window, on which phases count. token: of what
+    played then. sensors: empty until it is complete.
     """
 
     number: int
     state: str
     left: float
-    start: float
+    start: int
     token: int
     tones: int
     sensors: tuple[SensorReading, ...]
@@ -215,7 +215,7 @@ def _reading(values: Values, *, number: int, tones: int) -> Reading:
         values["reading"],
         name_of(READING_STATES, values["state"]),
         _Q["window_left"].from_wire(values["window_left"]),
-        _Q["window_start"].from_wire(values["window_start"]),
+        values["window_start"],
         values["token"],
         tones,
         tuple(

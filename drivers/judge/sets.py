@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Assembly, LayerSet, unpack_layers
+from drivers.protocol.sets import Assembly, LayerSet, is_last, unpack_layers
 from drivers.protocol.table import QUANTITIES, STAGED_LIFE
 
 _MAX_WORDS = QUANTITIES["set_words"].maximum
@@ -29,12 +29,16 @@ class ExpectedSet:
 
     def sent(self, part: Values, time: float) -> str:
         """Note a part that is sent; returns what is wrong with it, or ""."""
-        if time - self._sent.began > STAGED_LIFE:  # whatever an amplifier does
-            self._sent.drop()
+        if part["index"] >= part["parts"]:
+            return f"index must be below {part['parts']}, got {part['index']}"
+        if not is_last(part):
+            is_kept = self._sent.keep(part, time)
+            return "" if is_kept else f"parts must be {self._sent.count}, got {part['parts']}"
+        stream = self._sent.whole(part)
+        if isinstance(stream, int):
+            return f"part {stream} must come before the last"
         try:
-            stream = self._sent.add(part, time, _MAX_WORDS)
-            if stream is not None:
-                self._whole = part["token"], unpack_layers(stream)
+            self._whole = part["token"], unpack_layers(stream)
         except Refusal as refusal:
             return str(refusal)
         return ""

@@ -73,7 +73,7 @@ class Playback:
         return copied
 
     def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
-        """Play a set from a time on; what has a new tone counts its phase from there."""
+        """Play a set from a time on."""
         self.advance(time)
         for one in layers:
             layer = self._layers.setdefault(one.layer, _Layer())
@@ -205,8 +205,7 @@ class Playback:
         """Return the largest amplitude of a channel; voices of one frequency interfere."""
         sums: dict[float, complex] = {}
         for voice in self.all_voices[channel]:
-            turned = cmath.rect(1.0, -2 * math.pi * voice.frequency * voice.origin)
-            amplitude = voice.transition.at(time) * turned
+            amplitude = voice.transition.at(time)
             sums[voice.frequency] = sums.get(voice.frequency, 0j) + amplitude
         return sum(map(abs, sums.values()))
 

@@ -5,8 +5,6 @@ or later it may have begun, and a radius by which its first amplitude may differ
 any one clock; intervals are two times.
 """
 
-import cmath
-import math
 from collections.abc import Sequence
 from itertools import chain
 from typing import TypeAlias
@@ -32,7 +30,6 @@ class UncertainPlayback:
         self.half = [0.0] * _LAYERS
         # Channels of transitions that are gone, and until when [s] they may still play.
         self._ghosts: list[tuple[int, Transition, float]] = []
-        self._origins: dict[float, float] = {}  # half the interval of the origins of phases
 
     @property
     def lag(self) -> float:
@@ -124,12 +121,11 @@ class UncertainPlayback:
         half = (when[1] - when[0]) / 2
         ghosts = [each for each in self._ghosts if each[2] > when[0]]
         for channel, were in enumerate(before):
-            left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
+            left = {(each.layer, each.frequency, each.began): each.transition for each in were}
             known = {id(each.transition) for each in were}
             for voice in self.playback.all_voices[channel]:
                 way = voice.transition
-                earlier = left.pop((voice.layer, voice.frequency, voice.origin), None)
-                self._origins.setdefault(voice.origin, half)
+                earlier = left.pop((voice.layer, voice.frequency, voice.began), None)
                 if id(way) not in known:
                     way.half = half
                     way.radius = 0.0 if earlier is None else radius_of(earlier, *when)
@@ -139,8 +135,6 @@ class UncertainPlayback:
                 if until > when[0]:
                     ghosts.append((channel, way, until))
         self._ghosts = ghosts
-        origins = {voice.origin for voices in self.playback.all_voices for voice in voices}
-        self._origins = {each: self._origins[each] for each in origins}
 
     def bounds(self, channel: int, start: float, end: float, *, is_exact: bool = False) -> Interval:
         """Return the lowest and the largest level of a channel between two times.
@@ -156,50 +150,22 @@ class UncertainPlayback:
             for tone in tones if one.layer in unsure else ():
                 peak = max(peak_of(tone.onset), peak_of(tone.ending))
                 extra += max(abs(amplitude_of(tone.level, 0)), peak)
-        groups: dict[float, dict[float, list[Voice]]] = {}
+        groups: dict[float, list[Transition]] = {}
         for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:
                 extra += voice.peak(began) + voice.transition.radius
                 continue
-            groups.setdefault(voice.frequency, {}).setdefault(voice.origin, []).append(voice)
-        for frequency, by_origin in groups.items():
-            low, high = self._sum(frequency, by_origin, start, end, is_exact=is_exact)
-            lowest += low
-            highest += high
+            groups.setdefault(voice.frequency, []).append(voice.transition)
+        for ways in groups.values():
+            amplitudes = [_reached(way, (start + end) / 2) for way in ways]
+            radius = sum(radius_of(way, start, end) for way in ways)
+            level, most = abs(sum(amplitudes)), sum(map(abs, amplitudes))
+            lowest += max(level - radius, 0.0)
+            highest += (level if is_exact else most) + radius
         for at, way, until in self._ghosts:
             if at == channel and until > start:
                 extra += abs(_reached(way, start - way.half)) + way.radius
         return max(lowest - extra, 0.0), highest + extra
-
-    def _sum(
-        self,
-        frequency: float,
-        by_origin: dict[float, list[Voice]],
-        start: float,
-        end: float,
-        *,
-        is_exact: bool,
-    ) -> Interval:
-        """Return the lowest and largest sum of tones of one frequency, by their origins."""
-        highest, total, uncertain = 0.0, 0j, 0.0
-        discs: list[tuple[float, float]] = []
-        for origin, voices in by_origin.items():
-            center, radius = 0j, 0.0
-            for voice in voices:
-                amplitude = _reached(voice.transition, (start + end) / 2)
-                reach = radius_of(voice.transition, start, end)
-                highest += abs(amplitude) + reach
-                center += amplitude
-                radius += reach
-            discs.append((abs(center), radius))
-            total += center * cmath.rect(1, -2 * math.pi * frequency * origin)
-            turned = min(math.pi * frequency * self._origins.get(origin, 0.0), math.pi / 2)
-            uncertain += radius + 2 * abs(center) * math.sin(turned) * (len(by_origin) > 1)
-        if is_exact:
-            return max(abs(total) - uncertain, 0.0), min(abs(total) + uncertain, highest)
-        # Tones of one frequency that began at different times may cancel.
-        highs = sum(center + radius for center, radius in discs)
-        return max(0.0, *(2 * center - highs for center, _ in discs)), highest
 
 
 def radius_of(way: Transition, start: float, end: float) -> float:

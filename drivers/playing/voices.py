@@ -1,9 +1,10 @@
 """Voices of one channel: the tones that it plays at once, in any layers, until they have faded.
 
-    Voice: Im[A(t) exp(2 pi i f (t - origin))], A(t) along its last transition, in full levels
+    Voice: Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its last transition, in full levels
 
-Amplitudes are complex, in full levels; times [s] are of any one clock. Plain loops and few calls:
-every set is played by host and far end.
+Its angle is that of the amplifier's clock (`drivers.protocol.clock`), n its frequency word: it does
+not depend on when it began. Amplitudes are complex, in full levels; times [s] are of any one clock.
+Plain loops and few calls: every set is played by host and far end.
 """
 
 import cmath
@@ -144,7 +145,7 @@ def steepest(
 
 @dataclass(frozen=True, slots=True)
 class Voice:
-    """A tone of a layer until it has faded: frequency [Hz], origin [s] of its phase.
+    """A tone of a layer until it has faded: frequency [Hz], and when it began [s].
 
     has_ended: it falls silent and nothing continues it, unlike an onset that leads to level 0.
     ending: how it falls silent, None for the ramp.
@@ -152,7 +153,7 @@ class Voice:
 
     layer: int
     frequency: float
-    origin: float
+    began: float
     transition: Transition
     has_ended: bool = False
     ending: Envelope | None = None
@@ -180,7 +181,7 @@ class Voice:
         elif uncertainty and transition.end > end - uncertainty:
             largest, over = transition.peak(time - uncertainty), max(transition.end, end)
             transition = Transition(over, 0.0, complex(largest), 0j, over)
-        return Voice(self.layer, self.frequency, self.origin, transition, True, self.ending)
+        return Voice(self.layer, self.frequency, self.began, transition, True, self.ending)
 
     def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
         """Return it falling silent along its ending, or along a ramp [s] without one."""

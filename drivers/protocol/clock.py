@@ -6,8 +6,11 @@ A voice of frequency word n has the angle n times clock modulo 2^32, in turns of
 from drivers.protocol.table import CLOCK_TURN
 
 SPAN = 1 << 32
+HIGH_STEPS = 1 << 16
+"""Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+AT_MOST = 1638
+"""Steps of the high word by which a Commit may name a moment ahead: 0.5 s."""
 _PER_SECOND = SPAN / CLOCK_TURN
-_HIGH = 16  # bits below the high word
 
 
 def clock_at(seconds: float) -> int:
@@ -20,6 +23,21 @@ def ahead(clock: int, of: int) -> float:
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
 
 
+def at_behind(seconds: float) -> int:
+    """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
+    return high_word(clock_at(seconds) - 1) + 1 & 0xFFFF
+
+
+def moment_of(at: int, seconds: float) -> float | None:
+    """Return the moment [s] that a Commit names which is sent at a time; None for at once.
+
+    at: the high word of a clock of `clock_at`.
+    """
+    now = clock_at(seconds)
+    left = ((at << 16) - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AT_MOST << 16 else None
+
+
 def high_word(clock: int) -> int:
     """Return the high word of a clock, as a Commit names a moment."""
-    return clock >> _HIGH
+    return clock // HIGH_STEPS

@@ -4,6 +4,7 @@ All numbers are integers of the wire. A stream has the layers that a set changes
 other; a part is the values of one Set message. The far end collects parts in an `Assembly`.
 """
 
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -187,44 +188,37 @@ def parts(
     return made
 
 
+def is_last(part: Values) -> bool:
+    """Whether a part is the last of its set, which alone is replied to."""
+    return bool(part["index"] >= part["parts"] - 1)
+
+
 @dataclass
 class Assembly:
-    """Parts of one set as they arrive, in any order and repeatedly.
+    """Parts of one set but the last, as they arrive, in any order and repeatedly.
 
-    is_newer: whether a token is newer than another. The parts of an older set are discarded, as
-    are all `STAGED_LIFE` after the first.
+    began [s]: when the first came. It is discarded `STAGED_LIFE` later, or for another token.
     """
 
     token: int = 0
     count: int = 0
-    began: float = 0.0
+    began: float = -math.inf
     collected: dict[int, list[int]] = field(default_factory=dict)
 
-    def add(self, part: Values, now: float, max_words: int) -> list[int] | None:
-        """Take a part at a time [s]; returns the stream once it is whole.
+    def keep(self, part: Values, now: float) -> bool:
+        """Keep a part but the last at a time [s]; False where `parts` is not as before."""
+        token, count = part["token"], part["parts"]
+        if token != self.token or now - self.began > STAGED_LIFE:
+            self.token, self.count, self.began, self.collected = token, count, now, {}
+        if count == self.count:
+            self.collected[part["index"]] = part["stream"]
+        return bool(count == self.count)
 
-        max_words: of a stream. Raises Refusal for a part that fits no set.
-        """
-        if not part["index"] < part["parts"]:
-            raise Refusal(f"index must be below {part['parts']}, got {part['index']}")
-        if part["token"] != self.token or now - self.began > STAGED_LIFE:
-            self.drop()
-            self.token, self.count, self.began = part["token"], part["parts"], now
-        if part["parts"] != self.count:
-            raise Refusal(f"parts must be {self.count} as before, got {part['parts']}")
-        self.collected[part["index"]] = part["stream"]
-        if sum(map(len, self.collected.values())) > max_words:
-            self.drop()
-            raise Refusal(f"a set must have at most {max_words} words", "BAD_LENGTH")
-        if self.missing is not None:
-            return None
-        return [word for index in range(self.count) for word in self.collected[index]]
-
-    @property
-    def missing(self) -> int | None:
-        """Number of the first part that has not come; None if all have."""
-        return next((index for index in range(self.count) if index not in self.collected), None)
-
-    def drop(self) -> None:
-        """Discard what was collected."""
-        self.token, self.count, self.collected = 0, 0, {}
+    def whole(self, last: Values) -> list[int] | int:
+        """Return the stream of the set with this last part, or the first part that is missing."""
+        others = self.collected if last["token"] == self.token else {}
+        indices = range(last["parts"] - 1)
+        missing = next((index for index in indices if index not in others), None)
+        if missing is not None:
+            return missing
+        return [*chain.from_iterable(others[index] for index in indices), *last["stream"]]

@@ -143,7 +143,6 @@ _QUANTITIES = (
     _word("held_reading", 0, 65535),
     _word("window", 1, 10000, 1000, "s"),
     _word("window_left", 0, 10000, 1000, "s"),
-    _word("window_start", 0, 0xFFFFFFFF, 1000000, "s"),
     _word("tone_count", 1, 16),
     _word("clock", 0, 0xFFFFFFFF),
     _word("shift", 0, 65535),
@@ -262,7 +261,8 @@ def sensor_reading(tones: int) -> Record:
 
 
 _READING = Record(
-    *_numbers("reading:held_reading", "state:code", "window_left", "window_start"),
+    *_numbers("reading:held_reading", "state:code", "window_left"),
+    *_numbers("window_start:clock"),
     *_numbers("token:played_token", "tones:count", "count"),
     Rest("sensors"),  # see `sensor_reading`
 )

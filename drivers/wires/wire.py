@@ -24,6 +24,7 @@ from drivers.protocol.records import (
     Values,
 )
 from drivers.protocol.table import (
+    BROADCAST,
     EVENT,
     EVENT_RECORD,
     IDENTITY,
@@ -91,7 +92,19 @@ class More:
     data: bytes
 
 
-Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The part of a set on the wire, which has no reply, was written, as on Modbus."""
+
+
+Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More | Written
+
+
+def has_reply(address: int, name: str, values: Values) -> bool:
+    """Whether a request is replied to: not if it is of all, nor a part of a set but the last."""
+    if address == BROADCAST:
+        return False
+    return name != "Set" or values["index"] >= values["parts"] - 1
 
 
 def read_event(
@@ -163,6 +176,8 @@ class Wire(Protocol):
     """How long what was sent last takes to arrive [s]; 0 over a network."""
     blocked: str = "the port takes no bytes: check flow control and the adapter"
     """What a port that is blocked means, and what to check."""
+    confirms_parts: bool = False
+    """Whether each part of a set has a response, the next one being sent behind it."""
     busy: float = 0.0
     """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 

@@ -36,15 +36,14 @@ _LEVEL = QUANTITIES["level"]
 
 @dataclass(frozen=True)
 class Tone:
-    """A sine: frequency [Hz], amplitude 0..1 of full level, phase [degrees], its start [s].
+    """A sine: frequency [Hz], amplitude 0..1 of full level, phase [degrees].
 
-    Tones with one origin start together; one that has it already goes on.
+    One of the frequency that a channel plays already goes on.
     """
 
     frequency: float
     amplitude: float
     phase: float
-    origin: float
 
 
 class Device(Protocol):
@@ -68,7 +67,8 @@ class AdaptedAmplifier(Amplifier):
     def __init__(self, name: str, *, channels: int) -> None:
         super().__init__(name, channels=channels, is_output=True)
         self.identity = {**self.identity, "product": "adapter", "serial_number": name}
-        self.capabilities["features"] = 1 << FEATURES["output"] | 1 << FEATURES["events"]
+        features = (FEATURES[name] for name in ("output", "events", "mark"))
+        self.capabilities["features"] = sum(1 << bit for bit in features)
         self.device_levels = [1.0] * channels
         self.is_lost = True
 
@@ -181,7 +181,7 @@ def tone_of(voices: tuple[Voice, ...], now: float) -> Tone | None:
     if loudest is None or not level:
         return None
     phase = math.degrees(cmath.phase(amplitude))
-    return Tone(loudest.frequency, level, round(phase, 2), loudest.origin)
+    return Tone(loudest.frequency, level, round(phase, 2))
 
 
 def watch(silence: Callable[[], None]) -> Callable[[bytes], None]:

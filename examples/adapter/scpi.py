@@ -51,7 +51,7 @@ class Generator:
             if tone is None:
                 words.append(f"OUTP{channel + 1} OFF")
                 continue
-            if before is None or (before.frequency, before.origin) != (tone.frequency, tone.origin):
+            if before is None or before.frequency != tone.frequency:
                 words.append(f"{source}:FREQ {tone.frequency / 2:.10g}")
                 starts = True
             vpp = max(2 * self._full * math.sqrt(tone.amplitude), MIN_VPP)
@@ -63,7 +63,7 @@ class Generator:
         goes_on = any(
             tone is not None
             and (old := self._playing.get(channel)) is not None
-            and (old.frequency, old.origin) == (tone.frequency, tone.origin)
+            and old.frequency == tone.frequency
             for channel, tone in now.items()
         )
         if starts and not goes_on:

@@ -93,7 +93,7 @@ class Unit:
         except Refusal as refusal:
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, []
-        return 0, [*message.reply.pack(done)]
+        return 0, [*message.reply.pack(done)] if done else []
 
     def _move(self) -> None:
         self.number, self.moves_to = self.moves_to or self.number, 0

@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import clock_at
+from drivers.protocol.clock import high_word
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.sets import is_last, token_after
 from drivers.protocol.table import (
+    AHEAD_MAX,
     FAULTS,
     FEATURES,
     MESSAGES,
@@ -27,6 +28,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     VERSION,
 )
+from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.readings import (
     DERATE_ABOVE,
     DERATED,
@@ -43,7 +45,7 @@ from sim.amplifier.readings import (
     measured,
     with_readings,
 )
-from sim.amplifier.set_intake import SetIntake, derated
+from sim.amplifier.set_intake import Layers, SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
@@ -74,12 +76,20 @@ class Amplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: others hold
-    from the next restart. session: held while armed, or the one that ended last.
+    from the next restart. session: held while armed, or the one that ended last. clock: on which
+    phases count, by default without errors.
     """
 
     is_answering = True
 
-    def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        channels: int,
+        is_output: bool = False,
+        clock: AmplifierClock | None = None,
+    ) -> None:
         self.identity: Values = {
             **{"versions": 1 << VERSION, "vendor": "era-haptics", "product": "simulated amplifier"},
             **{"serial_number": f"SIM-{name}", "firmware": "1"},
@@ -93,7 +103,7 @@ class Amplifier:
         self._faults: deque[FaultRecord] = deque(maxlen=_FAULTS_KEPT)
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
-        self.committed_at = -math.inf  # s; see `token`
+        self.clock = AmplifierClock() if clock is None else clock
         self._sensing: SensorPort | None = None
         self._start()
 
@@ -111,10 +121,12 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
+        self._waiting: tuple[float, int, Layers] | None = None  # moment [s], token
+        self._marked: int | None = None  # clock of a Mark that no status has shown
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
-        """Of the set since arming that changed last what plays, and began t; 0: none."""
+        """Of the set since arming that changed last what plays; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self._is_limited = False
@@ -129,6 +141,8 @@ class Amplifier:
     def next_event(self) -> float:
         """Time of the next event [s], until which what plays is known."""
         due = self.playback.next_due
+        if self._waiting is not None:
+            due = min(due, self._waiting[0])
         if self.state != _ENABLED:
             return min(due, self._silent_from if self.state in _ENDING else math.inf)
         hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
@@ -137,7 +151,9 @@ class Amplifier:
     def tick(self, now: float) -> None:
         """Process the events due by now, in order."""
         while (moment := self.next_event) <= now:
-            if moment == self.playback.next_due:
+            if self._waiting is not None and moment == self._waiting[0]:
+                self._start_waiting(moment)
+            elif moment == self.playback.next_due:
                 self.playback.advance(moment)
                 self._changed(moment)
             elif self.state == _ENABLED and moment == self._last_fed + self._watchdog:
@@ -152,11 +168,14 @@ class Amplifier:
             self.is_derated = False
 
     def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s].
+        """Return the values of the reply to a request at a time [s]; none to a part but the last.
 
         Raises Refusal, which means that nothing was applied.
         """
         self.tick(now)
+        if name == "Set" and not is_last(values):
+            self._keep(values, now)
+            return {}
         message, following = MESSAGES[name], TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
             raise Refusal(f"{name} must not come in state {self.state}", "WRONG_STATE")
@@ -180,6 +199,8 @@ class Amplifier:
             "limited": self._is_limited,
         }
         self._is_limited = False
+        clock = self.clock.reading(now) if self._marked is None else self._marked
+        self._marked = None
         tokens = self.playback.tokens
         layers = self.capabilities["layers"]
         return with_readings(
@@ -188,7 +209,7 @@ class Amplifier:
                 "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
                 "latch": self.latch,
                 "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
-                "clock": clock_at(now),
+                "clock": clock,
                 **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
                 "levels": [_Q["level"].to_wire(level) for level in levels],
                 "tokens": [tokens.get(layer, 0) for layer in range(layers)],
@@ -239,6 +260,7 @@ class Amplifier:
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
         self._start()
+        self.clock.restart(moment)
         if self._sensing is not None:
             self._sensing.forget()
         self._enter("SWITCH_ON_DISABLED", moment)
@@ -251,7 +273,7 @@ class Amplifier:
             case "GetFaults":
                 return fault_list(self._faults, now)
             case "Arm":
-                self._arm(values["session"], values["watchdog"], now)
+                self._arm(values, now)
             case "Disarm" | "Stop":
                 if name == "Stop":
                     self.latch = token_after(self.latch)
@@ -264,6 +286,8 @@ class Amplifier:
                     limit = self.capabilities["ramp_max"]
                     raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+            case "Ping" if self.state == _ENABLED:
+                self.clock.steer(values["rate"], now)
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -271,7 +295,10 @@ class Amplifier:
             case "Commit":
                 layers = self._intake.commit(values["token"], now)
                 if layers is not None:
-                    self._play(layers, values["token"], now)
+                    self._start_waiting(now)
+                    self._play_when(layers, values, now)
+            case "Mark":
+                self._marked = self.clock.reading(now)
             case "GetAchieved":
                 layer, count = values["layer"], self.capabilities["layers"]
                 if layer >= count:
@@ -295,7 +322,8 @@ class Amplifier:
             return session != self.session
         return name == "Arm" and session == self.session
 
-    def _arm(self, session: int, watchdog: int, now: float) -> None:
+    def _arm(self, values: Values, now: float) -> None:
+        watchdog = values["watchdog"]
         low, high = self.capabilities["watchdog_min"], self.capabilities["watchdog_max"]
         if not low <= watchdog <= high:
             raise Refusal(f"watchdog must be {low} to {high}, got {watchdog}")
@@ -306,7 +334,8 @@ class Amplifier:
         self._silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
         self.token = 0
-        self.session = session
+        self.session = values["session"]
+        self.clock.shift(values["shift"])
         self._last_fed = now
         self._enter(_ENABLED, now)
 
@@ -317,46 +346,71 @@ class Amplifier:
             self.fault = "NONE"
             self._enter(following, now)
 
+    def _keep(self, part: Values, now: float) -> None:
+        """Keep a part of a set but the last, or drop it without a word."""
+        is_held = self.state == _ENABLED and part["session"] == self.session
+        if is_held and self._intake.keep(part, now):
+            self._last_fed = now
+
     def _take(self, part: Values, now: float) -> Values:
-        """Take a part of a set, and play it where it is whole and says so."""
+        """Take the last part of a set, and play it where it is whole and says so."""
         token = part["token"]
-        is_played = token == self._intake.committed
-        layers = None if is_played else self._intake.add(part, now)
-        if layers is not None and part["now"]:
+        taken = None if token == self._intake.committed else self._intake.take(part, now)
+        is_missing = isinstance(taken, int)
+        is_staged = not (taken is None or is_missing or part["now"])
+        if isinstance(taken, tuple) and part["now"]:
             self._intake.commit(token, now)
-            self._play(layers, token, now)
-            is_played = True
-        is_staged = layers is not None and not is_played
+            self._start_waiting(now)
+            self._play(taken, token, now)
         return {
-            **{"token": token, "exact": not self.is_derated},
-            **{"staged": is_staged, "played": is_played},
-            "missing": 0 if is_staged or is_played else self._intake.missing,
+            **{"token": token, "exact": not (is_missing or self.is_derated)},
+            **{"staged": is_staged, "played": not (is_missing or is_staged)},
+            "missing": taken if is_missing else 0,
         }
 
-    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+    def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
+        """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
+        clock = self.clock.reading(now)
+        if 1 <= (commit["at"] - high_word(clock)) % (1 << 16) <= AHEAD_MAX:
+            moment = self.clock.reaches(commit["at"], now)
+            self._waiting = moment, commit["token"], layers
+        else:
+            self._play(layers, commit["token"], now)
+
+    def _start_waiting(self, moment: float) -> None:
+        """Play the set that waits for a moment, if there is one."""
+        if self._waiting is not None:
+            _, token, layers = self._waiting
+            self._waiting = None
+            self._play(layers, token, moment)
+
+    def _play(self, layers: Layers, token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(wanted, token, now)
         if all(layer.renew for layer in layers):
             return
-        self.token, self.committed_at = token, now
+        self.token = token
         self._is_limited |= any(
             exceeds_full(self.playback, channel, now) for channel in self._channels
         )
         self._changed(now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
-        """Silence every channel within the ramp [s], and discard what is staged."""
+        """Silence every channel within the ramp [s], and discard what is staged or waits."""
         self.playback.silence(moment, ramp)
         self._silent_from = max(self.playback.silent_from, moment)
         if self.state in ("SWITCHED_ON", _ENABLED):
             self._discharged_from = self._silent_from
         self._intake.drop()
+        self._waiting = None
         self._changed(moment)
 
     def _enter(self, state: str, moment: float, *, channel: int | None = None) -> None:
         """Enter a state, and notify the listeners of a change."""
         if state == self.state:
             return
+        if self.state == _ENABLED:
+            self.clock.steer(0, moment)
         self.state = state
         event = {
             **{"state": STATES[state], "fault": FAULTS[self.fault], "latch": self.latch},

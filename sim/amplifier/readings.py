@@ -51,7 +51,8 @@ def capabilities(channels: int, *, is_output: bool = False) -> Values:
 
     is_output: full level is a linear amplifier's output, else the stroke of a motion.
     """
-    features = ("events", "interlock", "electrical", "address", *(("output",) if is_output else ()))
+    features = {"events", "interlock", "electrical", "address", "mark"}
+    features |= {"output"} if is_output else set()
     full = {name: quantity.maximum for name, quantity in QUANTITIES.items()}
     low, high = QUANTITIES["frequency"].to_wire(LOWEST), full["frequency"]
     limits = {"frequency_min": low, "frequency_max": high, "level_max": full["level"]}

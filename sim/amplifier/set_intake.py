@@ -1,11 +1,11 @@
-"""Sets of a simulated amplifier: collected from their parts, checked as a whole, staged.
+"""Sets of a simulated amplifier: collected from their parts, checked as a whole, staged, committed.
 
 All numbers are integers of the wire; see drivers.protocol.sets.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import (
@@ -18,85 +18,101 @@ from drivers.protocol.sets import (
 )
 from drivers.protocol.table import STAGED_LIFE
 
+Layers: TypeAlias = tuple[LayerSet, ...]
+
 
 class SetIntake:
     """Takes the parts of sets, and keeps the one that is whole until it is committed.
 
-    capabilities: values of its record. What is refused changes nothing.
+    capabilities: values of its record. committed: token of the set committed last, 0 for none.
+    One set is under way at most: collected, or staged.
     """
 
     def __init__(self, capabilities: Values) -> None:
         self.capabilities = capabilities
-        self.committed = 0  # token of the set committed last; 0: none
-        self._parts = Assembly()
-        self._staged: tuple[int, tuple[LayerSet, ...]] | None = None
-        self._began = -math.inf
+        self.committed = 0
+        self._parts = Assembly()  # of the set under way
+        self._staged: Layers | None = None  # of the same, once it is whole
 
-    @property
-    def missing(self) -> int:
-        """Number of the first part of the set under way that has not come."""
-        return self._parts.missing or 0
+    def keep(self, part: Values, now: float) -> bool:
+        """Take a part but the last at a time [s]; returns whether it is kept."""
+        token, under_way = part["token"], self._under_way(now)
+        is_newer = token != under_way and is_newer_token(token, under_way)
+        if not (is_newer_token(token, self.committed) and (is_newer or token == under_way)):
+            return False
+        if is_newer:
+            self._staged = None
+        return self._parts.keep(part, now)
 
-    def add(self, part: Values, now: float) -> tuple[LayerSet, ...] | None:
-        """Take a part at a time [s]; returns the layers once all parts are there.
+    def take(self, part: Values, now: float) -> Layers | int:
+        """Take the last part of a set that was not committed, at a time [s].
 
-        Raises Refusal for a part of no newer set, or for a set that is not allowed.
+        Returns the layers that are staged now, or the number of the first part that is missing.
+        Raises Refusal, which drops the parts of this set alone, and only where that is whole.
         """
-        token = part["token"]
-        if not is_newer_token(token, self.committed):  # a late copy
-            raise Refusal(f"token must be newer than {self.committed}, got {token}", "BAD_TOKEN")
-        if self._staged is not None and self._staged[0] == token:
-            if now - self._began <= STAGED_LIFE:
-                return self._staged[1]  # a part came again
-            self._staged = None
-        if self._is_older_than_kept(token, now):
-            raise Refusal("token must be newer than that of the set under way", "BAD_TOKEN")
-        stream = self._parts.add(part, now, self.capabilities["set_words"])
-        if self._parts.began == now:
-            self._staged = None
-        if stream is None:
-            return None
-        began = self._parts.began
-        self._parts.drop()
-        layers = unpack_layers(stream)
-        for layer in layers:
-            self._check(layer)
-        self._staged, self._began = (token, layers), began
+        token, under_way = part["token"], self._under_way(now)
+        is_under_way = token == under_way
+        if is_under_way and self._staged is not None:  # it came again
+            return self._staged
+        for other in (self.committed, 0 if is_under_way else under_way):
+            if not is_newer_token(token, other):
+                raise Refusal(f"token must be newer than {other}, got {token}", "BAD_TOKEN")
+        if part["index"] >= part["parts"]:
+            raise Refusal(f"index must be below {part['parts']}, got {part['index']}")
+        if is_under_way and part["parts"] != self._parts.count:
+            raise Refusal(f"parts must be {self._parts.count} as before, got {part['parts']}")
+        stream = self._parts.whole(part)
+        if isinstance(stream, int):
+            return stream
+        try:
+            layers = self._checked(stream)
+        except Refusal:
+            if is_under_way:
+                self.drop()
+            raise
+        if not is_under_way:
+            self._parts = Assembly(token, part["parts"], now)
+        self._staged = layers
         return layers
 
-    def commit(self, token: int, now: float) -> tuple[LayerSet, ...] | None:
+    def commit(self, token: int, now: float) -> Layers | None:
         """Return the layers of the staged set; None where it was committed before.
 
         Raises Refusal if none is staged under this token.
         """
         if token == self.committed:
             return None
-        if self._parts.count and self._parts.token == token:
-            raise Refusal(f"part {self.missing} of set {token} must come first", "INCOMPLETE")
-        if self._staged is None or self._staged[0] != token or now - self._began > STAGED_LIFE:
+        if token != self._under_way(now):
             raise Refusal(f"no set is staged under token {token}", "BAD_TOKEN")
-        layers = self._staged[1]
-        self._staged, self.committed = None, token
+        if self._staged is None:
+            raise Refusal(f"all parts of set {token} must come first", "INCOMPLETE")
+        layers, self.committed = self._staged, token
+        self.drop()
         return layers
 
     def drop(self) -> None:
         """Discard what is not committed."""
-        self._parts.drop()
-        self._staged = None
+        self._parts, self._staged = Assembly(), None
 
     def forget(self) -> None:
         """Discard all, with the token committed last."""
         self.drop()
         self.committed = 0
 
-    def _is_older_than_kept(self, token: int, now: float) -> bool:
-        """Whether a token is older than that of the set under way, or of the staged one."""
-        kept = []
-        if self._parts.count and now - self._parts.began <= STAGED_LIFE:
-            kept.append(self._parts.token)
-        if self._staged is not None and now - self._began <= STAGED_LIFE:
-            kept.append(self._staged[0])
-        return any(token != other and not is_newer_token(token, other) for other in kept)
+    def _under_way(self, now: float) -> int:
+        """Return the token of the set that is collected or staged, 0 for none."""
+        if now - self._parts.began > STAGED_LIFE:
+            self.drop()
+        return self._parts.token
+
+    def _checked(self, stream: Sequence[int]) -> Layers:
+        if len(stream) > self.capabilities["set_words"]:
+            most = self.capabilities["set_words"]
+            raise Refusal(f"a set must have at most {most} words", "BAD_LENGTH")
+        layers = unpack_layers(stream)
+        for layer in layers:
+            self._check(layer)
+        return layers
 
     def _check(self, layer: LayerSet) -> None:
         can = self.capabilities

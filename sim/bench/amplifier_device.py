@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_last
 from registry import clock
 from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
@@ -68,7 +69,8 @@ class AmplifierDevice:
 
     def handle(self, name: str, values: Values, now: float) -> Values:
         """Return the values of the reply to a request at a time [s]; raises Refusal."""
-        if self.faults.now("nak_storm", now):
+        has_reply = name != "Set" or is_last(values)
+        if has_reply and self.faults.now("nak_storm", now):
             raise Refusal("it refuses everything", "BUSY")
         return self._bench.exchange(self.name, name, values, now=now)
 

@@ -25,14 +25,16 @@ from model.structure.attachments import Era, FingertipLoad, PointLoad, check_loa
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import clock
+from sim.amplifier.clock import AmplifierClock, StraightClock
 from sim.amplifier.contract import Amplifier
 from sim.bench.sensing import REACH, Probe, Sensing
+from sim.bench.straight_clocks import StraightClocks
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
 from sim.plant.imperfections import Imperfections, PlateErrors, realised
 from sim.plant.loaded_plates import LoadedPlate, Placement
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.plant.voiced_base import delayed, motion_of
+from sim.plant.voiced_base import motion_of
 
 _TICK = 0.01  # s; of `keep_time`
 _MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
@@ -79,9 +81,16 @@ class Bench:
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self.amplifiers: Mapping[str, Amplifier] = {
-            name: Amplifier(name, channels=_channel_count(rig, name), is_output=name in rig.outputs)
+            name: Amplifier(
+                name,
+                channels=_channel_count(rig, name),
+                is_output=name in rig.outputs,
+                clock=AmplifierClock(imperfections.crystal_of(name), since=now),
+            )
             for name in rig.amplifiers
         }
+        clocks = {name: amplifier.clock for name, amplifier in self.amplifiers.items()}
+        self._clocks = StraightClocks(clocks, time=now)
         self._sensing = [
             Sensing(self, amplifier, _feet(rig, name), seed=number)
             for number, (name, amplifier) in enumerate(self.amplifiers.items())
@@ -92,12 +101,13 @@ class Bench:
         self._wired = [rig.wiring[era.name] for era in rig.eras]
         self._commanded: list[Voices] = [()] * len(rig.eras)
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
+        self._delays = [imperfections.delays.get(one.amplifier, 0.0) for one in self._wired]
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        # Voices that moved a base, with the time of their end [s].
-        self._played: deque[tuple[Voices, float]] = deque()
+        # Voices that moved the base of an ERA, with the time of their end [s].
+        self._played: deque[tuple[int, Voices, float]] = deque()
 
     @property
     def fingers(self) -> Fingers:
@@ -209,7 +219,7 @@ class Bench:
         plant = _plant_of(errors.realised(self.rig), self.time)
         plant.set_contacts(self._plant.contacts)
         for index, playing in enumerate(self._applied_outputs):
-            plant.set_input(index, self._motion(index, playing))
+            plant.set_input(index, self._motion(index, playing, self._clock_of(index)))
         self.imperfections = replace(self.imperfections, plate=errors)
         self._plant = plant
         self._shapes_at.cache_clear()
@@ -238,7 +248,7 @@ class Bench:
         amplifiers = self.amplifiers.values()
         while True:
             events = [amplifier.next_event for amplifier in amplifiers]
-            moment = min([to_time, *events])
+            moment = min([to_time, self._clocks.next_due, *events])
             self.time = max(self.time, moment)
             for amplifier, event in zip(amplifiers, events, strict=True):
                 if event <= moment or amplifier.is_derated:
@@ -326,38 +336,45 @@ class Bench:
             probe.record(times, part)
 
     def _update_plant(self) -> None:
-        """Pass changed outputs of the channels on to the plant, after their delay."""
+        """Pass on to the plant what channels play, and by which clock, after their delay."""
+        renewed = self._clocks.renew(self.time)
         for index, wired in enumerate(self._wired):
             playing = self.amplifiers[wired.amplifier].outputs[wired.number]
             commanded = self._commanded[index]
-            if playing is not commanded and playing != commanded:
+            is_new = playing is not commanded and playing != commanded
+            if is_new or (commanded and wired.amplifier in renewed):
                 self._commanded[index] = playing
-                self._apply(index, playing)
-        while self._played and self._played[0][1] < self.time - KEPT:
+                self._apply(index, playing, self._clock_of(index))
+        while self._played and self._played[0][2] < self.time - KEPT:
             self._played.popleft()
 
-    def _apply(self, index: int, playing: Voices) -> None:
-        """Let an output move the base of an ERA, after its amplifier's delay."""
-        delay = self.imperfections.delays.get(self._wired[index].amplifier, 0.0)
-        late, since = delayed(playing, delay) if delay else playing, self.time + delay
-        self._plant.set_input(index, self._motion(index, late), since=since)
-        self._played.append((self._applied_outputs[index], since))
-        self._applied_outputs[index] = late
+    def _clock_of(self, index: int) -> StraightClock:
+        """The clock of the amplifier of an ERA."""
+        return self._clocks.straight[self._wired[index].amplifier]
 
-    def _motion(self, index: int, playing: Voices) -> Motion:
+    def _apply(self, index: int, playing: Voices, clock: StraightClock) -> None:
+        """Let an output move the base of an ERA by a clock, after its amplifier's delay."""
+        since = self.time + self._delays[index]
+        self._plant.set_input(index, self._motion(index, playing, clock), since=since)
+        self._played.append((index, self._applied_outputs[index], since))
+        self._applied_outputs[index] = playing
+
+    def _motion(self, index: int, playing: Voices, clock: StraightClock) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
-        motion = motion_of(playing, stroke=self.rig.eras[index].stroke)
+        stroke, delay = self.rig.eras[index].stroke, self._delays[index]
+        motion = motion_of(playing, clock, stroke=stroke, delay=delay)
         return realised(motion, self._errors[index])
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""
-        present = [(output, math.inf) for output in self._applied_outputs]
+        present = [(index, output, math.inf) for index, output in enumerate(self._applied_outputs)]
         return sorted(
             {
                 tone.frequency
-                for output, end in [*self._played, *present]
+                for index, output, end in [*self._played, *present]
                 for tone in output
-                if tone.transition.start < until and min(end, tone.silent_from) > since
+                if tone.transition.start + self._delays[index] < until
+                and min(end, tone.silent_from + self._delays[index]) > since
             }
         )
 

@@ -25,6 +25,7 @@ from drivers.protocol.table import (
     sensor_reading,
 )
 from model.arrays import FloatArray
+from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.contract import Amplifier
 from sim.plant.accelerometer import Accelerometer, positions, readings
 
@@ -69,7 +70,7 @@ class Measurement:
 class ToneReader:
     """Reads tones at sensors of a plate from `start` [s] on, until its window has ended.
 
-    origin [s]: where t begins; token: of what plays. offset: t at the start [s].
+    clock: on which phases count; token: of what plays. window_start: the clock at the start.
     """
 
     def __init__(
@@ -79,18 +80,19 @@ class ToneReader:
         sensors: Sequence[Accelerometer],
         *,
         start: float,
-        origin: float | None,
+        clock: AmplifierClock,
         token: int,
         rng: np.random.Generator,
     ) -> None:
         self.measurement = measurement
         self.end = start + measurement.window
-        self.offset = 0.0 if origin is None else start - origin
+        self.window_start = clock.reading(start)
         self.token = token
         self.is_disturbed = False
         self._plate = plate
         self._sensors = tuple(sensors)
         self._start = start
+        self._clock = clock
         self._rng = rng
         self._reach = np.array([one.reach for one in sensors])
         unknowns, count = 2 * len(measurement.frequencies) + 1, len(sensors)
@@ -108,7 +110,10 @@ class ToneReader:
         inside = (times > self._start) & (times <= self.end)
         rate = self._plate.sample_rate
         read = readings(self._sensors, accelerations[inside], sample_rate=rate, rng=self._rng)
-        angles = 2 * math.pi * np.outer(times[inside] - self._start, self.measurement.frequencies)
+        # At one pace: samples come before the amplifier does what changes it.
+        clock = self._clock.straight(times[0])
+        shown = clock.shown + (times[inside] - clock.time) * clock.pace
+        angles = 2 * math.pi * np.outer(shown, self.measurement.frequencies)
         columns = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
         self._normal += columns.T @ columns
         self._right += columns.T @ read
@@ -118,11 +123,9 @@ class ToneReader:
 
     def tones(self) -> list[tuple[bool, list[complex]]]:
         """Of each sensor: whether it was overloaded, and the phasors of its tones."""
-        frequencies = np.array(self.measurement.frequencies)
-        count = len(frequencies)
+        count = len(self.measurement.frequencies)
         found, *_ = np.linalg.lstsq(self._normal, self._right, rcond=None)
         phasors = found[:count] + 1j * found[count : 2 * count]
-        phasors *= np.exp(-2j * math.pi * frequencies * self.offset)[:, None]
         return list(zip(self._is_overloaded.tolist(), phasors.T.tolist(), strict=True))
 
 
@@ -222,14 +225,13 @@ class Sensing:
         if apart * measurement.window < 1 - _ROUNDING:
             raise Refusal(f"frequencies must be {1 / measurement.window:g} Hz apart, got {apart:g}")
         self.forget()
-        token = self._amplifier.token
         self.reader = ToneReader(
             self._plate,
             measurement,
             self.sensors,
             start=now,
-            origin=self._amplifier.committed_at if token else None,
-            token=token,
+            clock=self._amplifier.clock,
+            token=self._amplifier.token,
             rng=self._rng,
         )
         self._plate.probes.append(self.reader)
@@ -257,12 +259,11 @@ class Sensing:
                     for each in phasors
                 ]
                 record.append(words, {"flags": int(is_overloaded), "tones": rows})
-        start = min(reader.offset, _Q["window_start"].high)
         return {
             **{"reading": reader.measurement.number, "state": READING_STATES[state]},
             "window_left": _Q["window_left"].to_wire(left),
-            "window_start": _Q["window_start"].to_wire(start),
-            **{"token": reader.token, "tones": tones, "count": listed, "sensors": words},
+            **{"window_start": reader.window_start, "token": reader.token},
+            **{"tones": tones, "count": listed, "sensors": words},
         }
 
 

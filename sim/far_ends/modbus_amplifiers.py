@@ -152,7 +152,7 @@ class _Unit:
             return code << 8 | channel, ()
         if message.name == "SetAddress":
             self.address = values["address"]
-        return 0, message.reply.pack(reply)
+        return 0, message.reply.pack(reply) if reply else ()
 
     def _read(self, address: int, count: int, now: float) -> Sequence[int]:
         """Return registers; none where some of them cannot be read."""

@@ -58,10 +58,12 @@ class SerialAmplifiers(FarEnd):
                 continue
             amplifier = self._amplifiers.get(frame.address)
             if amplifier is not None and amplifier.is_answering:
-                self._send(encode_frame(self._answer(frame, amplifier, now)))
+                reply = self._answer(frame, amplifier, now)
+                if reply is not None:
+                    self._send(encode_frame(reply))
 
-    def _answer(self, frame: Frame, amplifier: AmplifierPort, now: float) -> Frame:
-        """Return the reply to a request, a Nak where it is refused."""
+    def _answer(self, frame: Frame, amplifier: AmplifierPort, now: float) -> Frame | None:
+        """Return the reply to a request, a Nak where it is refused; None where it has none."""
         try:
             if frame.type == HELLO:
                 payload = pack_identity(amplifier.identity)
@@ -71,10 +73,10 @@ class SerialAmplifiers(FarEnd):
             payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
-        return frame._replace(kind=frame.kind | REPLY, payload=payload)
+        return frame._replace(kind=frame.kind | REPLY, payload=payload) if payload else None
 
     def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
-        """Carry out a request by an amplifier; returns the payload of its reply.
+        """Carry out a request by an amplifier; returns the payload of its reply, if it has one.
 
         Raises Refusal.
         """
@@ -87,7 +89,7 @@ class SerialAmplifiers(FarEnd):
                 values["address"] if each is amplifier else address: each
                 for address, each in self._amplifiers.items()
             }
-        return pack_words(BY_NUMBER[frame.type].reply.pack(reply))
+        return pack_words(BY_NUMBER[frame.type].reply.pack(reply)) if reply else b""
 
     def _broadcast(self, frame: Frame, now: float) -> None:
         message = BY_NUMBER.get(frame.type)

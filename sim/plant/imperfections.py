@@ -1,8 +1,8 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
 Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
-from the rig's, and fingers that do not weigh alike. Not modelled: clock drift, distortion, drifting
-errors, ERAs in other places.
+from the rig's, fingers that do not weigh alike, and crystals of the amplifiers. Not modelled:
+distortion, drifting errors of channels, ERAs in other places.
 """
 
 import cmath
@@ -13,6 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
+from drivers.protocol.table import CLOCK_TURN
 from model.answer.fingers import Finger
 from model.arrays import ComplexArray
 from model.errors import InputError
@@ -29,9 +30,11 @@ from model.structure.attachments import (
 from model.study.exact_plates import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration.convergence import finer_mesh
+from sim.amplifier.clock import Crystal
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
+_CRYSTAL, _WARM_UP = 50e-6, 1e-6  # 50 ppm, and 1 ppm/s either way
 
 
 @dataclass(frozen=True)
@@ -97,13 +100,14 @@ class PlateErrors:
 class Imperfections:
     """Imperfections of a bench, by default none.
 
-    channels: errors by channel; delays [s]: from a command to the base motion, by amplifier; plate:
-    errors of the plate and its ERAs; fingertip: standard deviation of the logarithm of a finger's
-    load; seed: of these loads.
+    channels: errors by channel; delays [s]: from a command to the base motion, by amplifier;
+    crystals: of the clocks, by amplifier; plate: errors of the plate and its ERAs; fingertip:
+    standard deviation of the logarithm of a finger's load; seed: of these loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
     delays: Mapping[str, float] = field(default_factory=dict)
+    crystals: Mapping[str, Crystal] = field(default_factory=dict)
     plate: PlateErrors = field(default_factory=PlateErrors)
     fingertip: float = 0.0
     seed: int = 0
@@ -125,7 +129,7 @@ class Imperfections:
                     f"imperfections: no ERA is wired to channel {channel.number} of amplifier "
                     f"{channel.amplifier}"
                 )
-        for name in self.delays:
+        for name in (*self.delays, *self.crystals):
             if name not in rig.amplifiers:
                 raise InputError(
                     f"imperfections: amplifier must be one of {', '.join(rig.amplifiers)}, "
@@ -135,6 +139,10 @@ class Imperfections:
     def errors_of(self, era: str, rig: Rig) -> ChannelErrors:
         """Errors of the channel to which an ERA is wired."""
         return self.channels.get(rig.wiring[era], ChannelErrors())
+
+    def crystal_of(self, amplifier: str) -> Crystal:
+        """The crystal of an amplifier."""
+        return self.crystals.get(amplifier, Crystal())
 
     def load_of(self, finger: str, fingertip: Fingertip) -> Fingertip:
         """The load of a finger by its id, always the same."""
@@ -159,7 +167,8 @@ class Imperfections:
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
 
-    The plate is solved on another mesh than the rig's, as accurate as `mesh: auto`.
+    Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved on another mesh
+    than the rig's, as accurate as `mesh: auto`.
     """
     rng = np.random.default_rng(seed)
     std = rig.uncertainty
@@ -180,7 +189,7 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         stiffness={era.name: relative(std.stiffness) for era in rig.eras},
         mesh=_other_mesh(rig),
     )
-    return Imperfections(channels, plate=plate, fingertip=std.fingertip, seed=seed)
+    return _drawn(rig, channels, plate, seed)
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
@@ -209,7 +218,25 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
         rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain))
         for era, gain in zip(rig.eras, drawn.gain[0].tolist(), strict=True)
     }
-    return Imperfections(channels, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed)
+    return _drawn(rig, channels, plate, seed)
+
+
+def _drawn(
+    rig: Rig, channels: Mapping[Channel, ChannelErrors], plate: PlateErrors, seed: int
+) -> Imperfections:
+    """Imperfections with the crystals of the amplifiers, which were switched on at any time."""
+    rng = np.random.default_rng([seed, crc32(b"crystals")])
+    crystals = {
+        name: Crystal(
+            error=rng.uniform(-_CRYSTAL, _CRYSTAL),
+            warm_up=rng.choice((-_WARM_UP, _WARM_UP)),
+            ahead=rng.uniform(0, CLOCK_TURN),
+        )
+        for name in rig.amplifiers
+    }
+    return Imperfections(
+        channels, crystals=crystals, plate=plate, fingertip=rig.uncertainty.fingertip, seed=seed
+    )
 
 
 def _other_mesh(rig: Rig) -> PlateMesh:

@@ -3,37 +3,27 @@
 import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 from drivers.playing.playback import Voice
 from model.transients.base_motion import Term, along_lines, raised_cosine
+from sim.amplifier.clock import StraightClock
 
 
-def motion_of(voices: Sequence[Voice], *, stroke: float) -> list[Term]:
-    """Return the motion of a base by the voices of its channel, level 1 being the stroke [m]."""
-    return [term for voice in voices for term in _terms(voice, stroke)]
+def motion_of(
+    voices: Sequence[Voice], clock: StraightClock, *, stroke: float, delay: float = 0.0
+) -> list[Term]:
+    """Return the motion of a base by the voices of its channel, level 1 being the stroke [m].
+
+    clock: of the amplifier, on which angles count; delay [s]: of the base behind its voices.
+    """
+    return [term for voice in voices for term in _terms(voice, clock, stroke, delay)]
 
 
-def _terms(voice: Voice, stroke: float) -> tuple[Term, ...]:
+def _terms(voice: Voice, clock: StraightClock, stroke: float, delay: float) -> tuple[Term, ...]:
     way, omega = voice.transition, 2 * math.pi * voice.frequency
-    factor = stroke * cmath.exp(1j * omega * (way.start - voice.origin))
+    factor = stroke * cmath.exp(1j * omega * clock.at(way.start))
+    start, omega = way.start + delay, omega * clock.pace
     if not way.knots:
-        return raised_cosine(way.start, way.step, omega, factor * way.first, factor * way.last)
+        return raised_cosine(start, way.step, omega, factor * way.first, factor * way.last)
     values = [factor * value for value in (way.first, *way.knots, way.last)]
-    return along_lines(way.start, way.step, omega, values)
-
-
-def delayed(voices: Sequence[Voice], delay: float) -> tuple[Voice, ...]:
-    """Return the voices of a channel, delayed [s]."""
-    return tuple(
-        replace(
-            voice,
-            origin=voice.origin + delay,
-            transition=replace(
-                voice.transition,
-                start=voice.transition.start + delay,
-                end=voice.transition.end + delay,
-            ),
-        )
-        for voice in voices
-    )
+    return along_lines(start, way.step, omega, values)

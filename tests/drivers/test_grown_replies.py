@@ -43,7 +43,7 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
 _FIRST = frozenset(STATUS.names)
 _UNSTATED = [0] * sum(each.words for each in STATUS.added)
 """What the table has added, of an amplifier that states only what is later than the table."""
-_OLDER = 9 + 4 + 8 + len(_UNSTATED)
+_OLDER = 11 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
 _CHECKS = ("capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths")
 

@@ -17,11 +17,11 @@ BROKEN: Broken = {
     "set_accepted_before_arm": ("enabled", lambda: Talk().identified().staged(5, hand.layer(0))),
     "refused_though_staged": (
         "commit",
-        lambda: Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5), 6),
+        lambda: Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5, 0), 6),
     ),
     "another_session_feeds": (
         "session",
-        lambda: Talk().armed().exchange(hand.PING, (8,), hand.status()),
+        lambda: Talk().armed().exchange(hand.PING, (8, 0), hand.status()),
     ),
     "reports_another_set": ("token", lambda: Talk().armed().playing().says(**HALF | {"token": 4})),
     "reports_another_set_of_a_layer": (
@@ -105,7 +105,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .staged(5, LOUD)
-            .sends(hand.COMMIT, (9, 5), address=0)
+            .sends(hand.COMMIT, (9, 5, 0), address=0)
             .says(kind=hand.GET_STATUS)
         ),
     ),
@@ -190,7 +190,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .says(hand.FAULT, fault=hand.ARC, latch=1)
-            .exchange(hand.ARM, (8, 250), hand.status(latch=1))
+            .exchange(hand.ARM, (8, 250, 0), hand.status(latch=1))
         ),
     ),
     "without_a_ramp": (
@@ -231,7 +231,7 @@ BROKEN: Broken = {
             .armed()
             .playing(level=0.7)
             .staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
-            .exchange(hand.COMMIT, (9, 6), hand.status(levels=(7000, 0), **ABOVE))
+            .exchange(hand.COMMIT, (9, 6, 0), hand.status(levels=(7000, 0), **ABOVE))
             .rest(0.03)
             .says(levels=(10000, 0), **ABOVE)
         ),
@@ -272,7 +272,7 @@ BROKEN: Broken = {
             .armed()
             .told("faults", "a", are_on=True)
             .numbered(77)
-            .host_bytes(hand.frame(hand.PING, (9,), sequence=77), flipped=-3)
+            .host_bytes(hand.frame(hand.PING, (9, 0), sequence=77), flipped=-3)
             .rest(0.001)
             .replies(hand.PING, hand.status())
         ),

@@ -1,4 +1,4 @@
-"""Serial frames of protocol 4 written by hand from docs/decisions/0061-protocol-3.md.
+"""Serial frames of protocol 4 written by hand from docs/decisions/0088-protocol-4.md.
 
 None of the product's codecs is used: a frame is 00, COBS of (type, version, address, sequence as
 u16, payload, CRC-32), 00; words are little-endian.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from cobs import cobs
 
-VERSION = 3
+VERSION = 4
 REPLY = 0x80
 HELLO, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP = 1, 2, 3, 4, 5, 6, 7, 8
 GET_STATUS, GET_FAULTS, CLEAR, PING, GET_ACHIEVED, NAK, EVENT = 9, 10, 11, 12, 13, 31, 30
@@ -38,9 +38,9 @@ def raw_frame(
 
 
 def identity(*, serial: str = "7") -> bytes:
-    """Return the payload of the reply to Hello: versions (bit 3), four texts with their lengths."""
+    """Return the payload of the reply to Hello: versions (bit 4), four texts with their lengths."""
     texts = b"".join(bytes([len(text)]) + text.encode() for text in ("v", "p", serial, "1"))
-    return struct.pack("<H", 1 << 3) + texts
+    return struct.pack("<H", 1 << 4) + texts
 
 
 def status(
@@ -51,6 +51,7 @@ def status(
     limited: bool = False,
     latch: int = 0,
     left: int = 250,
+    clock: int = 0,
     token: int = 0,
     levels: Sequence[int] = (0, 0),
     tokens: Sequence[int] = (0, 0, 0, 0),
@@ -59,8 +60,8 @@ def status(
     is_on = state in (ENABLED, SWITCHED_ON) if high_voltage is None else high_voltage
     counts = len(levels) << 8 | len(tokens)
     flags = is_on | limited << 2
-    head = [state, fault, flags, latch, left if state == ENABLED else 0, 250, 1800, token]
-    return [*head, counts, *levels, *tokens]
+    head = [state, fault, flags, latch, left if state == ENABLED else 0, 250, 1800]
+    return [*head, clock >> 16, clock & 0xFFFF, token, counts, *levels, *tokens]
 
 
 def capabilities(*, layers: int = 4) -> list[int]:
@@ -84,6 +85,7 @@ def capabilities(*, layers: int = 4) -> list[int]:
         2000,
         1,
         1000,
+        20,
     ]
     return [*general, *(200, 65535, 10000) * 2]
 

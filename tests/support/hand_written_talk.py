@@ -127,7 +127,7 @@ class Talk:
     def armed(self, *, address: int = 1) -> "Talk":
         """Let it be identified and armed: session 9, watchdog 250 ms."""
         self.identified(address=address)
-        return self.exchange(hand.ARM, (9, 250), hand.status(), address=address)
+        return self.exchange(hand.ARM, (9, 250, 0), hand.status(), address=address)
 
     def staged(self, token: int, *layers: Sequence[int], address: int = 1) -> "Talk":
         """Let a set be staged."""
@@ -138,7 +138,7 @@ class Talk:
     def committed(self, token: int, *, address: int = 1, **status: Any) -> "Talk":
         """Let a set be committed; status: as in the reply."""
         reply = hand.status(token=token, **status)
-        return self.exchange(hand.COMMIT, (9, token), reply, address=address)
+        return self.exchange(hand.COMMIT, (9, token, 0), reply, address=address)
 
     def playing(self, token: int = 5, level: float = 0.5) -> "Talk":
         """Let 100 Hz play at a level on channel 0 in layer 0, and settle."""
@@ -154,7 +154,7 @@ class Talk:
 
     def says(self, state: int = hand.ENABLED, *, kind: int = hand.PING, **status: Any) -> "Talk":
         """Let it be asked, by Ping unless told otherwise, and say how it is."""
-        words = (9,) if kind == hand.PING else ()
+        words = (9, 0) if kind == hand.PING else ()
         return self.exchange(kind, words, hand.status(state, **status))
 
 

@@ -153,7 +153,7 @@ BROKEN: Broken = {
     ),
     "armed_without_identification": (
         "identified",
-        lambda: Talk().told_of("opened").exchange(hand.ARM, (9, 250), hand.status()),
+        lambda: Talk().told_of("opened").exchange(hand.ARM, (9, 250, 0), hand.status()),
     ),
     "request_before_a_reply": (
         "credit",

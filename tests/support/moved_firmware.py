@@ -181,7 +181,7 @@ def request(kind: int, *words: int) -> bytes:
 
 def arm(watchdog_ms: int = 2000) -> bytes:
     """An Arm of the session."""
-    return request(hand.ARM, SESSION, watchdog_ms)
+    return request(hand.ARM, SESSION, watchdog_ms, 0)
 
 
 def apply(token: int, *commands: Sequence[int], ramp_ms: int = 0) -> bytes:

@@ -313,7 +313,7 @@ class _Starts(Chain):
 
         def note(*_: object) -> None:
             tones = [tone for each in amplifier.outputs for tone in each]
-            origins = {tone.origin for tone in tones if tone.transition.last}
+            origins = {tone.began for tone in tones if tone.transition.last}
             self.starts += sorted(origins - {*self.starts})
 
         after_each(self.far.device, note)

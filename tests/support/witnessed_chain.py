@@ -234,7 +234,7 @@ SCENARIOS: Mapping[str, Sequence[Step]] = {
         rest(0.1),
         methodcaller("inject", hand.SET, hand.part(7, hand.layer(0), now=True)),
         *(rest(0.01), operate("arm", rest=0.05), touch(1, rest=0.06)),
-        lambda scene: scene.inject(hand.PING, (scene.amplifier.session % 65535 + 1,)),
+        lambda scene: scene.inject(hand.PING, (scene.amplifier.session % 65535 + 1, 0)),
         *(rest(0.01), touch(rest=0.05)),
     ],
     # The table asks for more than full level on one ERA, 620 Hz, or is damaged: NaN.

@@ -175,7 +175,7 @@ async def greeted(client: Client) -> Values:
     """Read the identity of an amplifier of this version; raises Violation."""
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
-    expect(bool(versions >> VERSION & 1), "versions", expected="bit 3 set", seen=versions)
+    expect(bool(versions >> VERSION & 1), "versions", expected=f"bit {VERSION} set", seen=versions)
     return identity
 
 

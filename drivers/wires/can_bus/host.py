@@ -43,6 +43,7 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
+    has_reply,
     read_event,
     read_nak,
 )
@@ -95,7 +96,8 @@ class CanWire(Wire):
         if name == "Hello":
             start = CanFrame(cob_id("nmt"), bytes((_START, address)))
             frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
-        self._pending = None if address == BROADCAST else (address, number, kind)
+        is_replied = has_reply(address, name, values)
+        self._pending = (address, number, kind) if is_replied else None
         self._requested = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)

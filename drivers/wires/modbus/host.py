@@ -54,6 +54,8 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
+    Written,
+    has_reply,
     read_nak,
     reply_words,
 )
@@ -75,6 +77,7 @@ class _Request:
     tag: int
     message: Message
     frame: bytes
+    has_reply: bool = True
 
 
 class ModbusWire(Wire):
@@ -89,8 +92,10 @@ class ModbusWire(Wire):
         self.delay = delay
         self._baud = baud
         self._is_rtu = is_rtu
+        self.confirms_parts = is_rtu or baud > 0
         self._number = number
         self._request: _Request | None = None
+        self._write: _Request | None = None  # of a set, whose read is on the wire as well
         self._last: _Request | None = None  # that was replied to, and how
         self._replied = Response()
         self._reader = AduReader(is_rtu=is_rtu, of_requests=False, is_host=True)
@@ -104,12 +109,12 @@ class ModbusWire(Wire):
 
         Over TCP a request of all is a frame to each unit that was sent something before.
         """
-        self._request = self._last = None
+        self._request = self._last = self._write = None
         if address == BROADCAST:
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).frame
             sent = [self._written(unit, name, values) for unit in self._sizes]
-            self._unawaited = {each.message.transaction_id for each in sent}
+            self._unawaited.update(each.message.transaction_id for each in sent)
             if self._baud and sent:  # a gateway sends a write once the one before was replied to
                 echo = self._time(ECHO_SIZE) + self.silence + REACTION
                 self.takes += (len(sent) - 1) * (self.takes + echo)
@@ -120,7 +125,26 @@ class ModbusWire(Wire):
             self._request = self._sent(name, 0, message)
         else:
             self._request = self._written(address, name, values)
+            self._request.has_reply = has_reply(address, name, values)
+            if name == "Set" and not self.confirms_parts:
+                return self._without_pause(self._request)
         return self._request.frame
+
+    def _without_pause(self, write: _Request) -> bytes:
+        """Return the frames of a part of a set over a network: of the last one the read, too."""
+        if write.has_reply:
+            self._write, self._request = write, self._read_of(write)
+            return write.frame + self._request.frame
+        self._request = None
+        self._unawaited.add(write.message.transaction_id)
+        return write.frame
+
+    def _read_of(self, write: _Request) -> _Request:
+        """Return the request that reads the reply to one that is written."""
+        unit = write.message.dev_id
+        first = MESSAGES[write.name].number * BOX + REPLY
+        count = HEAD + reply_words(write.name, *self._sizes[unit])
+        return self._sent(write.name, write.tag, Read(dev_id=unit, address=first, count=count))
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""
@@ -136,6 +160,12 @@ class ModbusWire(Wire):
             if adu.transaction in self._unawaited:
                 self._unawaited.remove(adu.transaction)
                 continue
+            if (write := self._write) is not None:
+                if (response := response_to(write.message, adu)) is not None:
+                    self._write = None
+                    if response.exception and (arrival := self._arrival(write, response)):
+                        arrivals.append(arrival)
+                    continue
             response = response_to(sent, adu)
             if request is None or response is None:
                 self.counters.unexpected_frames += 1
@@ -150,11 +180,12 @@ class ModbusWire(Wire):
                 if self._last is request and self._replied != response:
                     arrivals.append(Several(adu.unit))
             elif request.message.function_code == WRITE and not response.exception:
-                first = MESSAGES[request.name].number * BOX + REPLY
-                count = HEAD + reply_words(request.name, *self._sizes[adu.unit])
-                read = Read(dev_id=adu.unit, address=first, count=count)
-                self._request = self._sent(request.name, request.tag, read)
-                arrivals.append(More(self._request.frame))
+                if request.has_reply:
+                    self._request = self._read_of(request)
+                    arrivals.append(More(self._request.frame))
+                else:
+                    self._request, self._last, self._replied = None, request, response
+                    arrivals.append(Written())
             elif (arrival := self._arrival(request, response)) is not None:
                 arrivals.append(arrival)
         return arrivals
@@ -163,7 +194,8 @@ class ModbusWire(Wire):
         """Take the request off the wire: its reply will be unexpected."""
         for adu in self._reader.end():  # a damaged length would take the next responses
             self._count_damaged(adu.raw)
-        self._request, self._damaged = None, b""
+        self._request = self._write = None
+        self._damaged = b""
 
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]: its write."""

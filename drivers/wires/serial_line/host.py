@@ -12,7 +12,6 @@ from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
-    BROADCAST,
     BY_NUMBER,
     EVENT,
     HELLO,
@@ -39,6 +38,7 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
+    has_reply,
     read_event,
     read_nak,
 )
@@ -70,7 +70,7 @@ class SerialWire(Wire):
             kind, version, words = message.number, VERSION, message.request.append([], values)
         frame = Frame(kind, address, self._sequence, b"", version)
         data = encode_frame(frame, words)
-        self._pending = None if address == BROADCAST else frame
+        self._pending = frame if has_reply(address, name, values) else None
         self.counters.frames_out += 1
         self.takes = self._byte_time * len(data)
         return data

@@ -41,6 +41,8 @@ extern struct sound_format sound_format;
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
+#define CLOCK_ERROR (10000000 / SAMPLE_RATE) // 0.1 us; a reading is that of the next sample
+
 #define FAULTS_KEPT 16
 
 #endif

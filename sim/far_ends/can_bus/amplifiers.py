@@ -173,19 +173,19 @@ class _Node:
             self.carry_out(message, now)
 
     def carry_out(self, message: Message, now: float) -> None:
-        """Carry out a message; only one with a number has a reply."""
+        """Carry out a message; one without a number has no reply, nor a part of a set."""
         sender = self.number
         try:
             kind, words = message.type, self._words(message, now)
         except Refusal as refusal:
             kind, words = NAK, nak_of(refusal, message.type)
-        if message.number:
+        if message.number and words:
             self._put(REPLY + sender, *segments(message.number, kind, words))
         if self.number != sender:
             self.boot(now)
 
     def _words(self, message: Message, now: float) -> list[int]:
-        """Carry out a request; returns the words of its reply. Raises Refusal."""
+        """Carry out a request; returns the words of its reply, if any. Raises Refusal."""
         if message.type == HELLO:
             return IDENTITY.pack(self._amplifier.identity)
         name, values = read_request(message.type, message.words)
@@ -194,7 +194,7 @@ class _Node:
         reply = self._amplifier.handle(name, values, now)
         if name == "SetAddress":
             self.number = values["address"]
-        return BY_NUMBER[message.type].reply.pack(reply)
+        return BY_NUMBER[message.type].reply.pack(reply) if reply else []
 
     def _leave(self, state: int, now: float) -> None:
         """Stop what plays, then leave the state in which there are requests."""

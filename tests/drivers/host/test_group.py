@@ -41,7 +41,7 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
         for end in ends:
             assert all(end.levels(name) == [0.7, 0.1] for name in end.hosts)
         origins = [
-            {round(voice.origin, 4) for voice in far.playback.all_voices[1]}
+            {round(voice.began, 4) for voice in far.playback.all_voices[1]}
             for end in ends
             for far in end.far.values()
         ]

@@ -41,7 +41,7 @@ def timed_line(name: str, amplifier: str) -> MemoryLine:
 
 def started(end: MemoryLine) -> list[float]:
     """When the tones of all amplifiers of a line began."""
-    return [voice.origin for far in end.far.values() for voice in far.playback.all_voices[0]]
+    return [voice.began for far in end.far.values() for voice in far.playback.all_voices[0]]
 
 
 @pytest.mark.parametrize("names", [*combinations(LINES, 2)], ids="-".join)
@@ -204,8 +204,8 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
         await group.apply({"a": [loud(0, 0.5)]})
         await group.beat()
     after = ends[1].far["b"].playback.all_voices[0]
-    assert [(each.origin, each.layer) for each in after] == [
-        (each.origin, each.layer) for each in before
+    assert [(each.began, each.layer) for each in after] == [
+        (each.began, each.layer) for each in before
     ]
     await group.apply({name: [loud(0, 0.2)] for name in group.amplifiers})
     await group.silence(0.0)

@@ -40,7 +40,21 @@ def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() ->
     playback.commit([layer(0, tone(level=0, onset=short), tone(1, onset=long))], 1, 0.0)
     playback.commit([layer(0, tone(keep_phase=True), after=True)], 2, 0.01)
     playback.advance(1.0)
-    assert [voice.origin for voice in playback.all_voices[0]] == pytest.approx([0.04])
+    assert [voice.began for voice in playback.all_voices[0]] == pytest.approx([0.04])
+
+
+def test_tones_of_one_frequency_interfere_whenever_they_began() -> None:
+    """By hand: 0.3, 0.4 i and -0.3 of 99.95 Hz add to 0.7 or less, however far apart they begin."""
+    playback = Playback(1, 8)
+    for number, (time, level, phase, sum_of_all) in enumerate(
+        [(0.0, 3000, 0, 0.3), (1.2345, 4000, 9000, 0.5), (7.7777, 3000, 18000, 0.4)]
+    ):
+        one = Command(0, 1999, level, phase)
+        playback.commit([LayerSet(number, 0, 0, (one,))], number + 1, time)
+        assert playback.level(0, time) == pytest.approx(sum_of_all)
+    other = Command(0, 2000, 1000, 0)
+    playback.commit([LayerSet(3, 0, 0, (other,))], 4, 8.0)
+    assert playback.level(0, 9.0) == pytest.approx(0.4 + 0.1)
 
 
 def test_random_sets_never_jump_and_keep_their_bounds() -> None:

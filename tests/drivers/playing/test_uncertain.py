@@ -134,12 +134,14 @@ def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
 
 
 def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:
-    """By hand: 0.5 at 20 Hz lasts, whatever three tones of 0.3 at 110 Hz make of one another."""
+    """By hand: 0.5 at 20 Hz lasts; three tones of 0.3 at 110 Hz cancel, or are added up to 0.9."""
     bounds = UncertainPlayback(Playback(1, 8))
-    for number, (frequency, level) in enumerate([(400, 5000), *[(2200, 3000)] * 3]):
-        one = LayerSet(number, 0, 0, (Command(0, frequency, level, 0),))
+    thirds = [(2200, 3000, degrees) for degrees in (0, 12000, -12000)]
+    for number, (frequency, level, phase) in enumerate([(400, 5000, 0), *thirds]):
+        one = LayerSet(number, 0, 0, (Command(0, frequency, level, phase),))
         bounds.commit([one], number + 1, (0.1 * number, 0.1 * number + 0.001))
     assert bounds.bounds(0, 1.0, 1.01) == pytest.approx((0.5, 1.4))
+    assert bounds.bounds(0, 1.0, 1.01, is_exact=True) == pytest.approx((0.5, 0.5))
 
 
 def test_bounds_are_no_wider_than_need_be() -> None:

@@ -8,6 +8,7 @@ import pytest
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import (
     Assembly,
+    is_last,
     pack_layers,
     parts,
     unpack_layers,
@@ -49,28 +50,30 @@ def test_stream_that_no_host_may_send_is_refused(
 
 
 def test_set_is_whole_whatever_the_order_of_its_parts() -> None:
-    """Three parts in all orders, each once more at the end, give the stream that was cut."""
+    """The parts but the last, in both orders and one again, give the stream that was cut."""
     stream = list(range(300))
-    cut = list(parts(stream, session=9, token=7, now=False))
-    assert [len(MESSAGES["Set"].request.pack(part)) for part in cut] == [120, 120, 69]
-    for order in permutations(cut):
+    *others, last = parts(stream, session=9, token=7, now=False)
+    assert [len(MESSAGES["Set"].request.pack(part)) for part in (*others, last)] == [120, 120, 69]
+    assert [is_last(part) for part in (*others, last)] == [False, False, True]
+    for order in permutations(others):
         assembly = Assembly()
-        results = [assembly.add(part, 0.1, 512) for part in (*order, order[0])]
-        assert results == [None, None, stream, stream]
+        assert [assembly.keep(part, 0.1) for part in (*order, order[0])] == [True] * 3
+        assert assembly.whole(last) == stream
 
 
 def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
-    """A newer token drops what was collected, and so does the time that a set may take."""
-    old, new = (list(parts([token] * 200, session=9, token=token, now=False)) for token in (1, 2))
+    """Another token drops what was collected, and so does the time that a set may take."""
+    old, new = (parts([token] * 300, session=9, token=token, now=False) for token in (1, 2))
     assembly = Assembly()
-    assert assembly.add(old[0], 0.0, 512) is None
-    assert assembly.add(new[1], 0.1, 512) is None
-    assert assembly.missing == 0
-    assert assembly.add(new[0], 0.1 + STAGED_LIFE + 0.01, 512) is None
-    assert assembly.missing == 1
-    assert assembly.add(new[1], 0.2 + STAGED_LIFE, 512) == [2] * 200
-    with pytest.raises(Refusal):
-        Assembly().add(old[0], 0.0, 100)
+    assert assembly.keep(old[0], 0.0)
+    assert assembly.keep(new[1], 0.1)
+    assert assembly.whole(new[2]) == 0
+    assert assembly.keep(new[0], 0.1 + STAGED_LIFE + 0.01)
+    assert assembly.whole(new[2]) == 1
+    assert not assembly.keep({**new[1], "parts": 4}, 1.2)
+    assert assembly.keep(new[1], 0.2 + STAGED_LIFE)
+    assert assembly.whole(new[2]) == [2] * 300
+    assert assembly.whole(old[2]) == 0
 
 
 def test_damaged_streams_are_read_or_refused() -> None:

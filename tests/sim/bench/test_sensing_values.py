@@ -55,7 +55,7 @@ def reading(bench: Bench, now: float, name: str = "main") -> Values:
 async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) -> None:
     """Amplitude and phase of two tones at four feet and at 28 places more, two a reply: 2 %.
 
-    Against the sparse direct solve; t counts from the commit.
+    Against the sparse direct solve; phases count on the clock, whenever the set was committed.
     """
     frequencies = [110.0 + 20 * number for number in range(16)]
     x = np.linspace(0.02, 0.28, 28)
@@ -99,19 +99,21 @@ def test_what_changes_disturbs_a_reading_and_a_renewal_does_not(coarse_rig: Rig)
             play(bench, 2, *what, now=5.25)
         found = reading(bench, 5.6)
         assert READING_STATES[state] == found["state"]
-        assert (found["reading"], found["token"], found["window_start"]) == (number, 1, 100_000)
+        # 5.2 s of the 20 s in which 2^32 steps go round.
+        assert (found["reading"], found["token"]) == (number, 1)
+        assert found["window_start"] == round(5.2 / 20 * 2**32)
         bench.exchange("main", "Stop", {"ramp": 0}, now=5.7)
         assert reading(bench, 5.8)["state"] == found["state"]
 
 
-def test_reading_without_a_set_counts_from_its_window(coarse_rig: Rig) -> None:
+def test_reading_without_a_set_has_no_token(coarse_rig: Rig) -> None:
     """After arming no token is there, whatever was played before."""
     bench = bench_of(coarse_rig)
     play(bench, 7, LayerSet(0, 0, 0, (Command(0, 2200, 1000, 0),)), now=5.1)
     bench.exchange("main", "Disarm", {"ramp": 0}, now=5.2)
     bench.exchange("main", "Arm", {"session": SESSION + 1, "watchdog": 2000, "shift": 0}, now=5.3)
     found = measure(bench, 1, 110.0, now=5.4, window=100)
-    assert (found["token"], found["window_start"]) == (0, 0)
+    assert found["token"] == 0
     bench.amplifiers["main"].restart(5.45)
     assert reading(bench, 5.6) == {
         **dict.fromkeys(("reading", "state", "window_left", "window_start", "token"), 0),

@@ -23,6 +23,7 @@ from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Fingertip
 from plate_in_time import lock_in
+from sim.amplifier.clock import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.imperfections import (
     ChannelErrors,
@@ -30,10 +31,11 @@ from sim.plant.imperfections import (
     PlateErrors,
     draw_imperfections,
 )
-from sim.plant.voiced_base import delayed, motion_of
+from sim.plant.voiced_base import motion_of
 
 AT = (0.08, 0.06)
 PERFECT = Imperfections()
+EXACT = StraightClock(0.0, 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -221,10 +223,7 @@ STROKE = 1e-4
 def defined(voices: tuple[Voice, ...], time: float) -> float:
     """Displacement [m] at a time [s]: the sum of sinusoids of the protocol."""
     return STROKE * sum(
-        (
-            voice.transition.at(time)
-            * cmath.exp(2j * math.pi * voice.frequency * (time - voice.origin))
-        ).imag
+        (voice.transition.at(time) * cmath.exp(2j * math.pi * voice.frequency * time)).imag
         for voice in voices
     )
 
@@ -246,7 +245,7 @@ def test_base_moves_by_its_voices(seed: int, late: float) -> None:
         )
         ramp = random_.choice((0, 5, 30))
         playback.commit([LayerSet(random_.randrange(2), ramp, 0, (command,))], token, now)
-        motion = motion_of(delayed(playback.all_voices[0], late), stroke=STROKE)
+        motion = motion_of(playback.all_voices[0], EXACT, stroke=STROKE, delay=late)
         for _ in range(5):
             now += random_.uniform(0.0005, 0.004)
             moved = sampled(motion, np.array([now + late]))[0]
@@ -258,6 +257,6 @@ def test_pieces_of_an_envelope_join(start: float) -> None:
     """One piece plays at any moment: there is no gap by rounding that a sample could fall into."""
     knots = tuple(0.01j * n for n in range(1, 19))
     way = Transition(start, 0.005, 0j, 0.19j, start + 0.095, knots)
-    terms = motion_of([Voice(0, 80.0, start, way)], stroke=1e-4)
+    terms = motion_of([Voice(0, 80.0, start, way)], EXACT, stroke=1e-4)
     assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
     assert (terms[0].start, terms[-1].end) == (start, math.inf)

@@ -117,7 +117,7 @@ def test_layer_may_have_ended_by_itself_just_before_a_set(
     """
     talk = Talk().armed()
     talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=40, valid_for=60))
-    talk.sends(hand.COMMIT, (9, 5)).rest(0.012)
+    talk.sends(hand.COMMIT, (9, 5, 0)).rest(0.012)
     talk.replies(hand.COMMIT, hand.status(token=5, tokens=(5, 0, 0, 0)))
     talk.rest(0.049).staged(6, hand.layer(0, ramp=40)).committed(6, levels=(4878, 0))
     assert talk.rest(after).says(token=6, levels=(level, 0)).found == broken
@@ -142,7 +142,7 @@ def test_arm_may_be_withdrawn_before_its_reply() -> None:
     """It was carried out, so that the set committed last is none."""
     talk = Talk().armed().playing()
     talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **FADING)).rest(0.01)
-    talk.sends(hand.ARM, (8, 250))
+    talk.sends(hand.ARM, (8, 250, 0))
     talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, token=0))
     assert "token" not in talk.found
 
@@ -179,7 +179,7 @@ def test_stop_is_over_where_the_amplifier_has_restarted(latch: int, broken: bool
     talk = Talk().armed()
     talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
     talk.says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=latch)
-    talk.exchange(hand.ARM, (10, 250), hand.status(latch=latch))
+    talk.exchange(hand.ARM, (10, 250, 0), hand.status(latch=latch))
     assert ("stop" in talk.found) is broken
 
 
@@ -193,7 +193,7 @@ def test_stop_that_was_not_heard_is_over_for_a_host_that_opens_the_wire_again(
     talk = Talk().armed().told("faults", "a", are_on=True)
     talk.sends(hand.STOP, (5,)).rest(0.3).told("faults", "a", are_on=False)
     talk.told_of("closed").rest(0.6).told_of("opened").identified(state, latch=1)
-    talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
+    talk.exchange(hand.ARM, (10, 250, 0), hand.status(latch=1))
     assert sorted({*talk.found}) == broken
 
 

@@ -1,0 +1,105 @@
+"""The clocks of all amplifiers of a plate: how well they agree, and what more is read of them.
+
+Where heartbeats alone do not show a clock well enough, on USB of full speed or in a busy network,
+statuses are read between them, as seldom as the line allows, and given up for whatever is sent
+next. On a line that several share one Mark lets all keep the clock of the same byte, so that what
+delays it is common to all of them.
+"""
+
+import asyncio
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from drivers.host.amplifier import Amplifier
+from drivers.host.clock_fit import WINDOW
+from drivers.host.jobs import Priority
+from drivers.host.line import GRACE, Line
+from drivers.protocol.table import has_feature
+from drivers.protocol.timing import HEARTBEAT
+
+_GOOD = 5e-6  # s; an error that costs nothing of a promise
+_MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
+_INTERVAL = 0.01  # s, at least, between these
+
+
+class Clocks:
+    """The clocks of amplifiers by name, whose lines are open."""
+
+    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        self._amplifiers = amplifiers
+        for each in amplifiers.values():
+            each.clock.is_alone = len(amplifiers) == 1
+        self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+        self._marked_from: dict[Line, float] = {}  # s; since when only marks are read
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """Errors of the clocks against each other [s rms] by amplifier; infinite: not held.
+
+        That which an amplifier states, that of what is seen of its clock, and where lines or
+        amplifiers differ half of the shortest exchange less its bits, of which no exchange shows
+        how it is shared by its two ways. 0 for one alone.
+        """
+        amplifiers = self._amplifiers
+        if len(amplifiers) == 1:
+            return dict.fromkeys(amplifiers, 0.0)
+        is_alike = len({_kind(each) for each in amplifiers.values()}) == 1
+        errors: dict[str, float] = {}
+        for name, each in amplifiers.items():
+            now = each.line.time()
+            shown = each.clock.error(now, is_common=self._is_common(each.line, now))
+            errors[name] = shown if is_alike else math.hypot(shown, each.clock.shortest / 2)
+        return errors
+
+    def look(self, line: Line, of_line: Sequence[Amplifier]) -> None:
+        """Read clocks of a line beside its heartbeat, which goes out next, as far as needed."""
+        if len(self._amplifiers) == 1:
+            return
+        now = line.time()
+        needed = [
+            each
+            for each in of_line
+            if each.clock.can_be_steered and each.clock.scatter(now) > _GOOD
+        ]
+        if line in self._marked_from or (needed and _has_marks(of_line)):
+            self._marked_from.setdefault(line, now)
+            for each in of_line:
+                each.clock.takes_marks = True
+            line.submit(None, Priority.HEARTBEAT, "Mark", {})
+        elif line.late <= GRACE:
+            takes = sum([each.exchange_time("GetStatus") for each in needed])
+            interval = max(_INTERVAL, takes / _MAX_LOAD)
+            for number in range(1, int(HEARTBEAT / interval)):
+                asyncio.get_running_loop().call_later(number * interval, self._read, needed)
+
+    def _read(self, amplifiers: Sequence[Amplifier]) -> None:
+        """Read the statuses of amplifiers that reply and are not being read."""
+        for each in amplifiers:
+            reading = self._readings.get(each)
+            is_free = reading is None or reading.done()
+            if is_free and each.silence_cause is None and each.line.loss is None:
+                self._readings[each] = each.read_status(Priority.READING)
+
+    def _is_common(self, line: Line, now: float) -> bool:
+        """Whether what delays readings of a line delays those of all amplifiers alike."""
+        is_only = all(each.line is line for each in self._amplifiers.values())
+        return is_only and now - self._marked_from.get(line, math.inf) > WINDOW
+
+
+def _has_marks(of_line: Sequence[Amplifier]) -> bool:
+    """Whether several amplifiers share a line, and all keep the clock of a Mark."""
+    return len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line)
+
+
+def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
+    """Return what an amplifier and its line have in common with those of equal delays."""
+    line, identity = amplifier.line, amplifier.identity
+    device = re.match(r"/.*/(\D*)", line.name)
+    return (
+        type(line.wire),
+        amplifier.status_time,
+        device and device[1],
+        *(identity.get(each) for each in ("vendor", "product", "firmware")),
+    )

@@ -20,7 +20,7 @@ _logger = logging.getLogger(__name__)
 
 
 class CountedClocks:
-    """Errors by amplifier of a rig; now: gives those that are known, rms [s], infinite if unknown."""
+    """Errors by amplifier of a rig; now: gives what is known, rms [s], infinite if unknown."""
 
     def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
         self._rig, self._now = rig, now

@@ -1,4 +1,4 @@
-"""How the amplifiers of a rig are connected, and how closely a host then holds their clocks together.
+"""How the amplifiers of a rig are connected, and how closely their clocks are then held.
 
 For `era config check`, by their URLs alone; a daemon counts what it sees on the lines themselves.
 """

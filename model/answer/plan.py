@@ -73,7 +73,7 @@ def answer(
     bands allow it; bands_may_swap: whether a finger may have the band of another one;
     min_contrast_db: below which the promise at the worst finger is not served as requested;
     limits: of the amplifiers. A stimulus whose modulation would leave a finger unserved, or whose
-    side bands do not fit, is steady, as is a shared one, and all where clocks are not held together.
+    side bands do not fit, is steady, as is a shared one, and all where clocks are not held.
     Levels are lowered where stroke and limits do not allow all: of the lower priorities first, of
     one priority the louder ones first.
     Raises InputError for fingers that contradict each other, and a band without frequencies.

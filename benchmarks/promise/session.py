@@ -9,7 +9,7 @@ import math
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -29,6 +29,7 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from registry import clock
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
+from sim.transport.line_kinds import PROMPT
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the chain
 _chain: Any = import_module("chain").Chain
@@ -131,12 +132,21 @@ class _Session:
         self._wanted = _Wanted()
         self._last = case.contents - 1
 
+    @property
+    def _wires(self) -> Wire | dict[str, Wire]:
+        """One line of all amplifiers, or one of each."""
+        case = self._case
+        kind = case.line or PROMPT
+        one = Wire("serial", speed=921_600, shared=True, line_kind=kind, seed=self._drawn.seed)
+        if case.is_one_bus:
+            return one
+        return {name: replace(one, shared=False, line=name) for name in self._rig.amplifiers}
+
     async def run(self) -> Outcome:
         """All fingers at once, then each event."""
-        wire = Wire("serial", speed=921_600, shared=True)
         on: Any
         async with _chain.armed(
-            wire,
+            self._wires,
             self._rig,
             self._case.table,
             intent_source=self._wanted,
@@ -152,6 +162,8 @@ class _Session:
                 self._wanted.targets[id] = {"band": band}
             self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
             on.at = dict(enumerate(self._places))
+            if case.resting:
+                await on.hold(case.resting)
             before = first = await self._settled(on)
             events = []
             for name in case.events:

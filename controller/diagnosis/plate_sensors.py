@@ -101,15 +101,15 @@ def _of_amplifier(
         if derivatives is None:
             unused.append(f"sensor {name} measures {sensor.unit.lower()}")
         elif era:
-            place = Sensor(era, era)
+            place = Sensor(era, era, amplifier=amplifier)
             if any(each.place == place for each in used):
-                place = Sensor(name, era)
+                place = Sensor(name, era, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
         elif sensor.channel is not None:
             unused.append(f"sensor {name} is at channel {sensor.channel}, which has no ERA")
         elif sensor.x is None or sensor.y is None:
             unused.append(f"sensor {name} states no place")
         else:
-            place = Sensor(name, x=sensor.x, y=sensor.y)
+            place = Sensor(name, x=sensor.x, y=sensor.y, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
     return used, unused

@@ -8,60 +8,30 @@ crystal's and leads the rest to zero: soon while nothing plays, else within what
 clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
 """
 
-import logging
 import math
-from typing import Literal
 
 from drivers.host.clock_fit import ClockFit
-from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead, clock_at
+from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, ahead, clock_at
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
-SETTLING = 3.0
-"""Seconds within which a clock must follow, and for which one that has jumped is not trusted."""
-MAX_RATE = 2e-4
-"""Of a crystal against the host's; one that is faster or slower is broken."""
-_STEP = HIGH_STEPS * CLOCK_TURN / SPAN  # s; of shift
 _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
-_SHIFTS = 1 << 16
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _SILENT = 0.2, 3e-3  # longer than a Ping is late
-_SEEN = 5e-5  # error of a rate below which it is judged
+_COMMON = 0.2  # of an error, between clocks that were read by the same Marks
+_SURELY = 4.0  # standard errors
 _UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
 _SLACK = 50e-6  # s; what is computed of bits and read of clocks, at the most
-_logger = logging.getLogger(__name__)
-
-ClockProblem = Literal["not_steered", "jumped", "crystal", "unsettled"]
-
-PROBLEMS: dict[ClockProblem, tuple[str, str]] = {
-    "not_steered": (
-        "its clock cannot be steered: what its ERAs play is not held to the other amplifiers",
-        "none is needed for a plate on one amplifier; else update its firmware, or exchange it",
-    ),
-    "jumped": (
-        "its clock jumps, stands still, or is read wrong by more than it states",
-        "check its clock and clock_error (era amp conformance); the promise is lowered meanwhile",
-    ),
-    "crystal": (
-        f"its clock runs more than {MAX_RATE * 1e6:g} ppm too fast or too slow",
-        "check its crystal and what it counts; the promise is lowered meanwhile",
-    ),
-    "unsettled": (
-        f"its clock does not follow the host within {SETTLING:g} s",
-        "check its rate and shift (era amp conformance); the promise is lowered meanwhile",
-    ),
-}
-"""Cause and remedy of what ails a clock, by kind."""
 
 
 class HeldClock:
-    """The clock of an amplifier of a name, by its messages; times [s] are of the host's clock.
+    """The clock of an amplifier, by its messages; times [s] are of the host's clock.
 
     stated: its `clock_error` as of the wire, known once it is identified.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self) -> None:
         self.stated = CLOCK_UNKNOWN
         self.shortest = math.inf
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
@@ -69,10 +39,9 @@ class HeldClock:
         """Whether it is held together with no other one."""
         self.takes_marks = False
         """Whether only readings of a Mark count, whose delay all on a line have in common."""
-        self._said: set[ClockProblem] = set()
         self._rate = 0
-        self._arrives = 0.0  # of the last request
-        self._marked: float | None = None
+        self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
+        self._mark: tuple[float, float] | None = None
         self._arming = 0  # the shift of an Arm without a reply
         self._is_armed = False
         self._jumped_at = -math.inf
@@ -103,11 +72,12 @@ class HeldClock:
         While armed with what is still to be led to zero. is_common: against those of others whose
         readings have the same errors.
         """
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "jumped":
+        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return math.inf
         lead = self.lead(time) if self._is_armed else 0.0
         stated = _ERROR.from_wire(self.stated) / math.sqrt(3)
-        return math.hypot(stated, 0.0 if is_common else self._fit.error(time), lead)
+        seen = self._fit.error(time) * (_COMMON if is_common else 1.0)
+        return math.hypot(stated, seen, lead)
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its readings [s]; infinite before the first."""
@@ -116,33 +86,33 @@ class HeldClock:
     def problem(self, time: float) -> ClockProblem | None:
         """Return what ails it at a time [s]; None if nothing."""
         if not self.can_be_steered:
-            return "not_steered"
-        if time - self._jumped_at < SETTLING:
-            return "jumped"
-        if self._fit and self._fit.rate_error < _SEEN and abs(self._fit.rate) > MAX_RATE:
-            return "crystal"
-        return "unsettled" if time - self._led_from > SETTLING else None
+            return None if self.is_alone else "clock_not_steered"
+        if time - self._jumped_at < CLOCK_SETTLING:
+            return "clock_jumped"
+        if self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_CLOCK_RATE:
+            return "clock_rate"
+        return "clock_unsettled" if time - self._led_from > CLOCK_SETTLING else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
         if not self.can_be_steered:
             return 0
-        return round(-self.lead(time) / _STEP) % _SHIFTS
+        return round(-self.lead(time) / HIGH_TIME) % HIGH_WORDS
 
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "jumped":
+        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return self._rate
         within, most = _PLAYING if is_playing else _SILENT
         rate = min(max(-self.lead(time) / within, -most), most) - self._fit.rate
         return min(max(round(rate * _RATE.per_unit), _RATE.minimum), _RATE.maximum)
 
-    def sent(self, name: str, values: Values, arrives: float) -> None:
-        """Note a request that arrives at a time [s] at the soonest."""
+    def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that is sent now and arrives at a time [s] at the soonest."""
         if name == "Mark":
-            self._marked = arrives
+            self._mark = now, arrives
             return
-        self._arrives = arrives
+        self._request = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
 
@@ -150,48 +120,51 @@ class HeldClock:
         self, name: str, values: Values, status: Values, received: float, *, bits: float
     ) -> None:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
-        time = self._arrives if self._marked is None else self._marked
-        time = min(time, received)
-        is_kept = self._marked is not None or not self.takes_marks
-        self._marked = None
+        is_kept = self._mark is not None or not self.takes_marks
+        sent, arrives = self._mark or self._request
+        time = min(arrives, received)
+        self._mark = None
         is_armed = status["state"] == ENABLED
         has_left = self._is_armed and not is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and is_armed:
-            steps = (values["shift"] + _SHIFTS // 2) % _SHIFTS - _SHIFTS // 2
-            self._added += steps * _STEP
+            steps = (values["shift"] + HIGH_WORDS // 2) % HIGH_WORDS - HIGH_WORDS // 2
+            self._added += steps * HIGH_TIME
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
         was_armed, self._is_armed = self._is_armed, is_armed
         if is_kept or not self._fit:
-            self._read(status["clock"], time, received, is_told=is_armed and was_armed)
+            bounds = time - sent, received - time
+            self._read(status["clock"], time, bounds, is_told=is_armed and was_armed)
         if name == "Ping" and is_armed:
             self._run(values["rate"])
         elif not is_armed:
             self._run(0)
         self._watch(time)
 
-    def _read(self, clock: int, time: float, received: float, *, is_told: bool) -> None:
-        """Take a reading of a time [s] or later, until it was received.
+    def _read(self, clock: int, time: float, bounds: tuple[float, float], *, is_told: bool) -> None:
+        """Take a reading of a time, so much earlier [s] at the most, or so much later.
 
         is_told: whether a jump is said, since no restart explains it.
         """
+        earlier, later = bounds
         added = self._added_until(time)
         expected = self._fit.lead(time) + added if self._fit else 0.0
         lead = expected + ahead(clock, clock_at(time + expected)) - added
         slack = _SLACK + (_ERROR.from_wire(self.stated) if self.can_be_steered else 0.0)
-        drift = 2 * MAX_RATE * (time - self._bounded_at)
-        lowest = max(self._low - drift, lead - (received - time) - slack)
-        highest = min(self._high + drift, lead + slack)
-        if has_jumped := lowest > highest:
-            self._jumped_at = time if is_told else self._jumped_at
+        drift = 2 * MAX_CLOCK_RATE * (time - self._bounded_at)
+        lowest = max(self._low - drift, lead - later - slack)
+        highest = min(self._high + drift, lead + earlier + slack)
+        has_jumped = lowest > highest
+        if has_jumped and is_told:
+            self._jumped_at = time
         if has_jumped or self._fit.has_moved(time, lead):
             self._forget(time)
             lead = ahead(clock, clock_at(time))
-            lowest, highest = lead - (received - time) - slack, lead + slack
+            lowest, highest = lead - later - slack, lead + earlier + slack
         self._low, self._high, self._bounded_at = lowest, highest, time
-        self._fit.add(time, lead, received - time)
+        self._fit.add(time, lead, later)
 
     def _added_until(self, time: float) -> float:
         return self._added + self._rate / _RATE.per_unit * (time - self._added_at)
@@ -199,20 +172,14 @@ class HeldClock:
     def _run(self, rate: int) -> None:
         """Note that it runs by a rate since the last request came."""
         if rate != self._rate:
-            self._added, self._added_at = self._added_until(self._arrives), self._arrives
+            arrives = self._request[1]
+            self._added, self._added_at = self._added_until(arrives), arrives
             self._rate = rate
 
     def _watch(self, time: float) -> None:
-        """Note if it follows, and say once what ails it."""
+        """Note since when it does not follow."""
         least, errors = _UNSETTLED
         if not self._is_armed or abs(self.lead(time)) <= max(least, errors * self.scatter(time)):
             self._led_from = math.inf
         else:
             self._led_from = min(self._led_from, time)
-        problem = self.problem(time)
-        if self.is_alone and problem == "not_steered":
-            return
-        if problem is not None and problem not in self._said:
-            self._said.add(problem)
-            cause, remedy = PROBLEMS[problem]
-            _logger.warning("amplifier %s: %s", self._name, cause, extra={"remedy": remedy})

@@ -22,6 +22,8 @@ from drivers.protocol.timing import HEARTBEAT
 _GOOD = 5e-6  # s; an error that costs nothing of a promise
 _MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
 _INTERVAL = 0.01  # s, at least, between these
+_FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
 
 class Clocks:
@@ -31,6 +33,7 @@ class Clocks:
         self._amplifiers = amplifiers
         for each in amplifiers.values():
             each.clock.is_alone = len(amplifiers) == 1
+        self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
         self._marked_from: dict[Line, float] = {}  # s; since when only marks are read
 
@@ -67,12 +70,18 @@ class Clocks:
             self._marked_from.setdefault(line, now)
             for each in of_line:
                 each.clock.takes_marks = True
-            line.submit(None, Priority.HEARTBEAT, "Mark", {})
+            asyncio.get_running_loop().call_later(self._later(_INTERVAL), _mark, line)
         elif line.late <= GRACE:
             takes = sum([each.exchange_time("GetStatus") for each in needed])
             interval = max(_INTERVAL, takes / _MAX_LOAD)
             for number in range(1, int(HEARTBEAT / interval)):
-                asyncio.get_running_loop().call_later(number * interval, self._read, needed)
+                later = self._later(number * interval)
+                asyncio.get_running_loop().call_later(later, self._read, needed)
+
+    def _later(self, duration: float) -> float:
+        """Return a duration [s] and some of a frame."""
+        self._dither = (self._dither + _GOLDEN) % 1.0
+        return duration + self._dither * _FRAME
 
     def _read(self, amplifiers: Sequence[Amplifier]) -> None:
         """Read the statuses of amplifiers that reply and are not being read."""
@@ -91,6 +100,11 @@ class Clocks:
 def _has_marks(of_line: Sequence[Amplifier]) -> bool:
     """Whether several amplifiers share a line, and all keep the clock of a Mark."""
     return len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line)
+
+
+def _mark(line: Line) -> None:
+    """Have all amplifiers of a line keep their clocks, for their next statuses."""
+    line.submit(None, Priority.HEARTBEAT, "Mark", {})
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

@@ -33,7 +33,7 @@ from drivers.host.reports import (
 from drivers.playing.contents import Layer
 from drivers.protocol.clock import clock_at, high_word, moment_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
+from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
@@ -110,7 +110,7 @@ class Dialogue:
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
         """What it may play by what is known beside its statuses and what fed it."""
-        self.clock = HeldClock(name)
+        self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
@@ -286,7 +286,7 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        self.clock.sent(name, values, arrives)
+        self.clock.sent(name, values, now, arrives)
         if name == "Hello":
             return
         feeding = self.feeding
@@ -310,10 +310,10 @@ class Dialogue:
             self._admitted = None
             self.played_at = now if name == "Silence" else self.played_at
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
-            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
-            if name == "Commit" or is_last:
+            is_now = name == "Set" and values["now"] and is_last(values)
+            if name == "Commit" or is_now:
                 self.played_at = now
-                starts = None if is_last else moment_of(values["at"], now)
+                starts = None if is_now else moment_of(values["at"], now)
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
@@ -341,7 +341,7 @@ class Dialogue:
             self.latch = latch
         self.status, self.status_at = reply, now
         self.clock.replied(name, values, reply, now, bits=self.status_time)
-        for kind in reports_of(reply):
+        for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:

@@ -6,6 +6,7 @@ moment that is ahead for the slowest. On one alone it plays with its last part. 
 commits one that changes nothing before.
 """
 
+import asyncio
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
@@ -76,7 +77,8 @@ class JointSets:
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
-        is_now = len(layers) == 1 or all(map(is_silence, layers.values()))
+        is_silent = all(map(is_silence, layers.values()))
+        is_now = is_silent or len(layers) == 1
         began = clock.now()
         amplifiers: list[Amplifier] = []
         staging: list[Awaitable[Staged]] = []
@@ -86,10 +88,12 @@ class JointSets:
                 staging.append(each.stage(token, layers[each.name], now=is_now))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
-        has_failed = is_now and len(layers) > 1
+        has_failed = is_silent
         for each, result in zip(amplifiers, results, strict=True):
-            if isinstance(result, CommandRefused) and not (result.is_disarmed or result.may_play):
-                if not isinstance(result, Preempted):
+            if isinstance(result, CommandRefused) and not result.is_disarmed:
+                if is_now and result.may_play:
+                    has_failed = True
+                elif not isinstance(result, Preempted):
                     refusals[each.name] = result
             elif isinstance(result, BaseException):
                 has_failed = True
@@ -122,10 +126,9 @@ class JointSets:
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
     ) -> CommandRefused:
-        """Silence a set that may play on some since a time [s], too late for others; why it ended."""
-        has_played = any(each.played_at >= began for each in amplifiers)
-        self.is_incomplete = False
-        if refusal.until is None or not has_played:
+        """Silence a set that may play since a time [s], and came too late; returns why it ended."""
+        if refusal.until is None or not any(each.played_at >= began for each in amplifiers):
+            self.is_incomplete = False
             return refusal
         await self.silence(STOP_RAMP)
         return Preempted(str(refusal))
@@ -148,6 +151,7 @@ class JointSets:
             by_line.setdefault(each.line, []).append(each)
         token, at = self.token, None
         if len(by_line) > 1:
+            await _freed([*by_line], until=min([one.until for one in staged.values()]))
             at = at_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
@@ -176,6 +180,15 @@ class JointSets:
             self.token = token_after(self.token)
             sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
             await self._members.all(sets)
+
+
+async def _freed(lines: Sequence[Line], *, until: float) -> None:
+    """Wait until a commit can be sent on all lines at once, or for a time [s]."""
+    while clock.now() < until:
+        busy = [line.awaited for line in lines if line.awaited is not None]
+        if not busy:
+            break
+        await asyncio.wait(busy)
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

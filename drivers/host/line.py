@@ -119,15 +119,19 @@ class Line:
         self.pump()
         return future
 
+    @property
+    def awaited(self) -> "asyncio.Future[Values] | None":
+        """The result of the request on the line, which a set waits for; None if it is free."""
+        job = self._current
+        return None if job is None or job.priority is Priority.READING else job.result
+
     def arrival(self, words: int) -> float:
         """Return by when [s] a request of so many words arrives that is sent next.
 
-        Behind what is on the line, and as late as replies have come: by the longest frame of USB,
-        no more. One that is lost is not waited for: it is repeated 30 ms later.
+        As late as replies have come, by three frames of USB at the most. One that is lost is not
+        waited for: it is repeated 30 ms later.
         """
-        free, job = max(self.time(), self._free_at), self._current
-        if job is not None and job.member is not None:
-            free = max(free, job.started_at + job.member.exchange_time(job.name))
+        free = max(self.time(), self._free_at, self._sent_until)
         return free + self.wire.transit(words) + min(self.late, _MAX_COMMIT_LATE) + _SENDING
 
     def received(self, data: bytes) -> None:

@@ -8,14 +8,17 @@ first: the first status says how it is.
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
 from drivers.protocol.records import Values
-from drivers.protocol.sets import is_newer_token, token_after
+from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from drivers.protocol.table import (
+    AHEAD_MAX,
     ENABLED,
     FAULTS,
     LATCHED,
@@ -44,6 +47,11 @@ _ONLY_IN = {
 }
 """States in which alone a request is accepted."""
 _NEVER: Interval = (-math.inf, math.inf)
+_NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
+"""Refusals of a part by what it does not hold."""
+_MAX_AHEAD = AHEAD_MAX * HIGH_TIME  # s
+_Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
+"""A committed set: its moment, token and layers, and whether it plays to the word."""
 
 
 class ExpectedAmplifier:
@@ -86,6 +94,9 @@ class ExpectedAmplifier:
         self.watchdog, self.fed, self.silent = math.inf, _NEVER, _NEVER
         self.is_shown = True
         self.sets = ExpectedSet()
+        self._waiting: _Waiting | None = None
+        self._clock: tuple[int, Interval] | None = None  # that was read last, and when
+        self._marked: Interval | None = None  # when a Mark came that no status has shown
         self._faults: deque[tuple[int, Interval]] = deque(maxlen=2)  # the newest first, and when
         self._settle(cause)
         self.outputs.forget()
@@ -107,6 +118,11 @@ class ExpectedAmplifier:
             self.can = capabilities
             self._settle("what was not heard")
             self.outputs.forget()
+
+    @property
+    def present(self) -> int:
+        """The high word of the clock that was read last, which names no moment ahead."""
+        return high_word(self._clock[0]) if self._clock is not None else 0
 
     @property
     def is_enabled(self) -> bool:
@@ -133,6 +149,8 @@ class ExpectedAmplifier:
         if self.is_enabled and time > self.expiry[1] + ROUNDED + self.slack:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
+        if self._waiting is not None and time > self._waiting[0][1] + self.slack:
+            self._begin(*self._waiting)
 
     def _trip(self, fault: int, since: Interval, cause: str) -> None:
         self.fault = fault
@@ -148,6 +166,7 @@ class ExpectedAmplifier:
     ) -> None:
         self.state = state
         self.sets.drop()
+        self._waiting = None
         self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
 
     def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
@@ -208,9 +227,12 @@ class ExpectedAmplifier:
             case "Clear" if self.state in LATCHED:
                 self._clear(values["latch"], shown["state"], when)
             case "Commit":
-                self._commit(values["token"], when)
+                self._commit(values, when)
             case "Set" if values["now"]:
+                self._start_waiting(values["token"], when)
                 self._play(values["token"], when)
+            case "Mark":
+                self._marked = when
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
         """Leave a stop or a fault, once all is silent, where its cause is gone."""
@@ -229,23 +251,38 @@ class ExpectedAmplifier:
         token, end = part["token"], when[1]
         self._expect("credit", end, "token of a reply to Set", token, reply["token"])
         is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
-        if is_fine and not self.outputs.may_derate and (reply["staged"] or reply["played"]):
+        if not (reply["staged"] or reply["played"]):
+            self._expect("plays", end, f"exact of set {token}, not whole", 0, reply["exact"])
+        elif is_fine and not self.outputs.may_derate:
             self._expect("plays", end, f"exact of set {token}", 1, reply["exact"])
-        if token == self.token:
-            self._expect("commit", end, "played of a repeated set", 1, reply["played"])
-        if token == self.token or token != reply["token"]:
+        if token != reply["token"]:
             return
-        known = self.sets.taken(part, reply, when)
-        seen = reply["missing"], reply["staged"], reply["played"]
+        known = (0, 0, 1) if token == self.token else self.sets.taken(part, reply, when)
         if known is None and self._unclear is not None:
             self._unclear("a part came as its set expired")
-        elif known is not None and seen not in known:
+        elif known is not None:
             what = f"missing, staged, played after part {part['index']} of set {token}"
-            self.report("commit", end, what, must=one_of(known), seen=seen)
+            seen = reply["missing"], reply["staged"], reply["played"]
+            self._expect("commit", end, what, known, seen)
         if reply["played"]:
+            self._start_waiting(token, when)
             self._play(token, when)
 
-    def _commit(self, token: int, when: Interval) -> None:
+    def part_came(self, part: Values, when: Interval) -> None:
+        """Apply a part of a set but the last, which is kept or dropped without a word."""
+        self.advance(when[0])
+        is_held = self.is_enabled and part["session"] == self.session
+        is_newer = self.token is not None and is_newer_token(part["token"], self.token)
+        if is_held and is_newer and self.sets.keep(part, when):
+            self.fed = when
+
+    def part_refused(self, part: Values, code: str) -> None:
+        """Apply a refusal of the last part of a set, by its code."""
+        if code not in _NOT_LOOKED_AT:
+            self.sets.refused(part)
+
+    def _commit(self, commit: Values, when: Interval) -> None:
+        token = commit["token"]
         if token == self.token:
             return
         until = self.sets.staged_until(token)[1]
@@ -253,7 +290,41 @@ class ExpectedAmplifier:
             seen = f"until {until:.4f} s" if until > -math.inf else "not staged"
             what = f"set {token} that is committed"
             self.report("token", when[1], what, must="staged", seen=seen)
-        self._play(token, when)
+        self._start_waiting(token, when)
+        moment = self._moment(commit["at"], when)
+        layers = self.sets.whole(token)
+        if layers is None or moment == when:
+            self._play(token, when)
+            return
+        self._waiting, self.token = (moment, token, layers, self.sets.is_exact), token
+        self.sets.drop()
+
+    def _moment(self, at: int, when: Interval) -> Interval:
+        """Return between which times a set starts whose commit is carried out between two."""
+        if self._clock is None:
+            return when[0], when[1] + _MAX_AHEAD
+        clock, read = self._clock
+        left = ahead(at * HIGH_STEPS, clock)
+        drift = DRIFT * (when[1] - read[0] + _MAX_AHEAD)
+        early, late = read[0] + left - drift, read[1] + left + drift
+        if early > when[1] and late <= when[0] + _MAX_AHEAD:
+            return early, late
+        if late <= when[0] or early > when[1] + _MAX_AHEAD:
+            return when
+        return when[0], max(when[1], late)
+
+    def _start_waiting(self, token: int, when: Interval) -> None:
+        """Play the set that waits, before another that is played between two times."""
+        if self._waiting is not None and token != self.token:
+            (early, late), *waiting = self._waiting
+            self._begin((min(early, when[0]), min(late, when[1])), *waiting)
+
+    def _begin(
+        self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
+    ) -> None:
+        """Have the set that waited play from some time between two on."""
+        self._waiting = None
+        self.outputs.play(layers, token, when, is_exact=is_exact)
 
     def _play(self, token: int, when: Interval) -> None:
         """Play a set between two times, unless it is the one that plays."""
@@ -287,9 +358,25 @@ class ExpectedAmplifier:
         if not (low <= left <= max(high, 0.0) or is_unknown):
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
-        self.outputs.check(shown, when)
+        self._note_clock(shown["clock"], when)
+        if self._waiting is None or when[1] < self._waiting[0][0] - self.slack:
+            self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
+
+    def _note_clock(self, clock: int, when: Interval) -> None:
+        """Note the clock that a status shows, or compare it with that of a Mark before it."""
+        marked, self._marked = self._marked, None
+        if marked is None:
+            self._clock = clock, when
+        elif self._clock is not None:
+            known, read = self._clock
+            slack = self.slack + DRIFT * (marked[1] - read[0])
+            low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
+            passed = ahead(clock, known)
+            if not low <= passed <= high:
+                what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
+                self.report("clock", when[1], what, must=must, seen=passed)
 
     def note_state(self, shown: Values, when: Interval) -> bool:
         """Compare state, fault and latch, and go on with them; returns whether the state fits."""
@@ -406,7 +493,8 @@ class ExpectedAmplifier:
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
         outputs = self.outputs
-        if not (sure := outputs.sure(when)):
+        is_starting = self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
+        if is_starting or not (sure := outputs.sure(when)):
             return
         possible = outputs.tokens_of(number, sure)
         problem: Problem | None = None
@@ -420,9 +508,11 @@ class ExpectedAmplifier:
                 is_exact=outputs.is_exact,
                 can_scale=outputs.may_derate or not outputs.is_exact,
             )
-            lasting = outputs.lasting.get(number, {0})
-            if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
+            lasting = outputs.lasting.get(number, {0}) if reply["commands"] else {0}
+            if problem is None and reply["valid_for"] not in lasting:
                 problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
+            if problem is None and reply["ramp"] and not reply["commands"]:
+                problem = "plays", "ramp of a silent layer", 0, reply["ramp"]
         if problem is not None:
             rule, what, must, seen = problem
             report = self.report if reply["commands"] else self.report_silence

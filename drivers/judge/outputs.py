@@ -51,7 +51,7 @@ class ExpectedOutputs:
     can: its capabilities, empty while unknown; slack [s]: of times. began: when what plays was
     changed last, by its cause. is_exact: levels are those asked for, to the step; may_derate: or
     lower, since it is warm. interferes: levels show how tones of one frequency interfere. lasting:
-    `valid_for` that a layer may show, of its set, a renewal or what waits.
+    `valid_for` that a layer may show, of its set or what waits.
     """
 
     def __init__(
@@ -124,7 +124,8 @@ class ExpectedOutputs:
             lasting = self.lasting.setdefault(number, set())
             if not (one.renew or one.after):
                 lasting.clear()
-            lasting.add(one.valid_for)
+            if not one.renew:
+                lasting.add(one.valid_for)
             if self._may_end(number, start, end):  # and then on other ways than by the set
                 goes_on = one.renew or any(each.keep_phase for each in one.commands)
                 self._unknown[number] = math.inf if goes_on else self._faded(one, end)

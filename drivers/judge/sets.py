@@ -5,40 +5,46 @@ from collections.abc import Sequence
 
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Assembly, LayerSet, is_last, unpack_layers
-from drivers.protocol.table import QUANTITIES, STAGED_LIFE
-
-_MAX_WORDS = QUANTITIES["set_words"].maximum
+from drivers.protocol.sets import Assembly, LayerSet, is_newer_token, unpack_layers
+from drivers.protocol.table import STAGED_LIFE
 
 
 class ExpectedSet:
-    """The newest set to one amplifier; times [s]. is_exact: it plays to the word, as is said."""
+    """The newest set to one amplifier; times [s]. is_exact: it plays to the word, as is said.
+
+    staged: token of the set that is staged, 0 for none.
+    """
 
     def __init__(self) -> None:
         self.is_exact = True
-        self._sent = Assembly()
         self._whole: tuple[int, tuple[LayerSet, ...]] = (0, ())  # token, and layers
         self._replaced = 0  # token of a set of which it is known what really plays
-        self._taken: set[int] = set()  # parts that have their reply
-        self._token = self._staged = 0  # of these parts, of a set that is staged
-        self._began: Interval = (-math.inf, -math.inf)  # when the first part came
+        self.drop()
 
     def drop(self) -> None:
-        """Discard what is staged."""
-        self._token = self._staged = 0
+        """Discard what is collected or staged."""
+        self._parts = Assembly()  # that are kept
+        self.staged = 0
+        self._began: Interval = (-math.inf, -math.inf)  # when the first part came
+        self._is_unclear = False  # whether a part came before the set expired, or after
 
-    def sent(self, part: Values, time: float) -> str:
-        """Note a part that is sent; returns what is wrong with it, or ""."""
-        if part["index"] >= part["parts"]:
-            return f"index must be below {part['parts']}, got {part['index']}"
-        if not is_last(part):
-            is_kept = self._sent.keep(part, time)
-            return "" if is_kept else f"parts must be {self._sent.count}, got {part['parts']}"
-        stream = self._sent.whole(part)
-        if isinstance(stream, int):
-            return f"part {stream} must come before the last"
+    def keep(self, part: Values, when: Interval) -> bool:
+        """Note a part but the last that comes between two times; returns whether it is kept."""
+        token = part["token"]
+        self._expire(when)
+        if token != self._parts.token:
+            if not is_newer_token(token, self._parts.token):
+                return False
+            self.drop()
+            self._began = when
+        return self._parts.keep(part, when[1])
+
+    def sent(self, last: Values) -> str:
+        """Note the last part of a set that is sent; returns what is wrong with it, or ""."""
+        stream = self._parts.whole(last)
         try:
-            self._whole = part["token"], unpack_layers(stream)
+            if not isinstance(stream, int):
+                self._whole = last["token"], unpack_layers(stream)
         except Refusal as refusal:
             return str(refusal)
         return ""
@@ -53,32 +59,44 @@ class ExpectedSet:
 
     def staged_until(self, token: object) -> Interval:
         """Return until when a set is kept, at the least and at the most, if it is staged."""
-        if not self._staged or token != self._staged:
+        if not self.staged or token != self.staged:
             return -math.inf, -math.inf
         return self._began[0] + STAGED_LIFE, self._began[1] + STAGED_LIFE
 
-    def taken(self, part: Values, reply: Values, when: Interval) -> list[Sequence[int]] | None:
-        """Note the reply to a part that came within an interval.
+    def taken(self, last: Values, reply: Values, when: Interval) -> Sequence[int] | None:
+        """Note the reply to the last part of a set, which came within an interval.
 
-        Returns what it may say: missing, staged and played; None where its set expired just
-        then. A part without a reply may have come.
+        Returns what it must say: missing, staged and played; None where its set expired just then.
         """
-        token, count = part["token"], part["parts"]
-        lived = when[0] - self._began[1], when[1] - self._began[0]
-        is_unclear = token == self._token and lived[0] <= STAGED_LIFE <= lived[1]
-        if token != self._token or lived[1] > STAGED_LIFE:
-            self._taken = set()
-            self._token, self._began = token, (self._began[0] if is_unclear else when[0], when[1])
-        self._taken.add(part["index"])
+        token = last["token"]
+        self._expire(when)
+        is_unclear, is_under_way = self._is_unclear, token == self._parts.token
+        stream = 0 if is_under_way and self.staged else self._parts.whole(last)
+        is_missing = isinstance(stream, int) and not (is_under_way and self.staged)
         if reply["staged"] or reply["played"]:
             self.is_exact = bool(reply["exact"]) or token == self._replaced
-        self._staged = token if reply["staged"] else 0
-        possible: list[Sequence[int]] = []
-        for index in range(count):
-            if index not in self._taken:
-                possible.append((index, 0, 0))
-            if index not in self._sent.collected:
-                break
-        else:
-            possible.append((0, 1 - part["now"], part["now"]))
-        return None if is_unclear else possible
+            if not is_under_way:
+                self.drop()
+                self._parts, self._began = Assembly(token, last["parts"], when[1]), when
+            self.staged = token if reply["staged"] else 0
+            self._began = self._began[0], (when[1] if is_unclear else self._began[1])
+        elif is_under_way:
+            self.staged = 0
+            self._parts.collected.pop(reply["missing"], None)
+        if is_unclear:
+            return None
+        return (stream, 0, 0) if is_missing else (0, 1 - last["now"], last["now"])
+
+    def refused(self, last: Values) -> None:
+        """Note that a last part was refused, with its set where all others are there."""
+        is_own = last["token"] == self._parts.token and not self.staged
+        is_one = last["index"] < last["parts"] == self._parts.count
+        if is_own and is_one and not isinstance(self._parts.whole(last), int):
+            self.drop()
+
+    def _expire(self, when: Interval) -> None:
+        """Drop what has expired by an interval."""
+        lived = when[0] - self._began[1], when[1] - self._began[0]
+        if lived[0] > STAGED_LIFE:
+            self.drop()
+        self._is_unclear |= lived[0] <= STAGED_LIFE < lived[1]

@@ -3,13 +3,14 @@
 A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
 """
 
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.table import AHEAD_MAX, CLOCK_TURN
 
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
 """Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
-AT_MOST = 1638
-"""Steps of the high word by which a Commit may name a moment ahead: 0.5 s."""
+HIGH_WORDS = SPAN // HIGH_STEPS
+HIGH_TIME = CLOCK_TURN / HIGH_WORDS
+"""Seconds of a step of the high word."""
 _PER_SECOND = SPAN / CLOCK_TURN
 
 
@@ -25,7 +26,7 @@ def ahead(clock: int, of: int) -> float:
 
 def at_behind(seconds: float) -> int:
     """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
-    return high_word(clock_at(seconds) - 1) + 1 & 0xFFFF
+    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
 
 
 def moment_of(at: int, seconds: float) -> float | None:
@@ -34,8 +35,8 @@ def moment_of(at: int, seconds: float) -> float | None:
     at: the high word of a clock of `clock_at`.
     """
     now = clock_at(seconds)
-    left = ((at << 16) - now) % SPAN
-    return seconds + left / _PER_SECOND if 0 < left <= AT_MOST << 16 else None
+    left = (at * HIGH_STEPS - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
 
 
 def high_word(clock: int) -> int:

@@ -30,6 +30,21 @@ _LAYER, _AFTER, _RENEW, _COUNT = LAYER.shifts
 _HEAD_FORM, _COMMAND_FORM = LAYER.form, COMMAND.form
 _ENVELOPE_FORM, _KNOT_FORM = ENVELOPE.form, KNOT.form
 _CHANNEL, _KEEP_PHASE, _SKIP_ENDING, _ONSET, _ENDING = COMMAND.shifts
+_COUNTS = 1 << _RENEW - _COUNT
+_CHANNELS, _Q = QUANTITIES["channel"].maximum + 1, QUANTITIES
+_WIDEST: Values = {
+    **{"layers": _Q["layer"].maximum + 1, "channels": _CHANNELS, "knots": _Q["knots"].maximum},
+    **{"ramp_max": _Q["ramp"].maximum, "envelope_step_min": _Q["envelope_step"].minimum},
+    "envelope_step_max": _Q["envelope_step"].maximum,
+    "limits": _CHANNELS
+    * [
+        {
+            **{"frequency_min": _Q["frequency"].minimum, "level_max": _Q["level"].maximum},
+            "frequency_max": _Q["frequency"].maximum,
+        }
+    ],
+}
+"""Capabilities of an amplifier to which the table alone sets limits, as far as sets have some."""
 
 
 def token_after(number: int) -> int:
@@ -132,40 +147,81 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     return list(memoryview(struct.pack(form, *numbers)).cast("H"))
 
 
-def unpack_layers(words: Sequence[int]) -> tuple[LayerSet, ...]:
-    """Return the layers of a stream; raises Refusal, also for a layer or channel that is twice."""
+def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet, ...]:
+    """Return the layers of a stream; raises Refusal for what is found first of what is wrong.
+
+    can: capabilities that it must keep to, those of the table unless others are given.
+    """
     layers: list[LayerSet] = []
     at = 0
     while at < len(words):
+        _check_length(words, at)
         head, at = LAYER.read(words, at)
-        commands: list[Command] = []
-        for _ in range(head.pop("count")):
-            command, at = _command(words, at)
-            if any(command.channel == other.channel for other in commands):
-                text = f"channel {command.channel} must occur once in a layer"
-                raise Refusal(text, "BAD_CHANNEL", command.channel)
-            commands.append(command)
+        count = head.pop("count")
         head["after"], head["renew"] = bool(head["after"]), bool(head["renew"])
-        is_empty = not commands
-        if head["after"] if is_empty else head["renew"]:
+        if head["renew"] if count else head["after"]:
             raise Refusal("renew must be without commands, after with some")
         if any(head["layer"] == other.layer for other in layers):
             raise Refusal(f"layer {head['layer']} must occur once in a set")
+        for name, most in (("layer", can["layers"] - 1), ("ramp", can["ramp_max"])):
+            if head[name] > most:
+                raise Refusal(f"{name} must be at most {most}, got {head[name]}")
+        commands: list[Command] = []
+        for _ in range(count):
+            channel = words[at] >> _CHANNEL & _CHANNELS - 1
+            if channel >= can["channels"] or any(channel == each.channel for each in commands):
+                text = f"channel must be 0 to {can['channels'] - 1}, once in a layer, got {channel}"
+                raise Refusal(text, "BAD_CHANNEL", channel)
+            try:
+                command, at = _command(words, at, can)
+            except Refusal as refusal:
+                raise Refusal(str(refusal), refusal.code, channel) from None
+            commands.append(command)
         layers.append(LayerSet(commands=tuple(commands), **head))
     return tuple(layers)
 
 
-def _command(words: Sequence[int], at: int) -> tuple[Command, int]:
+def _check_length(words: Sequence[int], at: int) -> None:
+    """Raise Refusal where the stream ends amid the layer that begins at an index."""
+    try:
+        count, at = words[at] & _COUNTS - 1, at + LAYER.words
+        for _ in range(count):
+            shapes, at = words[at] >> _ENDING & 3, at + COMMAND.words  # onset and ending
+            for _ in range(shapes.bit_count()):
+                at += ENVELOPE.words + KNOT.words * words[at]
+        is_cut = at > len(words)
+    except IndexError:
+        is_cut = True
+    if is_cut:
+        raise Refusal("the stream must not end amid a layer", "BAD_LENGTH")
+
+
+def _command(words: Sequence[int], at: int, can: Values) -> tuple[Command, int]:
     values, at = COMMAND.read(words, at)
     for name in ("keep_phase", "skip_ending"):
         values[name] = bool(values[name])
+    limits = can["limits"][values["channel"]]
+    is_driven = values["level"] > 0 or values["onset"]
+    low, high = limits["frequency_min"], limits["frequency_max"]
+    if is_driven and not low <= values["frequency"] <= high:
+        raise Refusal(f"frequency must be {low} to {high}, got {values['frequency']}")
+    peaks = [values["level"]]
     for name in ("onset", "ending"):
-        values[name], at = _envelope(words, at) if values[name] else (None, at)
+        values[name], at = _envelope(words, at, can) if values[name] else (None, at)
+        if values[name] is not None:
+            peaks.append(values[name].peak)
+    if max(peaks) > limits["level_max"]:
+        raise Refusal(f"level must be at most {limits['level_max']}, got {max(peaks)}")
     return Command(**values), at
 
 
-def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
+def _envelope(words: Sequence[int], at: int, can: Values) -> tuple[Envelope, int]:
     head, at = ENVELOPE.read(words, at)
+    low, high = can["envelope_step_min"], can["envelope_step_max"]
+    if not low <= head["step"] <= high:
+        raise Refusal(f"step must be {low} to {high}, got {head['step']}")
+    if head["knots"] > can["knots"]:
+        raise Refusal(f"knots must be at most {can['knots']}, got {head['knots']}")
     knots, at = KNOT.read_rows(words, at, head["knots"])
     return Envelope(head["step"], knots), at
 

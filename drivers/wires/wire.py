@@ -23,6 +23,7 @@ from drivers.protocol.records import (
     Text,
     Values,
 )
+from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
     BROADCAST,
     EVENT,
@@ -102,9 +103,7 @@ Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More |
 
 def has_reply(address: int, name: str, values: Values) -> bool:
     """Whether a request is replied to: not if it is of all, nor a part of a set but the last."""
-    if address == BROADCAST:
-        return False
-    return name != "Set" or values["index"] >= values["parts"] - 1
+    return address != BROADCAST and (name != "Set" or is_last(values))
 
 
 def read_event(

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import high_word
+from drivers.protocol.clock import HIGH_WORDS, high_word
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last, token_after
 from drivers.protocol.table import (
@@ -121,7 +121,7 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
-        self._waiting: tuple[float, int, Layers] | None = None  # moment [s], token
+        self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
         self._watchdog = 0.0
         self._last_fed = 0.0
@@ -167,10 +167,13 @@ class Amplifier:
         if self.is_derated and self._heat.at(now) < GOOD_BELOW:
             self.is_derated = False
 
-    def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s]; none to a part but the last.
+    def handle(
+        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
+    ) -> Values:
+        """Return the values of the reply to a request at a time [s].
 
-        Raises Refusal, which means that nothing was applied.
+        None to a broadcast, nor to a part of a set but the last. Raises Refusal, which means that
+        nothing was applied.
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
@@ -184,6 +187,8 @@ class Amplifier:
         reply = self._carry_out(name, values, following, now)
         if message.feeds and self.state == _ENABLED:
             self._last_fed = now
+        if is_broadcast:
+            return {}
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
 
@@ -288,6 +293,9 @@ class Amplifier:
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
             case "Ping" if self.state == _ENABLED:
                 self.clock.steer(values["rate"], now)
+                if self._waiting is not None:
+                    _, commit, layers = self._waiting
+                    self._waiting = self.clock.reaches(commit["at"], now), commit, layers
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -370,19 +378,18 @@ class Amplifier:
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
-        clock = self.clock.reading(now)
-        if 1 <= (commit["at"] - high_word(clock)) % (1 << 16) <= AHEAD_MAX:
-            moment = self.clock.reaches(commit["at"], now)
-            self._waiting = moment, commit["token"], layers
+        at = commit["at"]
+        if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
+            self._waiting = self.clock.reaches(at, now), commit, layers
         else:
             self._play(layers, commit["token"], now)
 
     def _start_waiting(self, moment: float) -> None:
         """Play the set that waits for a moment, if there is one."""
         if self._waiting is not None:
-            _, token, layers = self._waiting
+            _, commit, layers = self._waiting
             self._waiting = None
-            self._play(layers, token, moment)
+            self._play(layers, commit["token"], moment)
 
     def _play(self, layers: Layers, token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers

@@ -11,7 +11,6 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import (
     Assembly,
     Command,
-    Envelope,
     LayerSet,
     is_newer_token,
     unpack_layers,
@@ -109,48 +108,7 @@ class SetIntake:
         if len(stream) > self.capabilities["set_words"]:
             most = self.capabilities["set_words"]
             raise Refusal(f"a set must have at most {most} words", "BAD_LENGTH")
-        layers = unpack_layers(stream)
-        for layer in layers:
-            self._check(layer)
-        return layers
-
-    def _check(self, layer: LayerSet) -> None:
-        can = self.capabilities
-        if layer.layer >= can["layers"]:
-            raise Refusal(f"layer must be 0 to {can['layers'] - 1}, got {layer.layer}")
-        if layer.ramp > can["ramp_max"]:
-            raise Refusal(f"ramp must be at most {can['ramp_max']}, got {layer.ramp}")
-        for command in layer.commands:
-            self._check_command(command)
-
-    def _check_command(self, command: Command) -> None:
-        can, channel = self.capabilities, command.channel
-        if channel >= can["channels"]:
-            text = f"channel must be 0 to {can['channels'] - 1}, got {channel}"
-            raise Refusal(text, "BAD_CHANNEL", channel)
-        limits = can["limits"][channel]
-        low, high = limits["frequency_min"], limits["frequency_max"]
-        if command.is_driven and not low <= command.frequency <= high:
-            text = f"frequency must be {low} to {high}, got {command.frequency}"
-            raise Refusal(text, channel=channel)
-        envelopes = [one for one in (command.onset, command.ending) if one is not None]
-        levels = [level for one in envelopes for level, _ in one.knots]
-        if max((command.level, *levels)) > limits["level_max"]:
-            text = (
-                f"level must be at most {limits['level_max']}, got {max((command.level, *levels))}"
-            )
-            raise Refusal(text, channel=channel)
-        for one in envelopes:
-            self._check_envelope(one, channel)
-
-    def _check_envelope(self, envelope: Envelope, channel: int) -> None:
-        can = self.capabilities
-        low, high = can["envelope_step_min"], can["envelope_step_max"]
-        if not low <= envelope.step <= high:
-            raise Refusal(f"step must be {low} to {high}, got {envelope.step}", channel=channel)
-        if len(envelope.knots) > can["knots"]:
-            text = f"knots must be at most {can['knots']}, got {len(envelope.knots)}"
-            raise Refusal(text, channel=channel)
+        return unpack_layers(stream, self.capabilities)
 
 
 def derated(layers: Sequence[LayerSet], factor: float) -> tuple[LayerSet, ...]:

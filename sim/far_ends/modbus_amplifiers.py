@@ -137,16 +137,16 @@ class _Unit:
         request = parse_request(adu)
         message = None if request is None else _written(request)
         if request is not None and message is not None and message.is_broadcast:
-            result, _ = self._execute(message, request.registers[1:], now)
+            result, _ = self._execute(message, request.registers[1:], now, is_broadcast=True)
             self.is_moving = message.name == "SetAddress" and result == 0
 
     def _execute(
-        self, message: Message, words: Sequence[int], now: float
+        self, message: Message, words: Sequence[int], now: float, *, is_broadcast: bool = False
     ) -> tuple[int, Sequence[int]]:
         """Return the result and the words of the reply to a message."""
         try:
             name, values = read_request(message.number, words)
-            reply = self.amplifier.handle(name, values, now)
+            reply = self.amplifier.handle(name, values, now, is_broadcast=is_broadcast)
         except Refusal as refusal:
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, ()

@@ -82,8 +82,10 @@ class SerialAmplifiers(FarEnd):
         """
         if frame.version != VERSION:
             raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
-        name, values = read_request(frame.type, unpack_words(frame.payload))
-        reply = amplifier.handle(name, values, now)
+        words = unpack_words(frame.payload) if frame.type in BY_NUMBER else ()
+        name, values = read_request(frame.type, words)
+        is_broadcast = frame.address == BROADCAST
+        reply = amplifier.handle(name, values, now, is_broadcast=is_broadcast)
         if name == "SetAddress":
             self._amplifiers = {
                 values["address"] if each is amplifier else address: each

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _FTDI_PACKET = 62  # bytes beside two of status
+_SIGMAS, _STALLS = 4.0, 5.0  # of a log-normal part and of a stall: no longer ones occur
 _ORDER = 1e-9  # s; between what arrives, since timers of one moment run in any order
 _FRAME_ERROR = 50e-6  # of a USB host's crystal against its machine's clock; it may be 500e-6
 
@@ -19,7 +20,7 @@ class Latency:
     """Time that programs and drivers take [s]: `least`, a log-normal part, and seldom a stall.
 
     median, sigma: of the log-normal part; stalls: share of those with an exponential stall, which
-    is of this mean [s].
+    is of this mean [s], and never longer than five times that.
     """
 
     least: float = 0.0
@@ -30,8 +31,17 @@ class Latency:
 
     def draw(self, rng: random.Random) -> float:
         """Draw one [s]."""
-        stalled = rng.expovariate(1 / self.stall) if rng.random() < self.stalls else 0.0
-        return self.least + self.median * math.exp(self.sigma * rng.gauss(0.0, 1.0)) + stalled
+        log = self.sigma * max(min(rng.gauss(0.0, 1.0), _SIGMAS), -_SIGMAS)
+        stalled = 0.0
+        if rng.random() < self.stalls:
+            stalled = min(rng.expovariate(1 / self.stall), _STALLS * self.stall)
+        return self.least + self.median * math.exp(log) + stalled
+
+    @property
+    def longest(self) -> float:
+        """The longest one [s]."""
+        most = self.least + self.median * math.exp(_SIGMAS * self.sigma)
+        return most + (_STALLS * self.stall if self.stalls else 0.0)
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,12 @@ class LineKind:
     frame: float = 0.0
     usb_byte: float = 0.0
     latency_timer: float = 0.0
+
+    @property
+    def longest(self) -> float:
+        """The longest delay of a few bytes there and back together [s]."""
+        programs = self.writing.longest + self.waking.longest
+        return programs + 2 * self.frame * (1 + _FRAME_ERROR) + self.latency_timer
 
     def delays(self, seed: object) -> "LineDelays":
         """Return those of one line; equal seeds give equal delays."""

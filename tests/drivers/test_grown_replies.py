@@ -121,9 +121,9 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
 
 
 def test_places_of_words_are_those_of_the_page() -> None:
-    """Of protocol.md: nine words before the levels, three before the stream of a set."""
-    assert (STATUS.places["token"], STATUS.places["layers"], STATUS.words) == (7, 8, 9)
+    """Of protocol.md: eleven words before the levels, three before the stream of a set."""
+    assert (STATUS.places["token"], STATUS.places["layers"], STATUS.words) == (9, 10, 11)
     part = MESSAGES["Set"].request
     assert (part.places["now"], part.words) == (2, 3)
     caps = MESSAGES["GetCaps"].reply
-    assert (caps.places["envelope_step_max"], caps.words) == (17, 18)
+    assert (caps.places["envelope_step_max"], caps.words) == (17, 19)

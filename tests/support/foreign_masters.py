@@ -85,12 +85,12 @@ def drive(make: Make, url: str) -> str:
         vendor = b"".join(each.to_bytes(2) for each in master.read(1067, 16, 4))
         assert master.read(STATUS + 2, 1, 3) == [STATES["SWITCH_ON_DISABLED"]]
         assert master.read(STATUS + 7, 1, 4) == [250]  # 0.1 degrees C
-        master.write(0x300, [1, 9, 2000])
+        master.write(0x300, [1, 9, 2000, 0])
         master.write(0x500, [2, 9, 7, 3, 1, 0, 0, 0x30, 2200, 2000, 0])
         assert master.read(0x580, 5, 3) == [2, 0, 7, 5, 0]
-        levels = STATUS + 2 + 9
+        levels = STATUS + 2 + 11
         assert master.read(levels, 4, 4) == [0, 0, 0, 2000]
-        assert master.read(STATUS + 2 + 7, 1, 3) == [7]
+        assert master.read(STATUS + 2 + 9, 1, 3) == [7]
         with pytest.raises(minimalmodbus.IllegalRequestError):
             master.write_one(0x900, 1)  # function 6
         master.write(0x800, [3, 0])

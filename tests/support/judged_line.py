@@ -37,7 +37,7 @@ class JudgedLine:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.transmit = self.write
-        self._due = 0.0
+        self._due = self._arrival = 0.0
         self._ticked: list[Amplifier | FarEnd] = []
         if isinstance(far, Amplifier):
             known = {1: far, **(neighbours or {})}
@@ -52,7 +52,8 @@ class JudgedLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes to the amplifier."""
-        self._loop.call_later(DELAY, lambda: self._end.receive(data, self._loop.time()))
+        self._arrival = max(self._loop.time() + DELAY, self._arrival + _MOMENT)  # in their order
+        self._loop.call_at(self._arrival, lambda: self._end.receive(data, self._loop.time()))
 
     def close(self) -> None:
         """End what is due by itself."""

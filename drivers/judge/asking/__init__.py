@@ -17,6 +17,7 @@ from drivers.judge.asking import (
     reading,
     sensors,
     serial_frames,
+    set_parts,
     sets,
     staging,
     states,
@@ -53,9 +54,12 @@ CHECKS: tuple[Check, ...] = (
     *(states.what_does_not_feed, states.trips_amid_other_requests),
     *(states.trips_amid_fades, states.fault_list),
     *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
-    *(sets.all_or_nothing, sets.accepts_its_ranges, staging.parts_of_sets, staging.max_set),
-    *(staging.sets_expire, staging.stage_and_commit, staging.repeats_change_nothing),
-    *(staging.tokens_wrap, staging.newer_sets_replace, staging.committed_together),
+    *(sets.all_or_nothing, sets.accepts_its_ranges, set_parts.parts_of_sets),
+    *(set_parts.parts_that_are_dropped, set_parts.parts_again, set_parts.refused_parts),
+    *(set_parts.empty_sets, set_parts.max_set, set_parts.sets_expire),
+    *(staging.stage_and_commit, staging.repeats_change_nothing, staging.tokens_wrap),
+    *(staging.newer_sets_replace, staging.committed_together, staging.starts_at_its_moment),
+    staging.what_waits_for_its_moment,
     *(playing.layers_add, playing.layers_play_on, playing.valid_for, playing.renew, playing.after),
     *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),
     *(playing.endings_amid, playing.extreme_envelopes, playing.phases, playing.voices),
@@ -63,7 +67,8 @@ CHECKS: tuple[Check, ...] = (
     *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
     *(modbus_frames.present_areas, modbus_frames.exceptions),
     *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
-    *(reading.events, reading.broadcasts, reading.addresses, sensors.measured, sensors.readings),
+    *(reading.events, reading.broadcasts, reading.mark, reading.addresses),
+    *(sensors.measured, sensors.readings),
 )
 """All checks, in their order of execution."""
 

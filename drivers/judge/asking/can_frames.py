@@ -229,7 +229,7 @@ async def numbers(subject: Subject) -> None:
         accepted = math.inf
         for each, count in ((number, 1), *others):
             sent = clock.now()
-            ping = segments(each, _PING, [subject.session])
+            ping = segments(each, _PING, [subject.session, 0])
             what = f"number {each} after {number}"
             await expect_replies(count, what, *ping, since=min(accepted, sent))
             accepted = sent if count else accepted
@@ -253,7 +253,7 @@ async def numbers(subject: Subject) -> None:
         await expect_replies(0, "a part of a message", *others)
         await (follow(3) if number == 2 else asyncio.sleep(_FORGOTTEN))
         await expect_replies(0, "the last frame of a message that was given up", last)
-    (ping,) = segments(9, _PING, [subject.session])
+    (ping,) = segments(9, _PING, [subject.session, 0])
     await expect_replies(1, "words that are not used", ping[:6] + b"\xff\xff")
     client.number = 10
     await subject.ping()

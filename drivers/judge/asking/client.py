@@ -230,6 +230,10 @@ class Client(ABC):
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
         """Send a message and await its reply; raises Violation where none comes."""
 
+    async def part(self, number: int, words: Sequence[int]) -> None:
+        """Send a message that has no reply: a part of a set but the last."""
+        self.write(self.request(number, words))
+
     @abstractmethod
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frames of a request; to: its address, 0 for all, None for this amplifier."""

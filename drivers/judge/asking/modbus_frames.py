@@ -145,6 +145,11 @@ class ModbusClient(Client):
             return self.refusal(*when, number, (number, *divmod(result, 256)))
         return Answer("", None, tuple(reply), when)
 
+    async def part(self, number: int, words: Sequence[int]) -> None:
+        """Write a message, whose reply area is not read."""
+        response, _ = await self.transact(self.write_of(number, words))
+        expect_equal(response[0], WRITE, f"function of the response to {message_name(number)}")
+
     def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
         """Return the PDU that writes a message, tagged with the number of its frame."""
         tag = self.number % 0xFFFF + 1 if tag is None else tag
@@ -201,7 +206,7 @@ async def areas(subject: Subject) -> None:
         again = await area(number, function=READ_HOLDING)
         expect_equal(again, shown, f"reply area {number} by function 3")
     for tag in (1, 0xFFFF, 77):
-        await write(_PING, tag, 1)
+        await write(_PING, tag, 1, 0)
         shown = await area(_PING)
         expect_equal(shown[:HEAD], [tag, 0], "tag, result")
         expect_equal(await area(_PING, 3, HEAD + 3), shown[HEAD + 3 : HEAD + 6], "part of an area")
@@ -235,7 +240,7 @@ async def present_areas(subject: Subject) -> None:
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     if client.is_rtu:
         subject.require_alone()
-        data = client.adu(client.write_of(_PING, [subject.session], tag=4242), unit=0)
+        data = client.adu(client.write_of(_PING, [subject.session, 0], tag=4242), unit=0)
         await client.expect_silence(data, "a Ping for all")
         await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
@@ -282,7 +287,7 @@ async def exceptions(subject: Subject) -> None:
     await subject.arm()
     await subject.play(subject.one())
     known = READ, READ_HOLDING, WRITE
-    for what, pdu, code in _bad_pdus(client, client.write_of(_PING, [subject.session])):
+    for what, pdu, code in _bad_pdus(client, client.write_of(_PING, [subject.session, 0])):
         # On RTU the length of a frame follows from its function: of others it ends with a pause.
         if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
             continue
@@ -299,7 +304,7 @@ async def pieces(subject: Subject) -> None:
     pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
 
     def frame() -> bytes:
-        return client.request(_PING, [1])
+        return client.request(_PING, [1, 0])
 
     whole, broken = frame(), bytearray(frame())
     broken[6] = 200  # bytes that would follow

@@ -13,7 +13,7 @@ from drivers.protocol.table import SHORTENED_FADE
 from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
-_SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
+_SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
 
@@ -130,8 +130,9 @@ def onsets(subject: Subject) -> Rows:
     ]
     alone = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
     kept = subject.one(subject.tone(0, 0.5, onset=shapes[0], keep=True))
+    again = subject.one(subject.tone(0, 0.5, onset=shapes[0]), ramp=subject.ramp)
     rising = subject.one(ramp=subject.ramp), 0.4 * subject.ramp / 1000
-    return [*alone, (subject.one(), kept), (*rising, kept)]
+    return [*alone, (subject.one(), kept), (*rising, kept), (subject.one(), again)]
 
 
 @driving(_PLACE)
@@ -183,46 +184,32 @@ def extreme_envelopes(subject: Subject) -> Rows:
 
 @driving(_PLACE)
 async def phases(subject: Subject) -> None:
-    """It plays phases and frequencies: tones of one frequency interfere, also if begun apart."""
+    """It counts phases on its clock: tones of one frequency interfere alike whenever they began."""
     await subject.arm()
     await subject.require_interference()
-    silent, slow = play(layer(0), *map(layer, subject.layers[1:])), max(subject.lowest, _SLOW) / 20
-    require(
-        subject.exchange_time / subject.client.transactions <= 0.25 / slow,
-        "the line is too slow to see phases of tones that began apart",
-    )
+    silent = play(layer(0), *map(layer, subject.layers[1:]))
     for channel in subject.channels:
         first = layer(0, subject.tone(channel, 0.5, 30.0))
         for number in subject.layers[1:]:
             other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
             await subject.run([play(first, other), silent])
-    turned: list[tuple[int, float, float, bool | None]] = [
-        *((channel, phase, 1.25, None) for channel in subject.channels for phase in (90.0, -90.0)),
-        *((0, 0.0, round(0.9 * slow) + periods, None) for periods in (0.25, 0.5)),
-        *((0, 0.0, 0.5, keep) for keep in (True, False)),
-    ]
-    for case in turned:
-        await subject.in_time(partial(_expect_turned, subject, *case))
+    for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 1.75), (180.0, 0.5)):
+        time = periods * 20 / max(subject.lowest, _SLOW)
+        await subject.in_time(partial(_expect_alike, subject, phase, time))
 
 
-async def _expect_turned(
-    subject: Subject, channel: int, phase: float, periods: float, keep: bool | None
-) -> None:
-    """Play two tones some periods apart; keep: both at once, one of them again with that flag."""
-    slow = max(subject.lowest, _SLOW)
+async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
+    """Play two slow tones a time [s] apart, then the first of them again, that time later."""
     await subject.arm()
     subject.shown.outputs.interferes = True
-    tone = subject.tone(channel, 0.5, frequency=slow)
-    again = replace(subject.tone(channel, 0.5, phase, keep=bool(keep)), frequency=slow)
-    time = periods * 20 / slow
-    first = await subject.play(layer(0, tone), *([] if keep is None else [layer(1, tone)]))
-    await subject.pause(first.when.earliest + time - clock.now())
-    second = await subject.play(layer(1, again))
-    require_in_time(
-        second.when.latest - first.when.earliest <= time + 0.25 * 20 / slow,
-        "two sets were too far apart in time",
+    first, second = (
+        replace(subject.tone(0, 0.5, each), frequency=max(subject.lowest, _SLOW))
+        for each in (0.0, phase)
     )
-    await subject.status()
+    for number, tone in ((0, first), (1, second), (0, first)):
+        await subject.play(layer(number, tone))
+        await subject.pause(time)
+        await subject.status()
 
 
 @driving(_PLACE)

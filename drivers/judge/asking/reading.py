@@ -37,11 +37,11 @@ from drivers.protocol.table import (
 )
 from registry import clock
 
-_UNKNOWN = (19, 24, 29, 63)  # numbers of no message, below those of vendors
+_UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors
 _TRIES = 20
 _FEATURE_OF = {
     **{"GetMeasured": "electrical", "SetAddress": "address"},
-    **{"GetSensors": "sensors", "Measure": "sensors", "GetReading": "sensors"},
+    **{"GetSensors": "sensors", "Measure": "sensors", "GetReading": "sensors", "Mark": "mark"},
 }
 
 
@@ -153,11 +153,12 @@ async def hello_for_ever(subject: Subject) -> None:
     for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
         shown = await client.hello(payload, version)
         expect_equal(shown, subject.identity, f"identity by a Hello of version {version}")
-    for version in (0, 2, 4, 255):
+    for version in (0, 2, 3, 255):
         answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
         expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
-    answer = await client.exchange(MESSAGES["Ping"].number, [1], behind=b"\0")
-    expect_equal(answer.code, "BAD_LENGTH", "refusal of three bytes")
+    for number, code in ((MESSAGES["Ping"].number, "BAD_LENGTH"), (_UNKNOWN[0], "UNKNOWN_TYPE")):
+        answer = await client.exchange(number, [1, 0], behind=b"\0")
+        expect_equal(answer.code, code, f"refusal of message {number} of two and a half words")
 
 
 def _shortest(name: str) -> list[int]:
@@ -165,7 +166,7 @@ def _shortest(name: str) -> list[int]:
     values = {
         **{"session": 1, "watchdog": 250, "ramp": 5, "token": 1, "index": 0, "parts": 1},
         **{"now": 0, "stream": [], "latch": 0, "layer": 0, "address": 9, "serial_number": "?"},
-        **{"first": 0, "reading": 1, "window": 1000, "tones": 1},
+        **{"first": 0, "reading": 1, "window": 1000, "tones": 1, "shift": 0, "rate": 0, "at": 0},
         "frequencies": [QUANTITIES["frequency"].to_wire(100.0)],
     }
     return MESSAGES[name].request.pack(values)
@@ -173,6 +174,7 @@ def _shortest(name: str) -> list[int]:
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _TYPE = 0x7F  # of a frame, without the bit of a reply
+_MARKED = 0.2  # s; from a Mark until it is read
 _MOVED = 0.1  # s; until an amplifier has taken its address
 
 
@@ -192,16 +194,16 @@ async def events(subject: Subject) -> None:
         [
             *(subject.one(), subject.starve, subject.settle, subject.clear),
             *(subject.arm, subject.one(), send("Disarm", ramp=50), subject.settle),
-            *(send("Stop", ramp=0), subject.clear, 0.02),
+            *(send("Stop", ramp=0), send("Stop", ramp=0), subject.clear, 0.02),
         ]
     )
-    second = subject.latch
-    first = second - 1
+    last = subject.latch  # of the second Stop, which changes no state
+    second, first = last - 1, last - 2
     required = [
         *(("OPERATION_ENABLED", 0, first - 1), ("FAULT_REACTION_ACTIVE", 1, first)),
         *(("FAULT", 1, first), ("SWITCH_ON_DISABLED", 0, first), ("OPERATION_ENABLED", 0, first)),
         *(("SWITCHED_ON", 0, first), ("SWITCH_ON_DISABLED", 0, first)),
-        *(("QUICK_STOP_ACTIVE", 0, second), ("SWITCH_ON_DISABLED", 0, second)),
+        *(("QUICK_STOP_ACTIVE", 0, second), ("SWITCH_ON_DISABLED", 0, last)),
     ]
     found = [each for each in client.order if each.type & _TYPE == EVENT]
     reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in found]
@@ -222,12 +224,12 @@ async def broadcasts(subject: Subject) -> None:
 
     async def send_to_all(name: str, *, is_obeyed: bool = False, **values: object) -> None:
         message, sent = MESSAGES[name], clock.now()
-        words = message.request.pack({"session": subject.session, **values})
+        values = subject.filled(values)
+        words = message.request.pack(values)
         data = subject.client.request(message.number, words, to=0)
         await subject.client.expect_silence(data, f"a {name} for all")
         if is_obeyed:
-            own = {"session": subject.session, **values}
-            subject.shown.granted(name, own, {}, When(sent, clock.now()))
+            subject.shown.granted(name, values, {}, When(sent, clock.now()))
         await subject.request("GetStatus")
 
     await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
@@ -245,6 +247,23 @@ async def broadcasts(subject: Subject) -> None:
     await send_to_all("Commit", is_obeyed=True, token=subject.token)
     await subject.starve()
     await send_to_all("Stop", is_obeyed=True, ramp=0)
+
+
+@driving("protocol.md#messages")
+async def mark(subject: Subject) -> None:
+    """It keeps the clock of a Mark, alone or for all, and its next status shows that alone."""
+    subject.require("mark")
+    client = subject.client
+    await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
+    if client.has_broadcasts:
+        await client.look_around()
+    if client.has_broadcasts and not client.neighbours:
+        sent = clock.now()
+        client.write(client.request(MESSAGES["Mark"].number, (), to=0))
+        await asyncio.sleep(_MARKED)
+        subject.shown.carry_out("Mark", {}, {}, When(sent, sent + REACTION + client.transit))
+        await subject.run([_MARKED, 0.1])
+        expect_equal(len(client.heard), 0, "replies to a Mark for all")
 
 
 @driving("protocol.md#set-the-address")

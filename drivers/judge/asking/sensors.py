@@ -2,6 +2,8 @@
 
 import asyncio
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 from drivers.judge.amplifier import ROUNDED
 from drivers.judge.asking.check import driving, reading
@@ -15,8 +17,9 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import layer, send
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.clock import ahead
 from drivers.protocol.records import Record, Values
-from drivers.protocol.table import NO_CHANNEL, QUANTITIES, READING_STATES, sensor_reading
+from drivers.protocol.table import NO_CHANNEL, READING_STATES, sensor_reading
 
 _PLACE = "protocol.md#sensors"
 _WINDOW = 100  # ms
@@ -80,15 +83,15 @@ def _request(number: int, *frequencies: int) -> Values:
 
 async def _start(subject: Subject, request: Values) -> Answer:
     """Begin a reading, which says of which set and when."""
-    await subject.ping()
+    fed = await subject.ping()
     began = await subject.request("Measure", **request)
     seen = began["reading"], began["state"], began["token"]
     required = request["reading"], _RUNNING, subject.shown.token
     expect_equal(seen, required, "number, state, token of a reading that begins")
-    start = QUANTITIES["window_start"].from_wire(began["window_start"])
-    low = began.when.earliest - subject.shown.outputs.began[1] - 2 * ROUNDED
-    high = began.when.latest - subject.shown.outputs.began[0] + ROUNDED
-    expect_within(start, low, high, "window_start since the commit")
+    low = began.when.earliest - fed.when.latest - ROUNDED
+    high = began.when.latest - fed.when.earliest + ROUNDED
+    since = ahead(began["window_start"], fed["clock"])
+    expect_within(since, low, high, "window_start since the clock of a Status before")
     return began
 
 
@@ -119,9 +122,33 @@ async def _complete(subject: Subject, began: Answer, state: str = "COMPLETE") ->
     return found
 
 
+def _expect_turned(
+    first: Sequence[Values], second: Sequence[Values], by: int, what: str, slack: int = _ANGLE
+) -> None:
+    """Compare the phases of two tones that were read [0.01 degrees]."""
+    apart = (second[0]["phase"] - first[0]["phase"] - by + 18_000) % 36_000 - 18_000
+    expect_within(apart + by, by - slack, by + slack, what)
+
+
+async def _turn(subject: Subject, request: Values) -> None:
+    """Play each channel at 0 and at 90 degrees: where it is loudest, the second tone leads."""
+    (tone,), slack = request["frequencies"], _ANGLE + subject.can["phase_step"]
+    for channel in subject.channels:
+        found = []
+        for phase in (0.0, 90.0):
+            request = {**request, "reading": request["reading"] + 1}
+            await subject.play(subject.one(subject.tone(channel, 1.0, phase, frequency=tone)))
+            await subject.pause(_STEADY)
+            found.append(await _complete(subject, await _start(subject, request)))
+        heard = [[each["tones"] for each in rows] for rows in found]
+        first, second = max(zip(*heard, strict=True), key=lambda each: each[0][0]["amplitude"])
+        what = f"phase of channel {channel} at 90 degrees against 0"
+        _expect_turned(first, second, 9_000, what, slack)
+
+
 @driving(_PLACE)
 async def readings(subject: Subject) -> None:
-    """It reads tones at its sensors over a window, without feeding, and says what disturbed it."""
+    """It reads tones at its sensors over a window by its clock, and says what disturbed it."""
     described = await _described(subject)
     highest = min([subject.highest] + [each["frequency_max"] for each in described])
     tone = min(max(subject.frequency, 400), highest - _APART)
@@ -144,11 +171,11 @@ async def readings(subject: Subject) -> None:
         expect_within(shown[0]["amplitude"], low, high, f"amplitude of sensor {loudest}")
         for other in shown[1:]:
             expect_within(other["amplitude"], 0, _LEAK * loud, "amplitude of a silent tone")
-    for first, second in zip(tones[::2], tones[1::2], strict=True):
-        apart = abs(first[0]["phase"] - second[0]["phase"])
-        expect_within(min(apart, 36_000 - apart), 0, _ANGLE, "phase against that read before")
-    began = await _start(subject, _request(21, tone))
+    for first, second in pairwise(tones):
+        _expect_turned(first, second, 0, "phase against that read before")
+    await _turn(subject, _request(15, tone))
+    began = await _start(subject, _request(121, tone))
     await subject.play(full)
     for frequencies in ([_LOW], [tone, tone], [tone, tone + 1]):
-        await subject.send(send("Measure", **_request(22, *frequencies), code="BAD_VALUE"))
+        await subject.send(send("Measure", **_request(122, *frequencies), code="BAD_VALUE"))
     await _complete(subject, began, "DISTURBED")

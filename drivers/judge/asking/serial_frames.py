@@ -162,7 +162,7 @@ async def damaged_frames(subject: Subject) -> None:
     await subject.arm()
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
-    for number, sent in ((_PING, [subject.session]), (_SET, words)):
+    for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
         for what, data in subject.client.damaged(number, sent):
             await subject.client.expect_silence(data, f"message {number} with {what}")
             await subject.run([partial(subject.request, "GetStatus"), subject.ping])
@@ -190,7 +190,7 @@ async def tolerated_frames(subject: Subject) -> None:
     client = cast(SerialClient, subject.client)
 
     def ping() -> bytes:
-        return client.request(_PING, [1])
+        return client.request(_PING, [1, 0])
 
     whole = ping()
     for what, pieces, count in (
@@ -213,5 +213,5 @@ async def tolerated_frames(subject: Subject) -> None:
         await subject.request("Ping", session=1)
     client.invalid.clear()
     for _ in range(3):
-        await client.exchange(_PING, [1])
+        await client.exchange(_PING, [1, 0])
     expect_equal(client.invalid, [], "damaged replies")

@@ -126,13 +126,15 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         *([layer(0, tone, ramp=ramp + 1)] if ramp < 1000 else []),
     ):
         yield _part(pack_layers([good, layer_set]))
+    if ramp < 1000:
+        yield _part(pack_layers([good, layer(0, ramp=ramp + 1, renew=True)]))
     words = pack_layers([layer(0, tone)])
     head, command = LAYER.places, COMMAND.places
     for at, word, named in (
         (head["layer"], words[head["layer"]] | 1 << 15, (None,)),
         *((head[name], QUANTITIES[name].maximum + 1, (None,)) for name in ("ramp", "valid_for")),
         *(
-            (LAYER.words + command[name], word, (None, 0))
+            (LAYER.words + command[name], word, (0,))
             for name, word in (
                 ("channel", words[LAYER.words + command["channel"]] | 1 << 12),
                 ("level", _LEVEL + 1),
@@ -144,6 +146,15 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
     for wrong in (words[:-1], [*words, 0], [words[head["count"]] + 1, *words[1:]]):
         yield _part(wrong, "BAD_LENGTH")
+    # Of two flaws it names the first: length, layer, channel, then the channel's words.
+    beyond = [*words[: head["ramp"]], 1001, *words[head["ramp"] + 1 :]]
+    loud = [*words[LAYER.words : -2], _LEVEL + 1, words[-1]]
+    two = [words[0] + 1, *words[1 : LAYER.words]]
+    yield _part(beyond[:-1], "BAD_LENGTH")
+    yield _part([two[0], *beyond[1:], *words[LAYER.words :]], "BAD_VALUE")
+    yield _part([*two, *words[LAYER.words :], *loud], "BAD_CHANNEL", 0)
+    yield _part([*two, *loud, *words[LAYER.words :]], "BAD_VALUE", 0)
+    yield _part([*words[: LAYER.words], *loud, *words], "BAD_VALUE", 0)
 
 
 @driving(_PLACE)

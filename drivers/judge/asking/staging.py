@@ -1,119 +1,16 @@
-"""Checks of sets in parts and by tokens: staged, committed once, in their order, for a second."""
+"""Checks of sets by tokens: staged, committed once, in their order, for a second, at a moment."""
 
 from functools import partial
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import require
-from drivers.judge.asking.material import Material, Rows, layer, play, send, stage
+from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, pack_layers
-from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, STAGED_LIFE
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
+from drivers.protocol.table import AHEAD_MAX, COMMAND, LAYER
+from registry import clock
 
 _PLACE = "protocol.md#sets"
-_SHAPED = COMMAND.words + 2 * ENVELOPE.words  # of a command with two empty envelopes
-_MAX_TRIED = 2000  # words of a set: more take a slow wire longer than a set lives
-_LONG, _SHORT = 600, 60  # words of a set of several parts
-_SLOW = 0.03  # s; of a line, for an exchange of the longest messages
 _OLD = "BAD_TOKEN"
-
-
-def set_of(material: Material, room: int) -> list[LayerSet]:
-    """Make a set of this many words, or of as many as there can be."""
-    channels, max_knots = len(material.channels), material.can["knots"]
-    # All but the heads of layers has an even number of words.
-    bare = LAYER.words + _SHAPED * channels
-    max_layers = min(len(material.layers), room // bare)
-    counts = [each for each in range(1, max_layers + 1) if each % 2 == room % 2] or [max_layers]
-    full = bare + 2 * KNOT.words * channels * max_knots
-    count = next((each for each in counts if each * full >= room), counts[-1])
-    left = max(room - count * bare, 0) // KNOT.words
-    layers = []
-    for number in range(count):
-        tones = []
-        for channel in material.channels:
-            knots = [min(left, max_knots), min(max(left - max_knots, 0), max_knots)]
-            left -= sum(knots)
-            onset, ending = (material.envelope(0.001, *[0.1 + 0j] * each) for each in knots)
-            tones.append(material.tone(channel, 0.1, onset=onset, ending=ending))
-        layers.append(layer(number, *tones))
-    return layers
-
-
-def long_set(subject: Subject) -> list[LayerSet]:
-    """Make a set of several parts, a short one on a slow line, lest it expires on its way."""
-    is_quick = max(subject.client.transit, subject.exchange_time) < _SLOW
-    return set_of(subject, min(subject.can["set_words"], _LONG if is_quick else _SHORT))
-
-
-def _require_quick(subject: Subject) -> None:
-    require(
-        16 * subject.exchange_time <= STAGED_LIFE,
-        "the line is too slow for a set in several parts",
-    )
-
-
-@driving(_PLACE)
-def parts_of_sets(subject: Subject) -> Rows:
-    """It takes parts in any order and again, says which is missing, and plays a whole set alone."""
-    _require_quick(subject)
-    made = long_set(subject)
-
-    def cut(token: int, now: int = 0) -> list[Values]:
-        return subject.parts(*made, token=token, now=now, count=3)
-
-    def parts(token: int, now: int = 0) -> Rows:
-        return [send("Set", **each) for each in cut(token, now)]
-
-    def backwards(token: int, now: int) -> Rows:
-        first, *others = parts(token, now)
-        incomplete = send("Commit", token=token, code="INCOMPLETE")
-        late = [row for each in (*reversed(others), others[-1]) for row in (each, incomplete)]
-        again = [] if now else [others[-1], send("Commit", token=token)]
-        return [*late, first, *again, 0.05]
-
-    def second(**changed: int) -> Values:
-        return {**cut(5)[1], **changed}
-
-    count = len(parts(5))
-    others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
-    return [
-        *(subject.arm, subject.one(), *backwards(2, now=0), others, 0.05, *backwards(4, now=1)),
-        parts(5)[0],
-        send("Set", **second(index=count), code="BAD_VALUE"),
-        send("Set", **second(parts=count + 1), code="BAD_VALUE"),
-        *(send("Set", **second(token=3), code=_OLD), *parts(5)[1:], parts(6)[0]),
-        *(send("Commit", token=5, code=_OLD), send("Set", **second(), code=_OLD)),
-        *(*parts(6)[1:], send("Commit", token=6)),
-    ]
-
-
-@driving(_PLACE)
-def max_set(subject: Subject) -> Rows:
-    """It takes a set of as many words as it states, and refuses a longer one."""
-    room = min(subject.can["set_words"], _MAX_TRIED)
-    longer = set_of(subject, room + 2)
-    is_longer = len(pack_layers(longer)) > subject.can["set_words"]
-    refused = [stage(*longer, code="BAD_LENGTH")] if is_longer else []
-    return [subject.arm, stage(*set_of(subject, room)), send("Commit", token=1), *refused]
-
-
-@driving(_PLACE)
-def sets_expire(subject: Subject) -> Rows:
-    """It discards a set that is not committed, or not complete, 1 s after its first part."""
-    _require_quick(subject)
-    parts = subject.parts(*long_set(subject), token=3, now=0, count=3)
-    first, *others, last = (send("Set", **each) for each in parts)
-    shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)
-    return [
-        *(subject.arm, stage(subject.one()), shorter, send("Commit", token=1)),
-        *(stage(subject.one()), 1.1 * STAGED_LIFE, send("Commit", token=2, code=_OLD)),
-        last,
-        0.6 * STAGED_LIFE,
-        *others,
-        0.5 * STAGED_LIFE,
-        first,
-    ]
 
 
 @driving(_PLACE)
@@ -187,3 +84,51 @@ def committed_together(subject: Subject) -> Rows:
     room = subject.can["set_words"] // (LAYER.words + COMMAND.words * len(tones))
     layers = [layer(each, *tones, ramp=subject.ramp) for each in subject.layers[:room]]
     return [[stage(*layers), send("Commit", token=1)]]
+
+
+@driving(_PLACE)
+async def starts_at_its_moment(subject: Subject) -> None:
+    """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
+    ahead, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
+    for duration in (ahead, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
+        await subject.in_time(partial(_starts, subject, duration))
+    present = subject.shown.present
+    over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
+    await subject.in_time(partial(_starts, subject, ahead, shift=over_the_end))
+
+
+async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
+    """Commit a set for a moment a time [s] ahead, which repeats do not move."""
+    await subject.arm(shift=shift)
+    one = subject.one()
+    await subject.run([stage(one)])
+    await _commit(subject, duration)
+    end = clock.now() + max(duration, 0.0) + 0.05
+    await subject.run([play(one, token=1), send("Commit", token=1)])
+    while clock.now() < end:
+        await subject.run([0.01])
+    await subject.run([subject.follow])
+
+
+async def _commit(subject: Subject, duration: float) -> None:
+    """Commit the staged set for a moment that is a time [s] ahead of its last status."""
+    await subject.status()
+    await subject.request("Commit", token=subject.token, at=subject.moment(duration))
+
+
+@driving(_PLACE)
+def what_waits_for_its_moment(subject: Subject) -> Rows:
+    """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
+    half = layer(1, subject.beside(1, 0.5))
+    waits = [stage(subject.one(level=0.25)), partial(_commit, subject, 0.4)]
+    arm = send("Arm", watchdog=subject.can["watchdog_max"])
+    ends: list[Rows] = [
+        *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
+        [send("Disarm", ramp=0), subject.settle, subject.arm],
+        [arm],
+        [play(half)],
+        [stage(half), send("Commit", token=2)],
+        [stage(half), partial(_commit, subject, 0.2)],
+        [stage(half), send("Commit", token=3, code=_OLD)],
+    ]
+    return [(*waits, *each, 0.5) for each in ends]

@@ -6,7 +6,7 @@ from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.material import Rows, layer, play, send, stage
-from drivers.judge.asking.staging import long_set
+from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import QUANTITIES
@@ -238,6 +238,7 @@ def what_does_not_feed(subject: Subject) -> Rows:
     """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
+    first, *_ = subject.parts(*long_set(subject), token=7, now=0, count=3)
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
     idle: Rows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
@@ -246,11 +247,12 @@ def what_does_not_feed(subject: Subject) -> Rows:
         play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
         play(subject.one(), token=0x8001, code="BAD_TOKEN"),
         send("Set", **flawed, code=flaws),
+        *(send("Set", **first, session=77), send("Set", **{**first, "token": 0x8001})),
         send("Commit", token=20_000, code="BAD_TOKEN"),
         send("Commit", token=1, session=77, code="WRONG_SESSION"),
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
-        send("Ping", raw=(1, 0), code="BAD_LENGTH"),
+        send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
         partial(subject.client.exchange, 63, ()),
     ]
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]

@@ -34,8 +34,9 @@ from drivers.judge.asking.material import (
     play,
     send,
 )
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
+from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
 from drivers.wires.wire import reply_words
 from registry import clock
@@ -68,6 +69,7 @@ class Subject(Material):
         self.expected: Judge | None = None
         self.is_starving = True
         self.sent_set: list[Sequence[int]] = []
+        self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
         channels, layers = can["channels"], can["layers"]
@@ -110,7 +112,8 @@ class Subject(Material):
             answer = await self.answer(row.name, row.raw, **values)
             if answer.code:
                 break
-            answer = await self._carried_out(row.name, {"session": self.session, **values}, answer)
+            if _has_reply(row.name, row.raw, values):
+                answer = await self._carried_out(row.name, self.filled(values), answer)
         brief = {name: value for name, value in values.items() if name != "stream"}
         what = f"{row.name} {row.raw or brief}"
         codes = [each or _DONE for each in row.codes]
@@ -121,9 +124,13 @@ class Subject(Material):
         return answer
 
     async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
-        """Send a request by its values, or raw words, and return what became of it."""
+        """Send a request by its values, or raw words, and return what became of it.
+
+        A part of a set but the last has no reply, which what is heard with the next shows.
+        """
         self._check_fed()
-        message, values = MESSAGES[name], {"session": self.session, **values}
+        message, values = MESSAGES[name], self.filled(values)
+        has_reply = _has_reply(name, raw, values)
         if raw is None:
             try:
                 raw = message.request.pack(values)
@@ -134,17 +141,44 @@ class Subject(Material):
             is_part = self.sent_set and [*self.sent_set[-1][:head]] == [*raw[:head]]
             self.sent_set = [*(self.sent_set if is_part else ()), raw]
         client, sent = self.client, clock.now()
+        if not has_reply:
+            self._parts.append((sent, values, len(raw)))
+            await client.part(message.number, raw)
+            return Answer("", None, (), When(sent, clock.now()))
         answer = await client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
         took = clock.now() - sent
         client.quiet = min(client.quiet, QUIET + took)
+        before = self._parts_came(answer.when.latest)
+        if "index" in values and answer.code and self.expected is not None:
+            self.expected.part_refused(values, answer.code)
         if not answer.code:  # a refusal may come sooner
-            beyond = max(took - client.wire_time(len(raw), len(answer.words)), 0.0)
+            beyond = max(took - before - client.wire_time(len(raw), len(answer.words)), 0.0)
             count = 1 if name in _READ_ALONE else client.transactions
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
             client.reactions[name].append(beyond / count)
         self.heard_at = answer.when.latest
         return answer
+
+    def moment(self, duration: float) -> int:
+        """Return the high word of its clock that comes a time [s] after its last status."""
+        return round(self.shown.present + duration / HIGH_TIME) % HIGH_WORDS
+
+    def filled(self, values: Values) -> Values:
+        """Return values with those that a request has unless others are given."""
+        present = self.expected.present if self.expected is not None else 0
+        return {"session": self.session, "rate": 0, "shift": 0, "at": present, **values}
+
+    def _parts_came(self, latest: float) -> float:
+        """Have the parts that were sent come by a time [s]; returns what they take on the wire."""
+        made, self._parts = self._parts, []
+        if made:
+            expect_equal(len(self.client.heard), 0, "number of replies to parts but the last")
+        for sent, part, _ in made if self.expected is not None else ():
+            self.shown.part_came(part, When(sent, latest))
+        if self.client.transactions > 1:  # each had its response
+            return 0.0
+        return sum(self.client.wire_time(words, 0) for _, _, words in made)
 
     async def request(self, name: str, **values: Any) -> Answer:
         """Send a request that must be carried out; its reply must show what is expected."""
@@ -160,8 +194,8 @@ class Subject(Material):
         if self.expected is not None:
             if name == "Set":
                 self.token = values["token"]
-                if self.token != self.expected.token:
-                    self.expected.sets.sent(values, answer.when.earliest)
+                if self.token not in (self.expected.token, self.expected.sets.staged):
+                    self.expected.sets.sent(values)
             if name == "Commit" or shown.get("played"):
                 is_exact = shown.get("exact", self.expected.sets.is_exact)
                 await self._learn_achieved(values["token"], is_exact=bool(is_exact))
@@ -191,18 +225,19 @@ class Subject(Material):
 
     async def ping(self) -> Answer:
         """Feed the watchdog."""
-        return await self.request("Ping", rate=0)
+        return await self.request("Ping")
 
-    async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True) -> Answer:
+    async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True, shift: int = 0) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible.
 
-        is_fed: the nearest in which it can be fed, else it may expire from now on.
+        is_fed: the nearest in which it can be fed, else it may expire from now on. shift: of its
+        clock.
         """
         self.session = self.client.session = self.next_session
         self.token, self.is_starving = 0, not is_fed
         shortest = self.shortest_watchdog if is_fed else self.can["watchdog_min"]
         milliseconds = min(max(round(1000 * watchdog), shortest), self.can["watchdog_max"])
-        return await self.request("Arm", session=self.session, watchdog=milliseconds, shift=0)
+        return await self.request("Arm", session=self.session, watchdog=milliseconds, shift=shift)
 
     @property
     def next_session(self) -> int:
@@ -276,7 +311,7 @@ class Subject(Material):
 
     def played(self, part: Values, when: When) -> None:
         """Note that a set of one part was carried out."""
-        self.shown.sets.sent(part, when.earliest)
+        self.shown.sets.sent(part)
         self.shown.carry_out("Set", part, {}, when)
 
     async def play(self, *layers: LayerSet) -> Answer:
@@ -399,3 +434,8 @@ class Subject(Material):
             "its levels do not show that tones of one frequency interfere",
         )
         self.shown.outputs.interferes = True
+
+
+def _has_reply(name: str, raw: Sequence[int] | None, values: Values) -> bool:
+    """Whether a request has a reply: all but a part of a set that is not the last."""
+    return name != "Set" or raw is not None or is_last(values)

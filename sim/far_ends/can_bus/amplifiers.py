@@ -178,8 +178,8 @@ class _Node:
         try:
             kind, words = message.type, self._words(message, now)
         except Refusal as refusal:
-            kind, words = NAK, nak_of(refusal, message.type)
-        if message.number and words:
+            kind, words = NAK, nak_of(refusal, message.type) if message.number else []
+        if words:
             self._put(REPLY + sender, *segments(message.number, kind, words))
         if self.number != sender:
             self.boot(now)
@@ -191,7 +191,7 @@ class _Node:
         name, values = read_request(message.type, message.words)
         if name == "SetAddress" and values["address"] > NODE_MAX:
             raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
-        reply = self._amplifier.handle(name, values, now)
+        reply = self._amplifier.handle(name, values, now, is_broadcast=not message.number)
         if name == "SetAddress":
             self.number = values["address"]
         return BY_NUMBER[message.type].reply.pack(reply) if reply else []

@@ -37,7 +37,7 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
         await group.apply({name: [layer(0, tone())] for name in names})
         second = layer(1, Tone(0, 150.0, 0.2), Tone(1, 150.0, 0.1))
         await group.apply({name: [second] for name in names})
-        await asyncio.sleep(0.002)
+        await asyncio.sleep(0.01)
         for end in ends:
             assert all(end.levels(name) == [0.7, 0.1] for name in end.hosts)
         origins = [
@@ -47,7 +47,7 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
         ]
         assert all(each == origins[0] and len(each) == 1 for each in origins)
         await group.apply({name: [layer(0)] for name in names})
-        await asyncio.sleep(0.002)
+        await asyncio.sleep(0.01)
         assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
         assert all(end.retries == 0 for end in ends)
         assert all(end.line.wire.counters.unexpected_frames == 0 for end in ends)
@@ -145,7 +145,7 @@ async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> 
 async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]) -> None:
     """An amplifier that commits one of two layers says the token of the set all the same.
 
-    The status that its commit returns is the first that contradicts, the next heartbeat's the last.
+    The status of a heartbeat is the first that contradicts, that of the next one the last.
     """
     far = ends[0].far["a"].playback
     commit = far.commit
@@ -155,6 +155,7 @@ async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]
 
     far.commit = first_alone  # type: ignore[method-assign]
     await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+    await group.beat()
     await asyncio.sleep(0.05)
     with pytest.raises(CommandRefused):
         await group.beat()

@@ -8,7 +8,6 @@ import pytest
 
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.group import Group
-from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
@@ -154,17 +153,18 @@ async def test_reading_that_gives_way_to_a_set_is_no_silence(
     await reading
 
 
-@grouped(("a",), wire="serial")
+@pytest.mark.parametrize("wire", ["serial", "can", "rtu"])
+@grouped(("a",))
 async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
     group: Group, ends: list[MemoryLine]
 ) -> None:
-    """What comes while a part is on the line is sent next; after a stop no other part is."""
+    """What comes while parts are on the line is sent next; after a stop no other part is."""
     (end,) = ends
     end.outward = lambda _, data: [(0.002, data)]
-    onset = Envelope(20, ((100, 0),) * 12)
-    layers = {"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]}
-    kinds = [f"1:{MESSAGES[name].number}" for name in ("Set", "Ping", "Stop", "Commit")]
-    part, heartbeat, stop, commit = kinds
+    tones = [tone(each, 0.05, onset=Envelope(20, ((100, 0),) * 12)) for each in (0, 1)]
+    layers = {"a": [layer(number, *tones) for number in range(8)]}
+    kinds = [f"1:{MESSAGES[name].number}" for name in ("Set", "Ping", "Stop")]
+    part, heartbeat, stop = kinds
 
     def sent() -> list[str]:
         return [each for _, each in end.sent]
@@ -176,7 +176,7 @@ async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
     await group.amplifiers["a"].ping()
     await playing
     assert sent()[:2] == [heartbeat, part]
-    assert sent()[-1] == commit
+    assert sent()[-1] == part
     playing = asyncio.ensure_future(group.apply(layers))
     await asyncio.sleep(0.001)
     end.sent.clear()
@@ -184,20 +184,8 @@ async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
     with pytest.raises(Preempted):
         await playing
     assert sent()[0] == stop
-    assert not {part, commit} & {*sent()}
+    assert part not in sent()
     assert end.far["a"].state == "QUICK_STOP_ACTIVE"
-
-
-@in_virtual_time
-async def test_commits_that_fail_together_are_all_let_go() -> None:
-    """Also those that nobody waits for any more: a held line would carry no heartbeat."""
-    loop = asyncio.get_running_loop()
-    start = JointStart(3, loop.time() + 1)
-    let_go: list[Exception | None] = []
-    for _ in range(2):
-        start.arrive(0.001, let_go.append)
-    start.fail(CommandRefused("one"))
-    assert [type(each) for each in let_go] == [Preempted] * 2
 
 
 @grouped(("a",), wire="serial")

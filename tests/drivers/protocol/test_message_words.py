@@ -17,13 +17,20 @@ from drivers.protocol.table import STATUS as STATUS_RECORD
 
 STATUS: Values = {
     **{"state": 4, "fault": 0, "flags": 1, "latch": 0, "watchdog_left": 250},
-    **{"temperature": -53, "high_voltage": 1800, "token": 513, "channels": 4, "layers": 2},
+    **{
+        "temperature": -53,
+        "high_voltage": 1800,
+        "clock": 65538,
+        "token": 513,
+        "channels": 4,
+        "layers": 2,
+    },
     **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
 }
 NOT_STATED = dict.fromkeys(each.name for each in STATUS_RECORD.added)
 """What later editions add."""
 STATUS_WORDS = [
-    *(4, 0, 1, 0, 250, 0xFFCB, 1800, 513, 0x0402),
+    *(4, 0, 1, 0, 250, 0xFFCB, 1800, 1, 2, 513, 0x0402),
     *(2000, 0, 0, 10000, 513, 0),
 ]
 
@@ -59,11 +66,11 @@ def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> Non
 @pytest.mark.parametrize(
     ("name", "words", "code"),
     [
-        ("Arm", [9], "BAD_LENGTH"),
-        ("Arm", [9, 250, 0], "BAD_LENGTH"),
-        ("Arm", [9, 99], "BAD_VALUE"),
-        ("Arm", [0, 250], "BAD_VALUE"),
-        ("Commit", [9, 0], "BAD_TOKEN"),
+        ("Arm", [9, 250], "BAD_LENGTH"),
+        ("Arm", [9, 250, 0, 0], "BAD_LENGTH"),
+        ("Arm", [9, 99, 0], "BAD_VALUE"),
+        ("Arm", [0, 250, 0], "BAD_VALUE"),
+        ("Commit", [9, 0, 0], "BAD_TOKEN"),
         ("Set", [9, 1], "BAD_LENGTH"),
         ("SetAddress", [5, 33, *[0x4141] * 17], "BAD_LENGTH"),
         ("SetAddress", [5, 2, 0x0A41], "BAD_VALUE"),

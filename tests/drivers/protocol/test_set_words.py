@@ -36,8 +36,15 @@ STREAM = [
         ([0x0040, 20, 500], "BAD_VALUE", None),
         ([0x0060, 20, 500], "BAD_VALUE", None),
         ([0x1000, 20, 500], "BAD_VALUE", None),
-        ([0x0001, 20, 500, 0x0000, 2200, 10001, 0], "BAD_VALUE", None),
-        ([0x0001, 20, 500, 0x0002, 2200, 1, 0, 33, 50], "BAD_VALUE", None),
+        ([0x0001, 20, 500, 0x0000, 2200, 10001, 0], "BAD_VALUE", 0),
+        ([0x0001, 20, 500, 0x0052, 2200, 1, 0, 33, 50, *(0, 0) * 33], "BAD_VALUE", 5),
+        # Of two flaws that which comes first: length, layer, channel, then the channel's words.
+        ([0x0001, 1001, 500, 0x0010, 2200, 0, 0, 9], "BAD_VALUE", None),
+        ([0x0001, 1001, 500, 0x0012, 2200, 0, 0, 1, 50, 0], "BAD_LENGTH", None),
+        ([0x0001, 20, 500, 0x0010, 2200, 0, 18000, 0x0000, 1001, 0], "BAD_VALUE", 1),
+        ([0x0002, 20, 500, 0x0030, 2200, 10001, 0, 0x0030, 2200, 0, 0], "BAD_VALUE", 3),
+        ([0x0002, 1001, 500, *(0x0030, 2200, 0, 0) * 2], "BAD_VALUE", None),
+        ([0x0002, 20, 500, 0x0030, 2200, 0, 0, 0x0030, 2200, 10001, 0], "BAD_CHANNEL", 3),
     ],
 )
 def test_stream_that_no_host_may_send_is_refused(

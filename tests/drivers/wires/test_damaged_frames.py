@@ -49,9 +49,11 @@ class Recorded(Amplifier):
         super().__init__("a", channels=2)
         self.asked: list[tuple[str, Values]] = []
 
-    def handle(self, name: str, values: Values, now: float) -> Values:
+    def handle(
+        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
+    ) -> Values:
         self.asked.append((name, values))
-        return super().handle(name, values, now)
+        return super().handle(name, values, now, is_broadcast=is_broadcast)
 
 
 @pytest.mark.parametrize("kind", ["serial", "rtu", "tcp"])

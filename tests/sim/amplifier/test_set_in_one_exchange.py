@@ -141,7 +141,7 @@ def test_refused_set_drops_its_own_parts_alone() -> None:
     assert send(amplifier, last) == "missing 0"
     for part in (first, second):
         send(amplifier, part, stream=flawed)
-    assert send(amplifier, last, stream=[]) == "BAD_VALUE"  # layer 0 twice
+    assert send(amplifier, last, stream=[]) == "BAD_CHANNEL"
     assert send(amplifier, last) == "missing 0"
     assert [send(amplifier, each) for each in (first, second, last)] == ["", "", "staged"]
     assert send(amplifier, cut(2, count=1)[0], stream=flawed) == "BAD_CHANNEL"

@@ -159,7 +159,7 @@ class OnALine:
             {1: self.amplifier}, lambda data: self.replies.extend(reader.feed(data))
         )
 
-    def ask(self, kind: int, payload: str, *, version: int = 3) -> Frame:
+    def ask(self, kind: int, payload: str, *, version: int = 4) -> Frame:
         """The reply to a request with these bytes, in hexadecimal."""
         self.replies.clear()
         self.end.receive(encode_frame(Frame(kind, 1, 9, bytes.fromhex(payload), version)), 0.0)
@@ -170,12 +170,12 @@ class OnALine:
     ("kind", "payload", "version", "code"),
     [
         (99, "00", 2, "UNSUPPORTED_VERSION"),  # also unknown, with half a word
-        (99, "0000", 3, "UNKNOWN_TYPE"),
-        (3, "0000", 3, "BAD_VALUE"),  # session 0, and a word is missing
-        (3, "0100", 3, "BAD_LENGTH"),
-        (3, "0100 FA00 0000", 3, "BAD_LENGTH"),
-        (6, "0100 0000", 3, "BAD_TOKEN"),  # in the wrong state as well
-        (6, "0100 0100", 3, "WRONG_STATE"),  # of another session as well
+        (99, "0000", 4, "UNKNOWN_TYPE"),
+        (3, "0000", 4, "BAD_VALUE"),  # session 0, and a word is missing
+        (3, "0100 FA00", 4, "BAD_LENGTH"),
+        (3, "0100 FA00 0000 0000", 4, "BAD_LENGTH"),
+        (6, "0100 0000 0000", 4, "BAD_TOKEN"),  # in the wrong state as well
+        (6, "0100 0100 0000", 4, "WRONG_STATE"),  # of another session as well
     ],
 )
 def test_first_fault_wins_while_disarmed(kind: int, payload: str, version: int, code: str) -> None:
@@ -187,10 +187,10 @@ def test_first_fault_wins_while_disarmed(kind: int, payload: str, version: int, 
 def test_session_wins_over_what_a_request_asks_for() -> None:
     """While armed by session 7: a set of session 8 that is cut short, an Arm of another host."""
     line = OnALine()
-    line.ask(3, "0700 FA00")
+    line.ask(3, "0700 FA00 0000")
     assert line.ask(5, "0800 0100 0200 0100").payload[2] == REFUSALS["WRONG_SESSION"]
     assert line.ask(5, "0700 0100 0200 0100").payload[2] == REFUSALS["BAD_LENGTH"]
-    assert line.ask(3, "0800 D007").payload[2] == REFUSALS["WRONG_SESSION"]
+    assert line.ask(3, "0800 D007 0000").payload[2] == REFUSALS["WRONG_SESSION"]
 
 
 def test_echo_of_an_event_gets_no_reply() -> None:

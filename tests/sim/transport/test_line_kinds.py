@@ -53,11 +53,12 @@ def test_latency_has_its_least_and_median_and_stalls() -> None:
     stalled = [Latency(stalls=0.02, stall=1e-3).draw(rng) for _ in range(50_000)]
     assert sum(each > 0 for each in stalled) / 50_000 == pytest.approx(0.02, rel=0.1)
     assert statistics.mean(each for each in stalled if each) == pytest.approx(1e-3, rel=0.1)
+    assert max(stalled) <= 5e-3
 
 
 @pytest.mark.parametrize("name", LINE_KINDS)
 def test_delays_keep_the_order_and_are_those_of_their_seed(name: str) -> None:
-    """What is written first leaves first, each way; another seed gives other delays."""
+    """What is written first leaves first, each way, none too late; another seed, other delays."""
 
     def drawn(seed: object) -> list[float]:
         delays = LINE_KINDS[name].delays(seed)
@@ -66,6 +67,8 @@ def test_delays_keep_the_order_and_are_those_of_their_seed(name: str) -> None:
         ]
 
     times = drawn(("line", 1))
+    spent = [time - n % 300 * 1e-4 for n, time in enumerate(times)]
+    assert max(spent[:300]) + max(spent[300:]) <= LINE_KINDS[name].longest + 1e-3
     assert times[:300] == sorted(times[:300])
     assert times[300:] == sorted(times[300:])
     assert times == drawn(("line", 1)) != drawn(("line", 2))

@@ -43,8 +43,8 @@ def rtu(adu: str) -> bytes:
 Heard = tuple[str, bytes, str, dict[str, Any]]
 """A direction, bytes, and the message that they complete: "" for none."""
 PING: tuple[Heard, ...] = (
-    (">", tcp(5, "10 0C00 0002 04 0008 0007"), "Ping", {"session": 7, "rate": 0}),
-    ("<", tcp(5, "10 0C00 0002"), "carried out", {}),
+    (">", tcp(5, "10 0C00 0003 06 0008 0007 0000"), "Ping", {"session": 7, "rate": 0}),
+    ("<", tcp(5, "10 0C00 0003"), "carried out", {}),
     (">", tcp(6, "04 0C80 0002"), "read on", {}),
 )
 """With tag 8 and session 7."""
@@ -99,11 +99,11 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
         (
             (
                 ">",
-                rtu(f"01 10 0C00 0002 04 {PART[3:].hex()} 0007"),
+                rtu(f"01 10 0C00 0003 06 {PART[3:].hex()} 0007 0000"),
                 "Ping",
                 {"session": 7, "rate": 0},
             ),
-            ("<", rtu("01 10 0C00 0002"), "carried out", {}),
+            ("<", rtu("01 10 0C00 0003"), "carried out", {}),
             (">", rtu("01 04 0C80 0002"), "read on", {}),
             ("<", PART, "", {}),
             ("<", rtu(f"{PART.hex()} 0000")[len(PART) :], "reply", {}),
@@ -122,7 +122,7 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
         (
             (">", can(TONES[0]), "", {}),
             (
-                *(">", can("201 05 00 0C 01 07 00 00 00"), "damaged"),
+                *(">", can("201 05 00 0C 02 07 00 00 00"), "damaged"),
                 {"text": "message 4 without all frames"},
             ),
         ),
@@ -130,8 +130,8 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "echo, and another host": (
         "slcan",
         (
-            (">", can("201 01 00 0C 01 07 00 00 00"), "Ping", {"session": 7, "rate": 0}),
-            ("<", can("201 01 00 0C 01 07 00 00 00"), "", {}),
+            (">", can("201 01 00 0C 02 07 00 00 00"), "Ping", {"session": 7, "rate": 0}),
+            ("<", can("201 01 00 0C 02 07 00 00 00"), "", {}),
             ("<", can("201 02 00 03 02 17 2A FA 00"), "other host", {"text": "Arm"}),
         ),
     ),

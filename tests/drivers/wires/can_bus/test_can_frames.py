@@ -17,7 +17,11 @@ SET = ("1300050a34120700", "1301020081000100", "130200002000d007", "13038813d8dc
 """Session 1234, token 7, part 0 of 1; layer 1 along 1 ms: channel 2, 100 Hz, 0.5, -90 degrees."""
 REQUESTS: dict[str, tuple[int, Values, tuple[str, ...]]] = {
     "GetStatus": (0x11, {}, ("1100090000000000",)),
-    "Arm": (0x12, {"session": 0x1234, "watchdog": 250, "shift": 0}, ("120003023412fa00",)),
+    "Arm": (
+        0x12,
+        {"session": 0x1234, "watchdog": 250, "shift": 0},
+        ("120003033412fa00", "1201000000000000"),
+    ),
     "Set": (
         0x13,
         {
@@ -28,7 +32,11 @@ REQUESTS: dict[str, tuple[int, Values, tuple[str, ...]]] = {
         },
         SET,
     ),
-    "Commit": (0, {"session": 0x1234, "token": 7}, ("0000060234120700",)),  # a broadcast
+    "Commit": (
+        0,
+        {"session": 0x1234, "token": 7, "at": 0x0102},
+        ("0000060334120700", "0001020100000000"),
+    ),  # a broadcast
 }
 
 

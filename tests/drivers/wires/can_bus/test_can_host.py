@@ -34,28 +34,29 @@ def wire() -> CanWire:
 
 
 def test_versions_of_another_protocol_end_hello() -> None:
-    """Bit 2 for version 2: such an amplifier has the object, and does not reply to the message."""
+    """Bit 3 for version 3: such an amplifier has the object, and does not reply to the message."""
     wire = CanWire(500_000, sequence=0)
     wire.request(NODE, "Hello", {})
     versions = [
         pack_frames([CanFrame(can_id, bytes.fromhex(data))])
         for can_id, data in (
-            (0x585, "4B0020050C000000"),  # 2 and 3
-            (0x586, "4B00200504000000"),  # of another node
+            (0x585, "4B00200518000000"),  # 3 and 4
+            (0x586, "4B00200508000000"),  # of another node
             (0x585, "8000200500000206"),  # no such object
-            (0x585, "4B00200504000000"),
+            (0x585, "4B00200508000000"),
         )
     ]
-    assert [wire.received(each) for each in versions] == [[], [], [], [Reply({"versions": 4})]]
+    assert [wire.received(each) for each in versions] == [[], [], [], [Reply({"versions": 8})]]
     wire.request(NODE, "GetStatus", {})
     assert not wire.received(versions[-1])
 
 
 def test_broadcast_has_number_0_and_no_reply(wire: CanWire) -> None:
     """On identifier 200; the next request to node 5 goes on from 255 with 1."""
-    values = {"session": 0x1234, "token": 7}
-    (sent,) = unpack_frames(wire.request(0, "Commit", values))
-    assert (sent.id, sent.data.hex()) == (0x200, "0000060234120700")
+    values = {"session": 0x1234, "token": 7, "at": 0x0102}
+    sent, more = unpack_frames(wire.request(0, "Commit", values))
+    assert (sent.id, sent.data.hex()) == (0x200, "0000060334120700")
+    assert (more.id, more.data.hex()) == (0x200, "0001020100000000")
     (sent,) = unpack_frames(wire.request(NODE, "GetFaults", {}))
     assert sent.data.hex() == "01000a0000000000"
 

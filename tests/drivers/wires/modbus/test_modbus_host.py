@@ -127,7 +127,7 @@ def test_request_of_all_units_has_no_reply() -> None:
     commit = ("Commit", {"session": 9, "token": 7, "at": 0})
     wire = ModbusWire(0, is_rtu=True, number=0)
     frame = wire.request(0, *commit)
-    assert frame[:-2] == bytes.fromhex("00 10 0600 0003 06 0001 0009 0007")
+    assert frame[:-2] == bytes.fromhex("00 10 0600 0004 08 0001 0009 0007 0000")
 
     wire = ModbusWire(0, is_rtu=False, number=0)
     for unit in (1, 2):
@@ -220,7 +220,7 @@ def test_times_on_a_line_are_those_of_its_characters() -> None:
 
 
 def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
-    """By hand: to three units 3 · 15 characters at 9600 baud, two echoes of 8, five silences.
+    """By hand: to three units 3 · 17 characters at 9600 baud, two echoes of 8, five silences.
 
     Each echo may begin 10 ms late. A network has no time of its own.
     """
@@ -229,7 +229,7 @@ def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
     for unit in (1, 2, 3):
         wire.request(unit, "GetStatus", {})
     wire.request(0, *commit)
-    characters = 3 * 15 + 2 * 8 + 5 * 3.5
+    characters = 3 * 17 + 2 * 8 + 5 * 3.5
     assert wire.takes == pytest.approx(characters * 11 / 9600 + 2 * 0.01)
     network = ModbusWire(0, is_rtu=False, number=0)
     network.request(1, "GetStatus", {})

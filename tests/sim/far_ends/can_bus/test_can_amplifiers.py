@@ -11,14 +11,14 @@ from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 
 START = (0x000, "0100")
-ARM = (0x201, "010003023412fa00")  # session 1234, 250 ms
+ARM = ((0x201, "010003033412fa00"), (0x201, "0101000000000000"))  # session 1234, 250 ms
 SET = (  # session 1234, token 7: layer 0 along 0 ms, channel 0 at 100 Hz and half level
     (0x201, "0200050a34120700"),
     (0x201, "0201020001000000"),
     (0x201, "020200000000d007"),
     (0x201, "0203881300000000"),
 )
-COMMIT = (0x200, "0000060234120700")
+COMMIT = ((0x200, "0000060334120700"), (0x200, "0001000000000000"))
 
 
 class Bus:
@@ -56,9 +56,9 @@ def bus() -> Bus:
 @pytest.mark.parametrize("lost", range(4))
 def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> None:
     """No reply, nothing to commit; the repetition under a newer number is."""
-    bus.put(0.0, ARM)
+    bus.put(0.0, *ARM)
     kept = [*SET[:lost], *SET[lost + 1 :]]
-    assert bus.put(0.1, *kept, COMMIT) == []
+    assert bus.put(0.1, *kept, *COMMIT) == []
     assert bus.level(0.1) == 0.0
-    bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), COMMIT)
+    bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), *COMMIT)
     assert bus.level(0.11) == 0.5

@@ -157,7 +157,7 @@ class SettledReadings:
             ),
             np.array(values),
             tuple(fingers),
-            has_phase=False,  # renewals keep the phases of an earlier commit
+            has_phase=False,  # outputs follow their clocks by a delay that is not known
         )
         self._take(pattern)
 

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
+from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
@@ -118,6 +119,16 @@ class ExpectedAmplifier:
             self.can = capabilities
             self._settle("what was not heard")
             self.outputs.forget()
+
+    @property
+    def to_play(self) -> Playback:
+        """What it plays, with the set that waits, from its moment on."""
+        if self._waiting is None:
+            return self.outputs.playback
+        when, token, layers, _ = self._waiting
+        playback = self.outputs.playback.copied()
+        playback.commit(layers, token, sum(when) / 2)
+        return playback
 
     @property
     def present(self) -> int:
@@ -271,8 +282,8 @@ class ExpectedAmplifier:
     def part_came(self, part: Values, when: Interval) -> None:
         """Apply a part of a set but the last, which is kept or dropped without a word."""
         self.advance(when[0])
-        is_held = self.is_enabled and part["session"] == self.session
-        is_newer = self.token is not None and is_newer_token(part["token"], self.token)
+        is_held = self.state in (None, ENABLED) and self.session in (None, part["session"])
+        is_newer = is_newer_token(part["token"], self.token or 0)
         if is_held and is_newer and self.sets.keep(part, when):
             self.fed = when
 

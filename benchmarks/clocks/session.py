@@ -1,4 +1,4 @@
-"""A host with three amplifiers on lines as they are, in virtual time: the daemon's own control loop.
+"""A host with three amplifiers on lines as they are, in virtual time, with the daemon's own loop.
 
 Crystals are 50 ppm off and warm up, as `draw_imperfections` has them.
 """
@@ -84,7 +84,7 @@ async def armed(lines: Lines3, seed: int, names: tuple[str, ...] = NAMES) -> Asy
     rig = _rig_on_wire.on_amplifiers(_rig(12, 9), names)
     drawn = draw_imperfections(rig, seed=seed)
     async with _rig_on_wire.far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
-        far.machine.passing = (0.0, 0.0)
+        far.machine.be_prompt()
         controller = Controller(
             rig,
             _small_table(),

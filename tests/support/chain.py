@@ -292,21 +292,21 @@ class FarEnd:
         assert far.machine is not None
         self._machine = far.machine
 
-    def _handle(self, name: str, values: Values, now: float) -> Values:
+    def _handle(self, name: str, values: Values, now: float, **how: bool) -> Values | None:
         self.asked.append((now, name, values))
         answer = self.answer(name, values)
-        reply = self.obey(name, values, now) if answer is None else answer
+        reply = self.obey(name, values, now, **how) if answer is None else answer
         self._note(name, values, reply, now)
         return reply
 
-    def _note(self, name: str, values: Values, reply: Values, now: float) -> None:
+    def _note(self, name: str, values: Values, reply: Values | None, now: float) -> None:
         """Note what a request and its reply at a time [s] change."""
         if name == "Silence":
             self.committed.append((now, 0, ()))
         if name == "Set":
             parts = self._staged.setdefault(values["token"], {})
             parts[values["index"]] = list(values["stream"])
-        if name == "Commit" or (name == "Set" and reply["played"]):
+        if name == "Commit" or (name == "Set" and reply and reply.get("played")):
             parts = self._staged.pop(values["token"], {})  # none if it was repeated
             words = [word for index in sorted(parts) for word in parts[index]]
             if words:

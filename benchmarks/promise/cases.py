@@ -95,9 +95,9 @@ def _table(rig_name: str, is_identified: bool) -> LocalizationTable:
 
 
 def _resting(name: str, line: str, *, is_one_bus: bool = False) -> Case:
-    """Two contents on three amplifiers whose clocks drift, after ten minutes."""
+    """Two contents on three amplifiers whose clocks drift, while fingers rest."""
     return Case(
-        f"two contents after 10 min, {name}",
+        f"two contents at rest, {name}",
         None,
         "car_display",
         is_identified=True,
@@ -107,7 +107,9 @@ def _resting(name: str, line: str, *, is_one_bus: bool = False) -> Case:
     )
 
 
-RESTING = 600.0  # s
+HELD, RESTING = 3.0, 5.0  # s
+"""While clocks are read before any finger comes, and while fingers rest after."""
+
 _EVENTS = (LEAVES, JOINS, CHANGES)
 _TWO, _THREE = ((40.0, 110.0), (140.0, 190.0)), ((40.0, 110.0), (140.0, 190.0), (230.0, 320.0))
 CASES = (

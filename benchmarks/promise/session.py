@@ -18,7 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.promise.cases import CASES, CHANGES, JOINS, LEAVES, LEVEL_DB_SL, MOVES, Case, Point
+from benchmarks.promise.cases import (
+    CASES,
+    CHANGES,
+    HELD,
+    JOINS,
+    LEAVES,
+    LEVEL_DB_SL,
+    MOVES,
+    Case,
+    Point,
+)
 from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
@@ -161,6 +171,7 @@ class _Session:
             for id, band in enumerate(case.bands_for(contents)):
                 self._wanted.targets[id] = {"band": band}
             self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
+            await asyncio.sleep(HELD if case.resting else 0)
             on.at = dict(enumerate(self._places))
             if case.resting:
                 await on.hold(case.resting)

@@ -48,11 +48,16 @@ class CountedClocks:
         )
 
     def _say(self, before: Mapping[str, float]) -> None:
-        """Log which amplifiers play contents of their own from now on, and which no longer."""
+        """Log which amplifiers play contents of their own from now on, and which no longer.
+
+        No clock is known when its line has just been opened, so that it is no warning then.
+        """
+        level = logging.WARNING if before else logging.INFO
         for name, error in self.errors.items():
             is_alone = error > MAX_HELD
             if is_alone and before.get(name, 0.0) <= MAX_HELD:
-                _logger.warning(
+                _logger.log(
+                    level,
                     "amplifier %s: its clock is not held to the others', so its ERAs play contents "
                     "of their own; if that lasts, see its clock_error in era amp status",
                     name,

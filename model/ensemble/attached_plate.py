@@ -101,7 +101,7 @@ class AttachedPlate(Mounts):
     omega: FloatArray
     fingertip: Fingertip | None
     uncertainty: Uncertainty
-    clocks: ClockErrors = EXACT_CLOCKS
+    clocks: ClockErrors
 
     @property
     def era_count(self) -> int:

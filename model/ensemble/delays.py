@@ -86,9 +86,8 @@ class ClockErrors:
         own = np.array(self.amplifier)
         variance = _phases(self, frequencies)[:, own] ** 2
         is_same = own[:, None] == own
-        return (np.expm1(np.minimum(variance, _MAX_VARIANCE))[:, :, None] * is_same).astype(
-            np.float32
-        )
+        grown = np.expm1(np.minimum(variance, _MAX_VARIANCE))[:, :, None] * is_same
+        return np.asarray(grown, dtype=np.float32)
 
 
 EXACT_CLOCKS = ClockErrors()

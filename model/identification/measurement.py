@@ -47,8 +47,8 @@ class Measurement:
     of the imaginary part. half_level: tones repeated at half the level, per base displacement as
     well; at_end: the first tones, played last again; of both those that are loud beside noise,
     which nothing is allowed for. clock_errors: of the amplifiers that played and heard, by name, as
-    their lines and they state, rms [s]; empty where all have one clock. drives_lag: whether bases follow what was played with an unknown
-    lag, as actuators do behind an amplifier of voltage.
+    their lines and they state, rms [s]; empty where all have one clock. drives_lag: whether bases
+    follow what was played with an unknown lag, as actuators do behind an amplifier of voltage.
     """
 
     sensors: tuple[Sensor, ...]

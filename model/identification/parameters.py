@@ -219,8 +219,8 @@ def space_of(
     uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
     mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
     found by, and tell nothing more of it. drives_lag: whether bases follow what is played with a
-    lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic modes that may shift; form_of: number of sensors
-    beside ERAs of a plate with form errors.
+    lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic
+    modes that may shift; form_of: number of sensors beside ERAs of a plate with form errors.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
     none = np.zeros(0)

@@ -18,7 +18,7 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_SILENT = 0.2, 3e-3  # longer than a Ping is late
+_SILENT = 0.2, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
 _COMMON = 0.2  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
@@ -89,9 +89,10 @@ class HeldClock:
             return None if self.is_alone else "clock_not_steered"
         if time - self._jumped_at < CLOCK_SETTLING:
             return "clock_jumped"
-        if self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_CLOCK_RATE:
-            return "clock_rate"
-        return "clock_unsettled" if time - self._led_from > CLOCK_SETTLING else None
+        if time - self._led_from > CLOCK_SETTLING:
+            return "clock_unsettled"
+        is_off = self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_CLOCK_RATE
+        return "clock_rate" if is_off else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -104,8 +105,9 @@ class HeldClock:
         if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return self._rate
         within, most = _PLAYING if is_playing else _SILENT
-        rate = min(max(-self.lead(time) / within, -most), most) - self._fit.rate
-        return min(max(round(rate * _RATE.per_unit), _RATE.minimum), _RATE.maximum)
+        crystal = min(max(self._fit.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
+        rate = min(max(-self.lead(time) / within, -most), most) - crystal
+        return round(rate * _RATE.per_unit)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""

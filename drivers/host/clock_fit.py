@@ -114,7 +114,9 @@ class ClockFit:
         if (span := -points[0][0]) > 0:
             seen = _SLOPE * (self._end + _LEAST) / span
             trust = _LIKELY_RATE**2 / (_LIKELY_RATE**2 + seen**2)
-            slope, self._rate_error = trust * slope, math.sqrt(trust) * seen
+            slope = trust * slope
+            if count >= 2 * _FEW:
+                self._rate_error = math.sqrt(trust) * seen
         self._rate, self._lead = slope, min([lead - slope * time for time, lead in points])
 
 

@@ -57,26 +57,30 @@ class Clocks:
         return errors
 
     def look(self, line: Line, of_line: Sequence[Amplifier]) -> None:
-        """Read clocks of a line beside its heartbeat, which goes out next, as far as needed."""
-        if len(self._amplifiers) == 1:
+        """Read clocks of a line beside its heartbeat, which goes out next: more where needed."""
+        steered = [each for each in of_line if each.clock.can_be_steered]
+        if len(self._amplifiers) == 1 or not steered:
             return
-        now = line.time()
-        needed = [
-            each
-            for each in of_line
-            if each.clock.can_be_steered and each.clock.scatter(now) > _GOOD
-        ]
-        if line in self._marked_from or (needed and _has_marks(of_line)):
+        now, call_later = line.time(), asyncio.get_running_loop().call_later
+        is_good = all(each.clock.scatter(now) <= _GOOD for each in steered)
+        if line in self._marked_from or (not is_good and _has_marks(of_line)):
             self._marked_from.setdefault(line, now)
             for each in of_line:
                 each.clock.takes_marks = True
-            asyncio.get_running_loop().call_later(self._later(_INTERVAL), _mark, line)
+            call_later(self._later(_INTERVAL), _mark, line)
         elif line.late <= GRACE:
-            takes = sum([each.exchange_time("GetStatus") for each in needed])
+            takes = sum([each.exchange_time("GetStatus") for each in steered])
             interval = max(_INTERVAL, takes / _MAX_LOAD)
-            for number in range(1, int(HEARTBEAT / interval)):
-                later = self._later(number * interval)
-                asyncio.get_running_loop().call_later(later, self._read, needed)
+            count = int(HEARTBEAT / interval) - 1
+            for number in range(1, 1 + (min(count, 1) if is_good else count)):
+                call_later(self._later(number * interval), self._read, steered)
+
+    def dither(self, line: Line) -> float:
+        """Return by how much later [s] an amplifier is fed whose heartbeats alone are readings.
+
+        On a line whose replies come late, where nothing else is to wait for one.
+        """
+        return self._later(0.0) if len(self._amplifiers) > 1 and line.late > GRACE else 0.0
 
     def _later(self, duration: float) -> float:
         """Return a duration [s] and some of a frame."""

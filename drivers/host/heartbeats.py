@@ -102,6 +102,8 @@ class Heartbeats:
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
                 feed = partial(self._read_and_feed, each, self._members.epoch, reading)
+            elif later := self._clocks.dither(line):
+                feed = partial(self._feed_later, each.ping, self._members.epoch, later)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))
         return feeds
@@ -119,6 +121,12 @@ class Heartbeats:
         await reading
         self._members.check_none_since(before)
         return await amplifier.ping()
+
+    async def _feed_later(self, feed: Feed, before: int, later: float) -> object:
+        """Feed after a time [s], unless a stop or disarm has come since an epoch."""
+        await asyncio.sleep(later)
+        self._members.check_none_since(before)
+        return await feed()
 
     def _listen(self, amplifier: Amplifier) -> None:
         """Read the status of one that is mute, until it replies or is lost."""

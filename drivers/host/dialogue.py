@@ -273,7 +273,8 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        self.clock.sent(name, values, now, arrives)
+        # What was sent before may be lost: it may arrive as soon as its own bits have passed.
+        self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
         feeding = self.feeding

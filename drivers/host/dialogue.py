@@ -16,6 +16,7 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
+from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
 from drivers.host.jobs import Priority
@@ -112,6 +113,8 @@ class Dialogue:
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
         """What it may play by what is known beside its statuses and what fed it."""
+        self.clock = HeldClock()
+        """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -146,6 +149,15 @@ class Dialogue:
             words = request_words(name), reply_words(name, *size) + event
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
+
+    @property
+    def status_time(self) -> float:
+        """How long a Status takes on the wire [s]."""
+        if "Status" not in self._times:
+            can = self.capabilities
+            size = (can["channels"], can["layers"]) if can else WIDEST
+            self._times["Status"] = self.line.wire.transit(reply_words("GetStatus", *size))
+        return self._times["Status"]
 
     async def stage(
         self,
@@ -280,6 +292,7 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
+        self.clock.sent(name, values, now, arrives)
         if name == "Hello":
             return
         feeding = self.feeding
@@ -333,7 +346,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        for kind in reports_of(reply):
+        self.clock.replied(name, values, reply, now, bits=self.status_time)
+        for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:

@@ -155,7 +155,11 @@ BROKEN: Broken = {
         lambda: (
             Talk()
             .armed()
-            .exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(5, staged=False))
+            .exchange(
+                hand.SET,
+                hand.part(5, hand.layer(0)),
+                hand.taken(5, staged=False, exact=False),
+            )
         ),
     ),
     "broadcast_commit_ignored": (

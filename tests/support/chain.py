@@ -292,13 +292,11 @@ class FarEnd:
         assert far.machine is not None
         self._machine = far.machine
 
-    def _handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def _handle(self, name: str, values: Values, now: float) -> Values:
         self.asked.append((now, name, values))
         reply = self.answer(name, values)
         if reply is None:
-            reply = self.obey(name, values, now, is_broadcast=is_broadcast)
+            reply = self.obey(name, values, now)
         self._note(name, values, reply, now)
         return reply
 

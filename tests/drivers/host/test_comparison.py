@@ -111,8 +111,8 @@ async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None
     group = await group_of(end)
     take, handle = far._take, far.handle
 
-    def handled(name: str, values: Values, now: float, *, is_broadcast: bool) -> Values:
-        reply = handle(name, values, now, is_broadcast=is_broadcast)
+    def handled(name: str, values: Values, now: float) -> Values:
+        reply = handle(name, values, now)
         if name == "GetAchieved":
             reply["commands"] = [{**each, "frequency": said} for each in reply["commands"]]
         return reply

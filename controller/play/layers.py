@@ -60,9 +60,10 @@ class LayerContent:
 
     layer: with the ramp, onset and ending of its sets; drive: by ERA, as confirmed; settled_at
     [s]: when its onset has ended. is_shaped: whether it may have an ending, which is sent at
-    ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its first target would have been
-    lifted, as known when it was sent; between renewal_due and renewable_until it is renewed if all
-    targets have been confirmed since. ends_at: when it has ended by itself unless it was renewed.
+    ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its
+    first target would have been lifted, as known when it was sent; between renewal_due and
+    renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
+    ended by itself unless it was renewed.
     """
 
     content: Content
@@ -90,8 +91,8 @@ class Sets:
 
     layers: those that change, by number; started: of these, those that play another content;
     endings: of those that play on, which get an ending; silence: ramp [s] along which all layers
-    fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents that a ledger does not admit, for a reason; retry_at
-    [s]: when it may.
+    fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents
+    that a ledger does not admit, for a reason; retry_at [s]: when it may.
     """
 
     layers: Mapping[int, PlateLayer] = field(default_factory=dict)

@@ -31,7 +31,7 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_of, word_at
+from drivers.protocol.clock import moment_of, word_passed
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -243,7 +243,7 @@ class Dialogue:
         stop or disarm came first, CommandRefused where it is too late for what the ledger has
         admitted.
         """
-        at = word_at(self._time()) if at is None else at  # which has passed when it arrives
+        at = word_passed(self._time()) if at is None else at  # which has passed when it arrives
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 

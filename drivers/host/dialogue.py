@@ -19,7 +19,7 @@ from drivers.errors import (
 from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import Make, Priority
+from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -31,13 +31,12 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import clock_at, high_word, moment_of
+from drivers.protocol.clock import moment_of, word_at
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
-from registry import clock
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -67,19 +66,6 @@ class Staged:
     is_exact: bool
     since: float
     until: float
-
-
-def commit_of(session: int, token: int, at: int | None) -> Make:
-    """Return a commit; at: high word of the clock when the set starts, None for the present one.
-
-    Which is at once: it has passed when the commit arrives.
-    """
-
-    def make() -> list[Values]:
-        present = high_word(clock_at(clock.now())) if at is None else at
-        return [{"session": session, "token": token, "at": present}]
-
-    return make
 
 
 class Dialogue:
@@ -238,8 +224,9 @@ class Dialogue:
         stop or disarm came first, CommandRefused where it is too late for what the ledger has
         admitted.
         """
-        make = commit_of(self.session, token, at)
-        return self.line.submit(self, Priority.SET, "Commit", make)
+        at = word_at(self._time()) if at is None else at  # which has passed when it arrives
+        values = {"session": self.session, "token": token, "at": at}
+        return self.line.submit(self, Priority.SET, "Commit", values)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].

@@ -15,12 +15,12 @@ from typing import TypeAlias
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.clocks import Clocks
-from drivers.host.dialogue import commit_of
 from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
 from drivers.playing.contents import Layer
+from drivers.protocol.clock import word_at
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.timing import HEARTBEAT
@@ -165,10 +165,10 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            messages = commit_of(session, token, None)()
+            values = {"session": session, "token": token, "at": word_at(line.time())}
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
-                each.next_request(request, messages[0], Priority.SET)
-            return messages
+                each.next_request(request, values, Priority.SET)
+            return [values]
 
         return make

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
+from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
@@ -120,6 +121,16 @@ class ExpectedAmplifier:
             self.outputs.forget()
 
     @property
+    def to_play(self) -> Playback:
+        """What it plays, with the set that waits, from its moment on."""
+        if self._waiting is None:
+            return self.outputs.playback
+        when, token, layers, _ = self._waiting
+        playback = self.outputs.playback.copied()
+        playback.commit(layers, token, sum(when) / 2)
+        return playback
+
+    @property
     def present(self) -> int:
         """The high word of the clock that was read last, which names no moment ahead."""
         return high_word(self._clock[0]) if self._clock is not None else 0
@@ -150,7 +161,7 @@ class ExpectedAmplifier:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._begin(*self._waiting)
+            self._play_waiting(*self._waiting)
 
     def _trip(self, fault: int, since: Interval, cause: str) -> None:
         self.fault = fault
@@ -271,8 +282,8 @@ class ExpectedAmplifier:
     def part_came(self, part: Values, when: Interval) -> None:
         """Apply a part of a set but the last, which is kept or dropped without a word."""
         self.advance(when[0])
-        is_held = self.is_enabled and part["session"] == self.session
-        is_newer = self.token is not None and is_newer_token(part["token"], self.token)
+        is_held = self.state in (None, ENABLED) and self.session in (None, part["session"])
+        is_newer = is_newer_token(part["token"], self.token or 0)
         if is_held and is_newer and self.sets.keep(part, when):
             self.fed = when
 
@@ -317,9 +328,9 @@ class ExpectedAmplifier:
         """Play the set that waits, before another that is played between two times."""
         if self._waiting is not None and token != self.token:
             (early, late), *waiting = self._waiting
-            self._begin((min(early, when[0]), min(late, when[1])), *waiting)
+            self._play_waiting((min(early, when[0]), min(late, when[1])), *waiting)
 
-    def _begin(
+    def _play_waiting(
         self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
     ) -> None:
         """Have the set that waited play from some time between two on."""
@@ -359,10 +370,14 @@ class ExpectedAmplifier:
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
         self._note_clock(shown["clock"], when)
-        if self._waiting is None or when[1] < self._waiting[0][0] - self.slack:
+        if not self.may_start(when):
             self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
+
+    def may_start(self, when: Interval) -> bool:
+        """Whether a set that waits may have started by the end of an interval."""
+        return self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
 
     def _note_clock(self, clock: int, when: Interval) -> None:
         """Note the clock that a status shows, or compare it with that of a Mark before it."""
@@ -493,8 +508,7 @@ class ExpectedAmplifier:
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
         outputs = self.outputs
-        is_starting = self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
-        if is_starting or not (sure := outputs.sure(when)):
+        if self.may_start(when) or not (sure := outputs.sure(when)):
             return
         possible = outputs.tokens_of(number, sure)
         problem: Problem | None = None

@@ -77,7 +77,66 @@ BROKEN: Broken = {
     ),
     "staged_before_all_parts": (
         "commit",
-        lambda: Talk().armed().exchange(hand.SET, hand.part(5, LOUD[:4], parts=2), hand.taken(5)),
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(hand.SET, hand.part(5, LOUD[4:], index=1, parts=2), hand.taken(5))
+        ),
+    ),
+    "missing_though_all_came": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .sends(hand.SET, hand.part(5, LOUD[:4], parts=2))
+            .exchange(
+                hand.SET,
+                hand.part(5, LOUD[4:], index=1, parts=2),
+                hand.taken(5, staged=False, exact=False),
+            )
+        ),
+    ),
+    "part_replied_to": (
+        "credit",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(hand.SET, hand.part(5, LOUD[:4], parts=2), hand.taken(5, staged=False))
+        ),
+    ),
+    "exact_though_not_whole": (
+        "plays",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(
+                hand.SET,
+                hand.part(5, LOUD[4:], index=1, parts=2),
+                hand.taken(5, staged=False),
+            )
+        ),
+    ),
+    "played_before_its_moment": (
+        "silent",
+        lambda: (
+            Talk()
+            .armed()
+            .staged(5, LOUD)
+            .exchange(hand.COMMIT, (9, 5, 1000), hand.status(token=5))
+            .rest(0.1)
+            .says(token=5, levels=(5000, 0))
+        ),
+    ),
+    "not_played_at_its_moment": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .staged(5, LOUD)
+            .exchange(hand.COMMIT, (9, 5, 100), hand.status(token=5))
+            .rest(0.2)
+            .says(token=5, tokens=(5, 0, 0, 0))
+        ),
     ),
     "played_before_its_commit": (
         "commit",
@@ -96,7 +155,11 @@ BROKEN: Broken = {
         lambda: (
             Talk()
             .armed()
-            .exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(5, staged=False))
+            .exchange(
+                hand.SET,
+                hand.part(5, hand.layer(0)),
+                hand.taken(5, staged=False, exact=False),
+            )
         ),
     ),
     "broadcast_commit_ignored": (

@@ -67,8 +67,8 @@ def after_each(
     """Call with each request that a device carries out: its name, values, reply and time [s]."""
     obey = device.handle
 
-    def handle(name: str, values: Values, now: float, *, is_broadcast: bool = False) -> Values:
-        reply = obey(name, values, now, is_broadcast=is_broadcast)  # a refusal changes nothing
+    def handle(name: str, values: Values, now: float) -> Values:
+        reply = obey(name, values, now)  # a refusal changes nothing
         note(name, values, reply, now)
         return reply
 

@@ -254,9 +254,9 @@ async def mark(subject: Subject) -> None:
     """It keeps the clock of a Mark, alone or for all, and its next status shows that alone."""
     subject.require("mark")
     client = subject.client
-    await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
     if client.has_broadcasts:
         await client.look_around()
+    await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
     if client.has_broadcasts and not client.neighbours:
         sent = clock.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))

@@ -168,7 +168,7 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
 
 def check_sums(session: AmplifierSession, time: float) -> None:
     """Check what an amplifier plays from a time on, over all layers."""
-    sums = _sums(session.amplifier.outputs.playback, time)
+    sums = _sums(session.amplifier.to_play, time)
     for channel, limits in session.config.channels.items():
         level, rise = sums.get(channel, (0.0, 0.0))
         for what, value, limit in (("level", level, limits.level), ("rise", rise, limits.slew)):

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 from drivers.judge.amplifier import FEEDING as FEEDING
 from drivers.judge.watching.capture import Direction
 from drivers.protocol.records import Record, Refusal, Values
+from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
     ENABLED,
     EVENT,
@@ -60,6 +61,11 @@ class Request:
     earliest: float = math.inf
     end: float | None = None
     is_overdue: bool = False
+
+    @property
+    def has_reply(self) -> bool:
+        """Whether it is replied to: all but a part of a set that is not the last."""
+        return self.name != "Set" or bool(self.problem) or is_last(self.values)
 
 
 @dataclass(frozen=True, slots=True)

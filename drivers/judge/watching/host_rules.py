@@ -45,7 +45,7 @@ class HostRules:
 
         It silences, or reads whether a stop has, also one that a disarm's reading has confirmed.
         """
-        if request.name == "Set":
+        if request.name == "Set" and request.has_reply:
             layers = session.amplifier.sets.whole(request.values["token"])
             return layers is not None and not is_vibrating(*layers)
         is_unconfirmed = session.is_disarming or session.first_stop is not None
@@ -83,7 +83,7 @@ class HostRules:
         """Check a request to one amplifier; a broadcast is checked for each."""
         layers: Sequence[LayerSet] | None = None
         match request.name:
-            case "Set":
+            case "Set" if request.has_reply:
                 layers = session.amplifier.sets.whole(request.values["token"])
             case "Commit" if session.staged is not None:
                 token, staged = session.staged

@@ -17,7 +17,7 @@ from drivers.judge.watching.decoded import (
 )
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION, STATUS
+from drivers.protocol.table import REACTION, REFUSALS, STATUS, name_of
 
 _LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
 
@@ -84,12 +84,28 @@ class WatchedAmplifier(ExpectedAmplifier):
 
     # requests
 
+    def set_sent(self, request: Request) -> str:
+        """Note a part of a set that is sent; returns what is wrong with it, or ""."""
+        part = request.values
+        if part["index"] >= part["parts"]:
+            return f"index must be below {part['parts']}, got {part['index']}"
+        if not request.has_reply:
+            self.part_came(part, (request.started_at, request.since + REACTION))
+            return ""
+        return self.sets.sent(part)
+
+    def part_came(self, part: Values, when: Interval) -> None:
+        """Apply a part of a set but the last, which may be lost, and then feeds nothing."""
+        fed = self.fed
+        super().part_came(part, when)
+        self.fed = fed
+
     def sent(self, request: Request) -> None:
         """Note a request without a reply, or none yet, that may be carried out soon."""
         if request.name in FEEDING:
             self._fed_before = self.fed[1]
             self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
-        if request.name in CHANGING:
+        if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 
     def replied(self, request: Request, values: Values, end: float) -> None:
@@ -108,8 +124,10 @@ class WatchedAmplifier(ExpectedAmplifier):
             return
         self.granted(name, request.values, values, (request.earliest, end))
 
-    def refused(self, request: Request, time: float) -> None:
+    def refused(self, request: Request, code: int, time: float) -> None:
         """Note a refusal; what silences must not be refused, nor a commit of what is staged."""
+        if request.name == "Set" and not request.problem:
+            self.part_refused(request.values, name_of(REFUSALS, code))
         if request.name in FEEDING:
             self.fed = self.fed[0], self._fed_before
         if request.name in ("Stop", "Disarm"):

@@ -179,7 +179,9 @@ class WatchedWire:
                 self._check_request(session, time, sent)
             if session.is_mute and message.name == HELLO:
                 self._drop_pending(session)  # never to be replied to
-            if message.key is not None and (not is_copy or message.name == HELLO):
+            has_response = message.has_reply or self._kind.startswith("modbus")
+            is_awaited = message.key is not None and has_response
+            if message.key is not None and is_awaited and (not is_copy or message.name == HELLO):
                 self._pending[message.key] = sent
             session.is_mute &= message.name != HELLO
             if message.problem:
@@ -192,7 +194,7 @@ class WatchedWire:
     def _check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
         problem = request.problem
         if request.name == "Set" and not problem:
-            problem = session.amplifier.sets.sent(request.values, time)
+            problem = session.amplifier.set_sent(request)
         if problem:
             session.report_always("garbage", time, f"host sent {request.name}: {problem}")
         if request.problem:
@@ -200,9 +202,12 @@ class WatchedWire:
         if self._host.is_preempting(session, time, request):
             self._preempted_by = request.number
         elif not self.is_disturbed(request.started_at):
-            is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1
+            is_tcp = self._kind == "modbus-tcp"
+            is_to_each = is_tcp and len(self.sessions) > 1
             pending = [
-                one for one in self._pending.values() if not (is_to_each and one.name in BROADCAST)
+                one
+                for one in self._pending.values()
+                if not ((is_to_each and one.name in BROADCAST) or (is_tcp and not one.has_reply))
             ]
             self._host.check_order(session, request, pending, self._preempted_by)
         self._host.check_request(session, time, request)
@@ -212,6 +217,8 @@ class WatchedWire:
         sent = self._pending.get(notice.key)
         session = self.sessions.get(notice.address)
         match notice.what:
+            case "carried out" if sent is not None and not sent.has_reply:
+                del self._pending[notice.key]
             case "carried out" if sent is not None:
                 sent.since, sent.end = math.inf, time
             case "read on" if sent is not None:
@@ -251,7 +258,7 @@ class WatchedWire:
             session.report("garbage", time, what)
         amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
-            amplifier.refused(request, time)
+            amplifier.refused(request, reply.refusal, time)
         elif request.problem or reply.problem:
             if request.problem:
                 what = f"{session.name} accepted {request.name}: {request.problem}"

@@ -111,3 +111,38 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
     assert amplifier.handle("GetStatus", {}, 0.12)["high_voltage"] == round(1800 / math.e)
     assert Amplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["high_voltage"] == 0
+
+
+def test_rate_is_of_an_armed_session() -> None:
+    """100 ppm for a second are 21 475 steps of 2^32 in 20 s; disarmed there is no rate."""
+    amplifier = Amplifier("a", channels=2)
+    ping, shown = {"session": 7, "rate": 1000}, []
+    amplifier.handle("Ping", ping, 0.0)
+    amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 1.0)
+    for now in (1.0, 2.0):
+        shown.append(amplifier.handle("Ping", ping, now)["clock"])
+    amplifier.handle("Disarm", {"ramp": 0}, 2.0)
+    shown += [amplifier.handle("GetStatus", {}, now)["clock"] for now in (3.0, 4.0)]
+    fast = [clock - round(now * 2**32 / 20) for clock, now in zip(shown, (1, 2, 3, 4), strict=True)]
+    assert fast == pytest.approx([0, 21_475, 21_475, 21_475], abs=1)
+
+
+def test_watchdog_ends_the_rate_and_counts_real_time() -> None:
+    """3276.7 ppm fast, it trips after 0.25 s, and its clock is as fast as its crystal again."""
+    amplifier, events = armed(), []
+    amplifier.listeners.append(lambda event, at: events.append(at))
+    amplifier.handle("Ping", {"session": 7, "rate": 32767}, 0.0)
+    amplifier.tick(1.0)
+    assert events[0] == 0.25
+    ahead = amplifier.handle("GetStatus", {}, 1.0)["clock"] - round(2**32 / 20)
+    assert ahead == pytest.approx(0.25 * 3276.7e-6 * 2**32 / 20, abs=1)
+
+
+def test_shift_is_of_a_new_session() -> None:
+    """3 steps of the high word, once, though Arm is repeated; a restart shows 0."""
+    amplifier = Amplifier("a", channels=2)
+    for now in (0.0, 0.1):
+        status = amplifier.handle("Arm", {**ARM, "shift": 3}, now)
+    assert status["clock"] == 3 * 65536 + round(0.1 * 2**32 / 20)
+    amplifier.restart(5.0)
+    assert amplifier.handle("GetStatus", {}, 5.0)["clock"] == 0

@@ -111,6 +111,7 @@ def test_shift_is_the_nearest_step_and_the_rate_undoes_the_crystal() -> None:
     talk = Exchanges(Counter(40e-6, shown=START + 3.2001 - 40e-6))
     assert talk.arm() == 65536 - 10486
     assert abs(talk.counter.lead) <= STEP / 2 + 1e-6
+    assert talk.held.scatter(talk.now) < 20e-6  # what was read before goes on to count
     talk.run(10.0)
     assert talk.counter.rate == pytest.approx(-40e-6, abs=0.5e-6)
     assert abs(talk.counter.lead) < 2e-6
@@ -240,9 +241,9 @@ def test_what_it_states_is_in_its_error() -> None:
 
 
 def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
-    """The reply to Arm is lost: its clock is read anew, whether it was shifted or not."""
+    """The reply to Arm is lost: its clock is read anew, whether it was shifted by a step or not."""
     for is_obeyed in (True, False):
-        talk = Exchanges(Counter(shown=START + 5.0))
+        talk = Exchanges(Counter(shown=START - STEP))
         talk.run(1.0)
         shift = talk.held.shift(talk.now)
         talk.lost = lambda: True

@@ -20,7 +20,7 @@ from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_passed, word_behind
+from drivers.protocol.clock import word_behind, word_passed
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of

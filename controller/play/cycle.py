@@ -145,7 +145,7 @@ class Cycle:
     async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
         """Play the sets of a plan on all amplifiers, from one moment on.
 
-        Returns when [s] the last byte was sent, None where nothing is to be sent, or why they were
+        Returns when [s] they start, None where nothing is to be sent, or why they were
         refused. Whatever is raised instead leaves it unknown what plays.
         """
         if not (sets := plan.sets):
@@ -165,7 +165,7 @@ class Cycle:
             planner.not_played(plan)
             raise
         planner.confirm(sets, played, now=clock.now())
-        return played.sent_at
+        return played.starts_at
 
     def count_too_late(self, clicks: int) -> None:
         """Count clicks that came too late to be felt, while armed."""

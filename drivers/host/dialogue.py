@@ -107,7 +107,7 @@ class Dialogue:
         self.reported_at: dict[ReportKind, float] = {}
         """When [s] a status had a report last."""
         self.played_at = -math.inf
-        """When [s] a set or silence was sent last."""
+        """When [s] a set that was sent last starts at the soonest, or silence was sent."""
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -319,8 +319,8 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                self.played_at = arrives if is_now else now  # behind the other parts
                 starts = None if is_now else moment_of(values["at"], now)
+                self.played_at = arrives if starts is None else starts
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:

@@ -38,12 +38,12 @@ _COMMIT_WORDS = MESSAGES["Commit"].request.words
 class Played:
     """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
 
-    sent_at [s]: when the last commit went out.
+    starts_at [s]: at the soonest, the last of them.
     """
 
     token: int
     layers: Mapping[str, tuple[LayerSet, ...]]
-    sent_at: float
+    starts_at: float
 
 
 class JointSets:
@@ -114,15 +114,15 @@ class JointSets:
         self.is_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
-        sent_at = -math.inf
+        starts_at = -math.inf
         for each, one in staged.items():
-            played[each.name], sent_at = one.layers, max(sent_at, each.played_at)
+            played[each.name], starts_at = one.layers, max(starts_at, each.played_at)
             if not one.is_exact:
                 reading[each.name] = _achieved(each, one)
         if reading:
             achieved = await self._members.all([*reading.values()])
             played.update(zip(reading, achieved, strict=True))
-        return Played(token, played, sent_at)
+        return Played(token, played, starts_at)
 
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float

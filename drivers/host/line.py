@@ -121,9 +121,16 @@ class Line:
 
     @property
     def awaited(self) -> "asyncio.Future[Values] | None":
-        """The result of the request on the line, which a set waits for; None if it is free."""
+        """The result of the request on the line, unless a set preempts it; None if it is free."""
         job = self._current
-        return None if job is None or job.priority is Priority.READING else job.result
+        if job is None or (job.priority is Priority.READING and self._preempts_readings):
+            return None
+        return job.result
+
+    @property
+    def _preempts_readings(self) -> bool:
+        """Whether a set does: where replies come late a reading that is cut short never ends."""
+        return self.late <= GRACE
 
     def arrival(self, words: int) -> float:
         """Return by when [s] a request of so many words arrives that is sent next.
@@ -155,7 +162,7 @@ class Line:
                 if self._queue.jobs and self._must_yield(job):
                     self._not_answered(job)
                 else:
-                    self._start(job, arrival.data)
+                    self._start(job, arrival.data, is_present=arrival.is_present)
                 continue
             self._current = member.silence_cause = None
             if isinstance(arrival, Written):
@@ -217,10 +224,10 @@ class Line:
         finally:
             self._is_pumping = False
 
-    def _start(self, job: Job, rest: bytes = b"") -> None:
+    def _start(self, job: Job, rest: bytes = b"", *, is_present: bool = False) -> None:
         """Make a request in its turn and send it, noted for all that it reaches: no other way.
 
-        rest: of the request that is on the line already.
+        rest: of the request that is on the line already. is_present: its reply is made by that.
         """
         member, data = job.member, rest
         address = BROADCAST if member is None else member.address
@@ -249,6 +256,8 @@ class Line:
                 for each in self.members.values():
                     if address in (BROADCAST, each.address):
                         each.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            elif is_present and member is not None:
+                member.note_sent(job.name, job.values, now, begins + self.wire.takes)
             if trace.is_active():
                 what = job.name if member is None else f"{job.name} to {address}"
                 trace.frame(Direction.OUT, data, self.name, lambda: what)
@@ -358,8 +367,7 @@ class Line:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         free_at = max(self.time(), self._free_at)
-        # Where replies come late one that is cut short would never end.
-        yields_to = Priority.SET if self.late <= GRACE else Priority.SILENCE
+        yields_to = Priority.SET if self._preempts_readings else Priority.SILENCE
         if current.priority is Priority.READING and min(waiting, default=8) <= yields_to:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:

@@ -279,8 +279,10 @@ class Line:
             job.result.set_result({})
             return
         if not rest:
-            # A slow wire: as long as on others until it counts as degraded.
-            job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
+            # A slow wire: as long as on others until it counts as degraded. Of several parts each is
+            # lost as easily: heartbeats, which go between them, find one that is mute.
+            is_cut = job.longer and job.attempts == ATTEMPTS and len(job.parts) < 2
+            job.attempts -= 2 if is_cut else 1
         # Each of the two responses on Modbus may begin late.
         late = self.late if self.late > GRACE else 0.0
         job.due = max(job.due, begins + job.longer + job.timeout + late)

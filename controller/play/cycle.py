@@ -19,6 +19,7 @@ from drivers.errors import (
     DriverError,
     LinkDegraded,
     LinkError,
+    Overtaken,
     Preempted,
 )
 from drivers.host.group import Group
@@ -157,7 +158,10 @@ class Cycle:
                 return sent_at
             if self.group.sets.is_incomplete:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            played = await self.group.apply(sets.by_amplifier)
+            gives_way = self._wake.is_set if sets.endings else None
+            played = await self.group.apply(sets.by_amplifier, gives_way)
+        except Overtaken:  # endings, by what has come since: they follow it
+            return None
         except BaseException as error:
             is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:

@@ -12,9 +12,9 @@ from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.errors import CommandRefused, DriverError, Preempted
+from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged
+from drivers.host.dialogue import GivesWay, Staged
 from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
@@ -69,10 +69,13 @@ class JointSets:
                 refusals[name] = refusal
         return _merged(refusals) if refusals else None
 
-    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
+    async def play(
+        self, layers: Mapping[str, Sequence[Layer]], gives_way: GivesWay | None = None
+    ) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
+        Overtaken where it has given way.
         """
         before = self._members.epoch
         if self.token % INTERVAL == 0:
@@ -86,7 +89,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                staging.append(each.stage(token, layers[each.name], now=is_now))
+                one = layers[each.name]
+                staging.append(each.stage(token, one, now=is_now, gives_way=gives_way))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -101,7 +105,12 @@ class JointSets:
         if refusals and not has_failed:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
-        staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        try:
+            staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        except Overtaken as overtaken:
+            return overtaken
+        if gives_way is not None and not is_now and gives_way():
+            return Overtaken(f"set {token} has given way")
         if not is_now:
             self._members.check_none_since(before)
             self.is_incomplete = True

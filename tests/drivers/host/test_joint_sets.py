@@ -6,7 +6,7 @@ from itertools import combinations
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
+from drivers.errors import CommandRefused, DriverError, LinkTimeout, Overtaken, Preempted
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import MESSAGES
@@ -202,6 +202,42 @@ async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> Non
         await applying
     await reading
     assert await started(*ends) == [[], []]
+
+
+@pytest.mark.parametrize(("names", "staged"), [("a", [0]), ("ab", [0, 1])])
+@in_virtual_time
+async def test_set_gives_way_until_an_amplifier_is_to_play_it(
+    names: str, staged: list[int]
+) -> None:
+    """The line of one is busy for 3 ms; another one stages it, which no commit follows.
+
+    What plays goes on, and the next set plays at once.
+    """
+    ends = [MemoryLine("serial", each) for each in names]
+    group = await group_of(*ends)
+    await group.apply(dict.fromkeys(names, [LAYER]))
+    await started(*ends)
+    for end in ends:
+        end.sent.clear()
+    ends[0].outward = lambda _, data: [(0.003, data)]
+    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
+    await asyncio.sleep(0)
+    has_come = False
+    ending = group.apply(dict.fromkeys(names, [loud(0, 0.4)]), lambda: has_come)
+    giving_way = asyncio.ensure_future(ending)
+    await asyncio.sleep(0.001)
+    has_come = True
+    with pytest.raises(Overtaken):
+        await giving_way
+    await reading
+    sent = [[each for _, each in end.sent] for end in ends]
+    assert [each.count(f"1:{MESSAGES['Set'].number}") for each in sent] == staged
+    assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)
+    assert [end.levels()[0] for end in ends] == [0.5] * len(ends)
+    assert group.is_armed
+    await group.apply(dict.fromkeys(names, [loud(0, 0.2)]))
+    await started(*ends)
+    assert [end.levels()[0] for end in ends] == [0.2] * len(ends)
 
 
 def loud(number: int, level: float) -> Layer:

@@ -76,7 +76,7 @@ class Preempted(CommandRefused):
 
 
 class Overtaken(Preempted):
-    """A set that has given way before any amplifier was to play it: what plays goes on."""
+    """A set that was preempted before any amplifier was to play it: what plays goes on."""
 
 
 class CommandError(DriverError, ValueError):

@@ -158,8 +158,8 @@ class Cycle:
                 return sent_at
             if self.group.sets.is_incomplete:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            gives_way = self._wake.is_set if sets.endings else None
-            played = await self.group.apply(sets.by_amplifier, gives_way)
+            is_preempted = self._wake.is_set if sets.endings else None
+            played = await self.group.apply(sets.by_amplifier, is_preempted)
         except Overtaken:  # endings, by what has come since: they follow it
             return None
         except BaseException as error:

@@ -67,8 +67,8 @@ _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
-GivesWay: TypeAlias = Callable[[], bool]
-"""Whether a set gives way to what is waited for, as long as no amplifier is to play it."""
+IsPreempted: TypeAlias = Callable[[], bool]
+"""Whether what waits preempts a set, as long as no amplifier is to play it."""
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
 _UNCHECKED: tuple[Sequence[Layer] | None, float, float, _Checked] = (None, -math.inf, 0.0, ((), []))
 _logger = logging.getLogger(__name__)
@@ -162,12 +162,12 @@ class Dialogue:
         *,
         now: bool = False,
         priority: Priority | None = None,
-        gives_way: GivesWay | None = None,
+        is_preempted: IsPreempted | None = None,
     ) -> Staged:
         """Stage a set under a token, or play it at once.
 
         priority: None for that of a set, or of what silences. It is admitted by the ledger when
-        its turn on the line has come, unless it gives way then. Raises CommandRefused with the
+        its turn on the line has come, unless it is preempted then. Raises CommandRefused with the
         reason; Preempted where a stop came first; FrameError for two replies in a row with another
         token.
         """
@@ -177,8 +177,8 @@ class Dialogue:
 
         def make() -> list[Values]:
             nonlocal staged
-            if gives_way is not None and gives_way():
-                raise Overtaken(f"amplifier {self.name}: set {token} has given way")
+            if is_preempted is not None and is_preempted():
+                raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
             staged, messages = self._admit(token, layers, now=now)
             return messages
 

@@ -14,7 +14,7 @@ from functools import partial
 
 from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import GivesWay, Staged
+from drivers.host.dialogue import IsPreempted, Staged
 from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
@@ -70,12 +70,12 @@ class JointSets:
         return _merged(refusals) if refusals else None
 
     async def play(
-        self, layers: Mapping[str, Sequence[Layer]], gives_way: GivesWay | None = None
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
     ) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
-        Overtaken where it has given way.
+        Overtaken where it is preempted before that.
         """
         before = self._members.epoch
         if self.token % INTERVAL == 0:
@@ -89,8 +89,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                one = layers[each.name]
-                staging.append(each.stage(token, one, now=is_now, gives_way=gives_way))
+                wanted = layers[each.name]
+                staging.append(each.stage(token, wanted, now=is_now, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -109,8 +109,8 @@ class JointSets:
             staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
         except Overtaken as overtaken:
             return overtaken
-        if gives_way is not None and not is_now and gives_way():
-            return Overtaken(f"set {token} has given way")
+        if is_preempted is not None and not is_now and is_preempted():
+            return Overtaken(f"set {token} is preempted")
         if not is_now:
             self._members.check_none_since(before)
             self.is_incomplete = True

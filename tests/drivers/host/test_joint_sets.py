@@ -215,7 +215,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     """
     ends = [MemoryLine("serial", each) for each in names]
     group = await group_of(*ends)
-    await group.apply(dict.fromkeys(names, [LAYER]))
+    await group.apply({each: [LAYER] for each in names})
     await started(*ends)
     for end in ends:
         end.sent.clear()
@@ -223,7 +223,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
     await asyncio.sleep(0)
     has_come = False
-    ending = group.apply(dict.fromkeys(names, [loud(0, 0.4)]), lambda: has_come)
+    ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
     giving_way = asyncio.ensure_future(ending)
     await asyncio.sleep(0.001)
     has_come = True
@@ -235,7 +235,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)
     assert [end.levels()[0] for end in ends] == [0.5] * len(ends)
     assert group.is_armed
-    await group.apply(dict.fromkeys(names, [loud(0, 0.2)]))
+    await group.apply({each: [loud(0, 0.2)] for each in names})
     await started(*ends)
     assert [end.levels()[0] for end in ends] == [0.2] * len(ends)
 

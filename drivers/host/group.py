@@ -191,7 +191,7 @@ class Group:
         Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
         one does not reply: then it is unknown whether the set plays. What else fails stops all
         amplifiers before it is raised.
-        is_preempted: asked before an amplifier is sent the set, and before they are to play it; then
+        is_preempted: asked before one is sent the set, and before they are to play it; if so,
         Overtaken, and what plays goes on.
         """
         return self._exchange(partial(self.sets.play, layers, is_preempted))

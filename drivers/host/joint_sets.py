@@ -89,8 +89,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                wanted = layers[each.name]
-                staging.append(each.stage(token, wanted, now=is_now, is_preempted=is_preempted))
+                requested = layers[each.name]
+                staging.append(each.stage(token, requested, now=is_now, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent

@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Overtaken, Preempted
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
 from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire
@@ -101,6 +101,42 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
         await asyncio.sleep(0.05)
         await group.beat()
     assert await apart() < 1e-6
+
+
+@pytest.mark.parametrize("lines", [("a", "b"), ("ab",)], ids=len)
+@in_virtual_time
+async def test_sets_start_together_by_clocks_that_cannot_be_steered(lines: tuple[str, ...]) -> None:
+    """Each its own way around: b's is 0.35 s behind, where the word of 0.25 s ago is ahead.
+
+    On two lines within a step of the word that names the moment; on one all play at once.
+    """
+    ends = [MemoryLine("serial", *names) for names in lines]
+    for end in ends:
+        for name, far in end.far.items():
+            far.capabilities["clock_error"] = CLOCK_UNKNOWN
+            crystal = Crystal(ahead={"a": 7.3, "b": -0.35}[name])
+            far.clock = AmplifierClock(crystal, since=end.loop.time())
+    group = await group_of(*ends)
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    began = [each for starts in await started(*ends) for each in starts]
+    assert len(began) == 2
+    if len(lines) == 2:
+        assert max(abs(each - applied.starts_at) for each in began) < 305e-6
+
+
+@in_virtual_time
+async def test_amplifier_that_does_not_start_at_its_moment_is_found() -> None:
+    """By two statuses, 1 and 12 ms after the moment, that show nothing of the set."""
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    group = await group_of(*ends)
+    ends[1].far["b"].playback.commit = lambda *_: None  # type: ignore[method-assign]
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    read_status = group.amplifiers["b"].read_status
+    await asyncio.sleep(applied.starts_at + 0.001 - ends[0].loop.time())
+    await read_status()
+    await asyncio.sleep(0.011)
+    with pytest.raises(CommandRefused):
+        await read_status()
 
 
 @pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])

@@ -106,7 +106,7 @@ class WatchedAmplifier(ExpectedAmplifier):
             self._fed_before = self.fed[1]
             self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
         if request.name == "Mark" and request.key is None:
-            self._marked = request.started_at, request.since + REACTION
+            self.clock.mark((request.started_at, request.since + REACTION))
         if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 

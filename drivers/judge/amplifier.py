@@ -299,7 +299,7 @@ class ExpectedAmplifier:
         self._start_waiting(token, when)
         moment = self.clock.moment(commit["at"], when)
         layers = self.sets.whole(token)
-        if layers is None or moment == when:
+        if layers is None or moment is None:
             self._play(token, when)
             return
         self._waiting, self.token = (moment, token, layers, self.sets.is_exact), token

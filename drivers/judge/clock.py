@@ -46,8 +46,11 @@ class ExpectedClock:
                 what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
                 self._report("clock", when[1], what, must=must, seen=passed)
 
-    def moment(self, at: int, when: Interval) -> Interval:
-        """Return when a set starts whose commit names a high word and comes between two times."""
+    def moment(self, at: int, when: Interval) -> Interval | None:
+        """Return when a set starts whose commit names a high word and comes between two times.
+
+        None where that is surely at once.
+        """
         if self._read is None:
             return when[0], when[1] + _MAX_AHEAD
         clock, read = self._read
@@ -57,5 +60,5 @@ class ExpectedClock:
         if early > when[1] and late <= when[0] + _MAX_AHEAD:
             return early, late
         if late <= when[0] or early > when[1] + _MAX_AHEAD:
-            return when
+            return None
         return when[0], max(when[1], late)

@@ -17,6 +17,7 @@ class ExpectedClock:
         self._report, self._slack = report, slack
         self._read: tuple[int, Interval] | None = None  # the last one, and when
         self._marked: Interval | None = None
+        self._is_unclear = False
 
     @property
     def present(self) -> int:
@@ -30,14 +31,18 @@ class ExpectedClock:
 
     def mark(self, when: Interval) -> None:
         """Note a Mark that comes between two times."""
-        self._marked = when
+        self._marked, self._is_unclear = when, False
+
+    def unheard(self) -> None:
+        """Note that a status may have shown the clock of a Mark which was not heard."""
+        self._is_unclear = True
 
     def check(self, shown: int, when: Interval) -> None:
         """Note what a status shows, or compare it where it is the clock of a Mark."""
         marked, self._marked = self._marked, None
         if marked is None:
             self._read = shown, when
-        elif self._read is not None:
+        elif self._read is not None and not self._is_unclear:
             clock, read = self._read
             slack = self._slack + _DRIFT * (marked[1] - read[0])
             low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Mapping
 
 from drivers.protocol.records import Bits, Number, Record
 from drivers.protocol.table import (
+    AHEAD_MAX,
+    CLOCK_TURN,
     COMMAND,
     EVENT,
     FAULTS,
@@ -50,8 +52,7 @@ _HEAD = """\
 _RANGES = (
     *("frequency_PER_UNIT", "WIRE_level_MAX", "level_PER_UNIT"),
     *("WIRE_phase_MIN", "WIRE_phase_MAX", "phase_PER_UNIT", "WIRE_ramp_MAX", "WIRE_valid_for_MAX"),
-    *("WIRE_watchdog_MIN", "WIRE_watchdog_MAX", "WIRE_knots_MAX"),
-    *("WIRE_envelope_step_MIN", "WIRE_envelope_step_MAX"),
+    *("WIRE_watchdog_MIN", "WIRE_watchdog_MAX", "WIRE_envelope_step_MAX"),
 )
 """What the firmware uses of quantities; requests are checked by their table."""
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}  # of words out of range, by quantity
@@ -108,6 +109,7 @@ def _constants() -> Mapping[str, int]:
         **{"PROTOCOL_VERSION": VERSION, "WORDS_MAX": MAX_WORDS, "NO_CHANNEL": NO_CHANNEL},
         "STAGED_LIFE_MS": round(STAGED_LIFE * 1000),
         "SHORTENED_FADE_MS": round(SHORTENED_FADE * 1000),
+        **{"CLOCK_TURN": round(CLOCK_TURN), "AHEAD_MAX": AHEAD_MAX},
         **{name: ranges[name] for name in _RANGES},
     }
 

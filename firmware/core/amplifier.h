@@ -2,7 +2,8 @@
 //
 // The amplifier, whatever its wire: states, session, watchdog, layers, faults, and its samples.
 //
-// Requests take effect with the next sample (wire/messages.c reads them). `amplifier_sample` makes
+// Requests take effect with the next sample (wire/messages.c reads them), a commit also with that at
+// a moment of the clock, on which the phases of all voices count. `amplifier_sample` makes
 // that sample; `amplifier_time` says what real time it is, which ends watchdog, vibrations and sets
 // that wait for a commit even where no samples are made. Nothing here knows the board; its main loop
 // (loop.c) hands over what is measured and takes samples and `high_voltage`.
@@ -17,8 +18,16 @@ struct layer {
     uint16_t token, ramp, valid_for; // of the set that plays
     struct timer ends;
     uint32_t waits; // samples until the set that waits starts; 0: none waits
+    bool starts, is_over; // with the sample just made
     uint16_t waiting_token, waiting_count;
     uint16_t waiting[STREAM_WORDS];
+};
+
+// A set that was committed for a moment ahead.
+struct waiting_set {
+    uint16_t token; // 0: none waits
+    uint32_t at;    // of the clock
+    uint16_t count, words[STREAM_WORDS];
 };
 
 struct fault_record {
@@ -51,6 +60,8 @@ struct amplifier {
     // For the board: whether the high voltage is on.
     bool high_voltage;
     uint32_t slack; // us by which samples may come late
+    int32_t ahead;  // 2^-16 of a sample, by which the next sample comes out later than now
+    uint32_t heard; // us since the last byte of the request arrived
 
     enum state state;
     enum fault fault;
@@ -59,7 +70,8 @@ struct amplifier {
     uint64_t sample;   // samples since power-up
     uint64_t clock;    // of the next sample, 20 s a turn of 2^64
     uint64_t step;     // of the clock per sample, by the host's rate
-    uint16_t since;    // the last sample have passed so many 2^-16 of one
+    uint32_t mark;     // the clock that the next status shows instead, if it
+    bool has_mark;
     uint64_t now;      // us
     uint64_t now_at;   // sample before which it was that time
     uint16_t watchdog; // ms
@@ -67,6 +79,7 @@ struct amplifier {
     uint16_t committed; // token of the set committed last; 0: none
     bool is_limited;    // the sum of a channel was, since the last status
     struct intake intake;
+    struct waiting_set waiting;
     struct layer layers[LAYERS];
     struct channel channels[CHANNELS_MAX];
     struct fault_record faults[FAULTS_KEPT]; // newest first
@@ -84,6 +97,9 @@ void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX]
 
 // The same in units of 2^-30 of full level, whatever SQUARE_LAW.
 void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX]);
+
+// Let the clock go on by the time of samples that were lost.
+void amplifier_skip(struct amplifier *amplifier, uint64_t samples);
 
 // Hand over real time [us], which never goes back: what was due by then has ended.
 void amplifier_time(struct amplifier *amplifier, uint64_t now);
@@ -104,8 +120,9 @@ void amplifier_stop(struct amplifier *amplifier, uint16_t ramp);
 void amplifier_silence(struct amplifier *amplifier, uint16_t ramp);
 enum nak amplifier_clear(struct amplifier *amplifier, uint16_t latch);
 void amplifier_feed(struct amplifier *amplifier);
-// Play the staged set under its token.
-void amplifier_play(struct amplifier *amplifier);
+// Commit the staged set: it plays when the high word of the clock becomes `at`, if that is within
+// half a second ahead, else at once.
+void amplifier_commit(struct amplifier *amplifier, uint16_t at);
 
 // Time of the next sample [us].
 static inline uint64_t amplifier_now(const struct amplifier *amplifier)
@@ -113,12 +130,11 @@ static inline uint64_t amplifier_now(const struct amplifier *amplifier)
     return amplifier->now + (amplifier->sample - amplifier->now_at) * 1000000 / SAMPLE_RATE;
 }
 
-// What its clock is by now: that of the last sample, and what has passed since.
+// The clock at the output by now: that of the next sample, less the time until that comes out.
 static inline uint32_t amplifier_clock(const struct amplifier *amplifier)
 {
-    const uint32_t step = (uint32_t)(amplifier->step >> 32);
-    const uint32_t next = (uint32_t)(amplifier->clock >> 32);
-    return next - step + (uint32_t)((uint64_t)step * amplifier->since >> 16);
+    int64_t ahead = (int64_t)(amplifier->step >> 16) * amplifier->ahead;
+    return (uint32_t)((amplifier->clock - (uint64_t)ahead) >> 32);
 }
 
 // Token of a layer that plays, 0 of a silent one.

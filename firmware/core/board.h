@@ -16,8 +16,10 @@ enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 // Real time [us], of another clock than the converter's: it ends watchdog and vibrations even where
 // no samples are taken.
 uint64_t board_microseconds(void);
-// Samples that are due since the last call, by the clock of the converter.
-uint32_t board_samples_due(void);
+// Samples that are due since the last call, by the clock of the converter. ahead, read together with
+// them and unbiased: by how much the next one will come out later than now, in 2^-16 of a sample: of
+// one, less what the converter's timer has counted, and what lies in a buffer before it.
+uint32_t board_samples_due(int32_t *ahead);
 // Hand the next sample of every channel to the converter; 32767 is full level.
 void board_output(const int16_t samples[CHANNELS_MAX]);
 // Go on sending; then sleep until a sample is due or a byte has arrived.
@@ -29,7 +31,8 @@ void board_wait(void);
 int board_read(enum line line);
 // Begin to send; the bytes are copied.
 void board_write(enum line line, const uint8_t *bytes, uint16_t length);
-// Microseconds since the last byte arrived (Modbus RTU ends its frames with silence).
+// Microseconds since the byte read last arrived: Modbus RTU ends its frames with silence, and Mark
+// keeps the clock of a byte (with the feature, of every line, by the time stamp of an interrupt).
 uint32_t board_silence(enum line line);
 
 // High voltage, and what is measured.

@@ -34,12 +34,14 @@
 #endif
 #define ENVELOPE_KNOTS 32
 
-#define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000
+#ifndef SAMPLE_RATE
+#define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000, at least 4000
+#endif
 #define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
 
 // 1: the serial line is shared with other amplifiers (RS-485), so that events are not sent there.
 #define SERIAL_IS_SHARED 0
-#define FEATURES (FEATURE_EVENTS | FEATURE_INTERLOCK | FEATURE_ADDRESS)
+#define FEATURES (FEATURE_EVENTS | FEATURE_INTERLOCK | FEATURE_ADDRESS | FEATURE_MARK)
 
 #define FREQUENCY_MIN (20 * FREQUENCY_PER_UNIT)
 #define FREQUENCY_MAX (2000 * FREQUENCY_PER_UNIT) // at most a quarter of the sample rate
@@ -55,7 +57,7 @@
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-#define CLOCK_ERROR (10000000 / SAMPLE_RATE) // 0.1 us; a reading is that of the next sample
+#define CLOCK_ERROR 10 // 0.1 us; board_samples_due knows microseconds
 
 #define FAULTS_KEPT 16
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
 // Layers: what a committed set makes them play, when they end by themselves, and sets that wait for
-// the end of onsets.
+// a moment of the clock or the end of onsets.
 
 #include "amplifier.h"
 
@@ -11,11 +11,13 @@ static void let_last(struct layer *layer)
 {
     timer_stop(&layer->ends);
     layer->waits = 0;
+    layer->starts = layer->is_over = false;
 }
 
 static void end_by(struct amplifier *amplifier, struct layer *layer, uint16_t valid_for)
 {
     timer_stop(&layer->ends);
+    layer->is_over = false;
     if (valid_for > 0)
         timer_start(&layer->ends, valid_for, amplifier_now(amplifier));
 }
@@ -70,10 +72,11 @@ static void wait(struct layer *layer, struct layer_head head, const uint16_t *wo
     memcpy(layer->waiting, words, layer->waiting_count * sizeof *words);
 }
 
-void amplifier_play(struct amplifier *amplifier)
+// Start what was committed with the next sample.
+static void start_set(struct amplifier *amplifier)
 {
-    struct intake *intake = &amplifier->intake;
-    struct reader reader = reader_of(intake->words, intake->count);
+    struct waiting_set *set = &amplifier->waiting;
+    struct reader reader = reader_of(set->words, set->count);
     while (reader.left > 0 && reader.nak == NAK_NONE) {
         const uint16_t *words = reader.at;
         struct layer_head head = read_layer(&reader);
@@ -82,13 +85,35 @@ void amplifier_play(struct amplifier *amplifier)
         if (head.renew) {
             end_by(amplifier, layer, head.valid_for);
         } else if (waits > 0) {
-            wait(layer, head, words, &reader, intake->token, waits);
+            wait(layer, head, words, &reader, set->token, waits);
         } else {
-            start(amplifier, head, &reader, intake->token);
+            start(amplifier, head, &reader, set->token);
         }
     }
-    amplifier->committed = intake->token;
+    set->token = 0;
+}
+
+// Whether the next sample is at or behind the moment of the set that waits.
+static bool is_due(const struct amplifier *amplifier)
+{
+    uint32_t next = (uint32_t)(amplifier->clock >> 32);
+    return amplifier->waiting.token > 0 && (int32_t)(next - amplifier->waiting.at) >= 0;
+}
+
+void amplifier_commit(struct amplifier *amplifier, uint16_t at)
+{
+    struct intake *intake = &amplifier->intake;
+    struct waiting_set *set = &amplifier->waiting;
+    uint16_t ahead = (uint16_t)(at - (amplifier_clock(amplifier) >> 16));
+    if (set->token > 0) // it goes first
+        start_set(amplifier);
+    set->token = amplifier->committed = intake->token;
+    set->at = (uint32_t)at << 16;
+    set->count = intake->count;
+    memcpy(set->words, intake->words, intake->count * sizeof *set->words);
     intake_drop(intake);
+    if (ahead < 1 || ahead > AHEAD_MAX || is_due(amplifier))
+        start_set(amplifier);
 }
 
 static void end(struct amplifier *amplifier, uint8_t number)
@@ -103,12 +128,18 @@ void layers_sample(struct amplifier *amplifier)
 {
     for (uint8_t i = 0; i < LAYERS; i++) {
         struct layer *layer = &amplifier->layers[i];
-        bool has_ended = timer_sample(&layer->ends);
-        if (layer->waits > 0 && --layer->waits == 0) {
+        layer->is_over = timer_sample(&layer->ends);
+        layer->starts = layer->waits > 0 && --layer->waits == 0;
+    }
+    if (is_due(amplifier))
+        start_set(amplifier);
+    for (uint8_t i = 0; i < LAYERS; i++) {
+        struct layer *layer = &amplifier->layers[i];
+        if (layer->starts) {
             struct reader reader = reader_of(layer->waiting, layer->waiting_count);
             struct layer_head head = read_layer(&reader);
             start(amplifier, head, &reader, layer->waiting_token);
-        } else if (has_ended) {
+        } else if (layer->is_over) {
             end(amplifier, i);
         }
     }
@@ -123,6 +154,7 @@ void layers_time(struct amplifier *amplifier)
 
 void layers_silence(struct amplifier *amplifier, uint16_t ramp)
 {
+    amplifier->waiting.token = 0;
     for (unsigned i = 0; i < LAYERS; i++)
         let_last(&amplifier->layers[i]);
     for (unsigned i = 0; i < CHANNELS; i++)

@@ -77,8 +77,12 @@ void loop_samples(void)
 {
     int16_t samples[CHANNELS_MAX];
     uint64_t now = board_microseconds();
-    uint32_t due = board_samples_due();
-    due = due > SAMPLES_LATE_MAX ? SAMPLES_LATE_MAX : due;
+    uint32_t due = board_samples_due(&amplifier.ahead);
+    if (due > SAMPLES_LATE_MAX) {
+        amplifier_skip(&amplifier, due - SAMPLES_LATE_MAX);
+        due = SAMPLES_LATE_MAX;
+    }
+    amplifier.heard = 0;
     uint64_t span = (uint64_t)due * 1000000 / SAMPLE_RATE;
     amplifier_time(&amplifier, now > span ? now - span : 0); // of the first one
     for (; due > 0; due--) {
@@ -91,6 +95,15 @@ void loop_samples(void)
     }
     amplifier_time(&amplifier, now);
     switch_high_voltage();
+}
+
+// Make the samples that are due by the last byte of a frame; return the silence since it [us].
+static uint32_t hear(enum line line)
+{
+    uint32_t silence = board_silence(line);
+    loop_samples();
+    amplifier.heard = silence;
+    return silence;
 }
 
 static void send(enum line line, const uint8_t *reply, uint16_t length)
@@ -113,7 +126,7 @@ static void serve_serial(void)
 {
     for (int byte = board_read(LINE_SERIAL); byte >= 0; byte = board_read(LINE_SERIAL)) {
         if (byte == 0) // the end of a frame
-            loop_samples();
+            hear(LINE_SERIAL);
         send(LINE_SERIAL, serial.reply, serial_byte(&serial, (uint8_t)byte));
     }
 }
@@ -123,15 +136,14 @@ static void serve_modbus(void)
     for (int byte = board_read(LINE_MODBUS); byte >= 0; byte = board_read(LINE_MODBUS))
         rtu_byte(&rtu, (uint8_t)byte);
     if (rtu.length > 0)
-        loop_samples();
-    send(LINE_MODBUS, rtu.reply, rtu_silence(&rtu, board_silence(LINE_MODBUS)));
+        send(LINE_MODBUS, rtu.reply, rtu_silence(&rtu, hear(LINE_MODBUS)));
 }
 
 static void serve_can(void)
 {
     for (int byte = board_read(LINE_CAN); byte >= 0; byte = board_read(LINE_CAN)) {
         if (byte == '\r')
-            loop_samples();
+            hear(LINE_CAN);
         const char *answer = slcan_byte(&slcan, (uint8_t)byte);
         if (answer != NULL)
             send(LINE_CAN, (const uint8_t *)answer, (uint16_t)strlen(answer));

@@ -42,8 +42,14 @@ void amplifier_init(struct amplifier *amplifier, const char *serial_number,
 
 void amplifier_steer(struct amplifier *amplifier, int16_t rate)
 {
-    const int64_t step = (int64_t)(UINT64_C(0xCCCCCCCCCCCCCCD) / SAMPLE_RATE); // 2^64 in 20 s
-    amplifier->step = (uint64_t)(step + step / 10000000 * rate);
+    // 2^64 in 20 s, too much by less than 1 for each sample: by 2 us in a year at 48 kHz.
+    const int64_t step = (int64_t)(UINT64_MAX / (CLOCK_TURN * SAMPLE_RATE) + 1);
+    amplifier->step = (uint64_t)(step + step * rate / 10000000);
+}
+
+void amplifier_skip(struct amplifier *amplifier, uint64_t samples)
+{
+    amplifier->clock += amplifier->step * samples;
 }
 
 void amplifier_restart(struct amplifier *amplifier)
@@ -51,6 +57,7 @@ void amplifier_restart(struct amplifier *amplifier)
     layers_silence(amplifier, 0);
     intake_drop(&amplifier->intake);
     timer_stop(&amplifier->fed);
+    amplifier_steer(amplifier, 0);
     amplifier->committed = 0;
     amplifier->high_voltage = amplifier->is_limited = false;
     amplifier->fault = FAULT_NONE;
@@ -186,8 +193,6 @@ void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
     amplifier->sample++;
     amplifier->clock += amplifier->step;
     layers_sample(amplifier);
-    for (unsigned i = 0; i < CHANNELS; i++)
-        channel_stop_silent(&amplifier->channels[i]);
     settle(amplifier);
     if (timer_sample(&amplifier->intake.life))
         intake_drop(&amplifier->intake);

@@ -11,9 +11,11 @@ uint64_t board_microseconds(void)
     return memory.now;
 }
 
-uint32_t board_samples_due(void)
+uint32_t board_samples_due(int32_t *ahead)
 {
-    uint64_t due = memory.now * SAMPLE_RATE / 1000000 - memory.samples_counted;
+    uint64_t passed = memory.now * SAMPLE_RATE; // in millionths of a sample
+    uint64_t due = passed / 1000000 + memory.buffered - memory.samples_counted;
+    *ahead = (int32_t)((1000000 - passed % 1000000) * 65536 / 1000000 + 65536 * memory.buffered);
     memory.samples_counted += due;
     return (uint32_t)due;
 }

@@ -18,6 +18,7 @@ extern struct memory {
         uint64_t heard_at;
     } lines[LINES];
     uint64_t now, samples_counted; // us, and those made of them
+    uint32_t buffered;             // samples that are made ahead
     int16_t samples[SAMPLES_MAX];
     uint32_t samples_length; // of all channels, not fetched yet
     bool is_interlock_open;

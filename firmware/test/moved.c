@@ -14,13 +14,15 @@
 
 static struct mbap connection;
 
-void moved_begin(void)
+// buffered: samples that are made ahead.
+void moved_begin(uint32_t buffered)
 {
     memset(memory.lines, 0, sizeof memory.lines);
     memset(memory.addresses, 1, sizeof memory.addresses);
     connection.length = 0;
     memory.now = memory.samples_counted = 0;
     memory.samples_length = 0;
+    memory.buffered = buffered;
     memory.is_interlock_open = false;
     loop_init();
 }

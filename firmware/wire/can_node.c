@@ -104,18 +104,19 @@ static void handle(struct can_node *node, const struct can_assembly *message)
     uint8_t type = message->type;
     uint16_t address = message->words[SET_ADDRESS_ADDRESS];
     bool is_moving = type == MESSAGE_SET_ADDRESS && message->count > 0;
-    if (type == MESSAGE_HELLO)
+    if (type == MESSAGE_HELLO && message->is_numbered)
         message_identity(&reply, node->amplifier);
     else if (is_moving && address > NODE_MAX)
         verdict.nak = NAK_BAD_VALUE;
     else
-        verdict = message_handle(node->amplifier, type, message->words, message->count, &reply);
+        verdict = message_handle(node->amplifier, type, message->words, message->count,
+                                 message->is_numbered ? &reply : NULL);
     is_moving = is_moving && verdict.nak == NAK_NONE && address != node->number;
     if (verdict.nak != NAK_NONE) {
         message_nak(&reply, type, verdict);
         type = MESSAGE_NAK;
     }
-    if (message->is_numbered)
+    if (message->is_numbered && reply.count > 0)
         can_send_message(node, message->number, type, &reply);
     if (is_moving) {
         node->number = (uint8_t)address;
@@ -138,8 +139,7 @@ void can_receive(struct can_node *node, const struct can_frame *frame)
     } else if (node->nmt != NMT_OPERATIONAL) {
         return; // until it is identified
     } else if (frame->id == REQUEST) {
-        if (can_assemble(&node->broadcasts, frame->data, now) &&
-            message_is_broadcast(node->broadcasts.type))
+        if (can_assemble(&node->broadcasts, frame->data, now))
             handle(node, &node->broadcasts);
     } else if (function == REQUEST) {
         if (can_assemble(&node->requests, frame->data, now))

@@ -17,30 +17,20 @@ static const struct request {
     } field[REQUEST_FIELDS_MAX];
 } REQUESTS[] = {REQUEST_TABLE};
 
-static const struct request *request_of(uint8_t type)
-{
-    bool is_known = type >= MESSAGE_GET_CAPS && type < sizeof REQUESTS / sizeof REQUESTS[0];
-    return is_known ? &REQUESTS[type] : NULL;
-}
-
-bool message_is_broadcast(uint8_t type)
-{
-    const struct request *request = request_of(type);
-    return request != NULL && request->is_broadcast;
-}
-
-static bool is_there(uint8_t type)
+bool message_is_known(uint8_t type)
 {
     switch (type) {
     case MESSAGE_SET_ADDRESS:
         return (FEATURES & FEATURE_ADDRESS) != 0;
+    case MESSAGE_MARK:
+        return (FEATURES & FEATURE_MARK) != 0;
     case MESSAGE_GET_MEASURED:
     case MESSAGE_GET_SENSORS:
     case MESSAGE_MEASURE:
     case MESSAGE_GET_READING:
         return false;
     default:
-        return true;
+        return type >= MESSAGE_GET_CAPS && type < sizeof REQUESTS / sizeof REQUESTS[0];
     }
 }
 
@@ -89,7 +79,6 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
     const uint32_t clock = (uint32_t)(amplifier->clock >> 32);
-    amplifier->is_limited = false;
     for (unsigned i = 0; i < CHANNELS; i++)
         levels[i] = channel_level(&amplifier->channels[i], clock);
     for (uint8_t i = 0; i < LAYERS; i++)
@@ -101,7 +90,7 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
         .latch = amplifier->latch,
         .watchdog_left = amplifier_watchdog_left(amplifier),
         .readings = amplifier->measured.readings,
-        .clock = amplifier_clock(amplifier),
+        .clock = amplifier->has_mark ? amplifier->mark : amplifier_clock(amplifier),
         .token = amplifier->committed,
         .channels = CHANNELS,
         .layers = LAYERS,
@@ -109,6 +98,7 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
         .tokens = tokens,
     };
     put_status(reply, &status);
+    amplifier->is_limited = amplifier->has_mark = false;
 }
 
 static void reply_capabilities(struct words *reply)
@@ -130,7 +120,7 @@ static void reply_capabilities(struct words *reply)
         .level_max = LEVEL_MAX, .level_step = 1,
         .phase_step = 1,
         .ramp_max = RAMP_MAX,
-        .slew = UINT16_MAX,
+        .slew = 0, // no limit
         .watchdog_min = WATCHDOG_MIN, .watchdog_max = WATCHDOG_MAX,
         .envelope_step_min = ENVELOPE_STEP_MIN, .envelope_step_max = ENVELOPE_STEP_MAX,
         .clock_error = CLOCK_ERROR,
@@ -179,7 +169,7 @@ static enum nak reply_achieved(struct words *reply, const struct amplifier *ampl
     return NAK_NONE;
 }
 
-// Take a part of a set, and play it where it is whole and says so.
+// Take a part of a set, and play that where its last part says so.
 static struct verdict take(struct amplifier *amplifier, const uint16_t *words, uint16_t count,
                            struct words *reply)
 {
@@ -188,32 +178,36 @@ static struct verdict take(struct amplifier *amplifier, const uint16_t *words, u
     struct verdict verdict = {.channel = NO_CHANNEL};
     uint16_t token = words[SET_TOKEN], bits = words[SET_BITS];
     bool is_played = token == amplifier->committed, is_staged = false;
-    if (!is_played) {
-        verdict.nak = is_newer(token, amplifier->committed)
-                          ? intake_take(intake, token, bits, &part, amplifier->now)
-                          : NAK_BAD_TOKEN;
+    if (!is_played && !is_newer(token, amplifier->committed)) {
+        verdict.nak = NAK_BAD_TOKEN;
+    } else if (is_earlier_part(bits)) {
+        bool is_kept = !is_played && intake_keep(intake, token, bits, &part, amplifier->now);
+        verdict.nak = is_kept ? NAK_NONE : NAK_BAD_TOKEN;
+        return verdict;
+    } else if (!is_played) {
+        verdict.nak = intake_take(intake, token, bits, &part, amplifier->now);
         verdict.channel = part.channel;
-        is_staged = intake->is_staged;
+        is_staged = intake->is_staged && intake->token == token;
     }
     if (verdict.nak != NAK_NONE)
         return verdict;
     if (is_staged && FIELD_OF(bits, SET_NOW)) {
-        amplifier_play(amplifier);
+        amplifier_commit(amplifier, (uint16_t)(amplifier_clock(amplifier) >> 16));
         is_played = true;
         is_staged = false;
     }
     struct wire_taken taken = {
         .token = token,
-        .exact = true,
+        .exact = is_staged || is_played,
         .staged = is_staged,
         .played = is_played,
-        .missing = is_staged || is_played ? 0 : intake_missing(intake),
+        .missing = is_staged || is_played ? 0 : intake_missing(intake, token),
     };
     put_taken(reply, &taken);
     return verdict;
 }
 
-static enum nak commit(struct amplifier *amplifier, uint16_t token)
+static enum nak commit(struct amplifier *amplifier, uint16_t token, uint16_t at)
 {
     const struct intake *intake = &amplifier->intake;
     if (token == amplifier->committed) // its reply was lost
@@ -222,7 +216,7 @@ static enum nak commit(struct amplifier *amplifier, uint16_t token)
         return NAK_BAD_TOKEN;
     if (!intake->is_staged)
         return NAK_INCOMPLETE;
-    amplifier_play(amplifier);
+    amplifier_commit(amplifier, at);
     return NAK_NONE;
 }
 
@@ -258,7 +252,7 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
     case MESSAGE_SET:
         return take(amplifier, words, count, reply);
     case MESSAGE_COMMIT:
-        verdict.nak = commit(amplifier, words[COMMIT_TOKEN]);
+        verdict.nak = commit(amplifier, words[COMMIT_TOKEN], words[COMMIT_AT]);
         break;
     case MESSAGE_SILENCE:
         if (words[SILENCE_RAMP] > RAMP_MAX)
@@ -285,6 +279,11 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
         if (amplifier->state == OPERATION_ENABLED)
             amplifier_steer(amplifier, (int16_t)words[PING_RATE]);
         break;
+    case MESSAGE_MARK:
+        amplifier->mark = amplifier_clock(amplifier) -
+                          (uint32_t)(((uint64_t)amplifier->heard << 32) / (CLOCK_TURN * 1000000));
+        amplifier->has_mark = true;
+        break;
     default: // GetStatus
         break;
     }
@@ -294,11 +293,15 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, const
 struct verdict message_handle(struct amplifier *amplifier, uint8_t type, const uint16_t *words,
                               uint16_t count, struct words *reply)
 {
-    const struct request *request = request_of(type);
     struct verdict verdict = {.nak = NAK_UNKNOWN_TYPE, .channel = NO_CHANNEL};
+    struct words unsent = {.count = 0};
+    bool is_broadcast = reply == NULL;
+    if (is_broadcast)
+        reply = &unsent;
     reply->count = 0;
-    if (request == NULL || !is_there(type))
+    if (!message_is_known(type) || (is_broadcast && !REQUESTS[type].is_broadcast))
         return verdict;
+    const struct request *request = &REQUESTS[type];
     verdict.nak = check_words(request, type, words, count);
     if (verdict.nak == NAK_NONE && !is_allowed(amplifier, type))
         verdict.nak = NAK_WRONG_STATE;
@@ -307,12 +310,12 @@ struct verdict message_handle(struct amplifier *amplifier, uint8_t type, const u
         verdict.nak = NAK_WRONG_SESSION;
     if (verdict.nak == NAK_NONE)
         verdict = carry_out(amplifier, type, words, count, reply);
-    if (verdict.nak != NAK_NONE)
-        return verdict;
-    if (request->feeds)
+    if (verdict.nak == NAK_NONE && request->feeds)
         amplifier_feed(amplifier);
-    if (reply->count == 0) // after feeding, so that the status shows the watchdog full
-        reply_status(reply, amplifier);
+    if (type == MESSAGE_SET && count > SET_BITS && is_earlier_part(words[SET_BITS]))
+        verdict.nak = NAK_NONE; // dropped without a word
+    else if (verdict.nak == NAK_NONE && reply->count == 0 && !is_broadcast)
+        reply_status(reply, amplifier); // after feeding, so that it shows the watchdog full
     return verdict;
 }
 

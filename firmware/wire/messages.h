@@ -7,13 +7,14 @@
 
 #include "amplifier.h"
 
-// Carry out a request of a type, but for Hello; the reply is written where it is not refused. What
-// SetAddress sets, words[SET_ADDRESS_ADDRESS], is its line's to take.
+// Carry out a request of a type, but for Hello; the reply is written where it is not refused. None is
+// to an earlier part of a set, be it kept or not: no words. reply: null of a broadcast, which most
+// types may not be. What SetAddress sets, words[SET_ADDRESS_ADDRESS], is its line's to take.
 struct verdict message_handle(struct amplifier *amplifier, uint8_t type, const uint16_t *words,
                               uint16_t count, struct words *reply);
 
-// Whether a type may be for all amplifiers of a line.
-bool message_is_broadcast(uint8_t type);
+// Whether there is such a message, with the features of this amplifier.
+bool message_is_known(uint8_t type);
 
 // Write the reply to a request that was refused.
 void message_nak(struct words *reply, uint8_t type, struct verdict verdict);

@@ -42,7 +42,7 @@ static bool is_present(uint16_t type)
     return type == MESSAGE_GET_CAPS || type == MESSAGE_GET_STATUS || type == MESSAGE_GET_FAULTS;
 }
 
-// Carry out a message; return the result: 0, or code and channel of the refusal.
+// Carry out a message, a broadcast without a reply (null); return the result: 0, or code and channel of the refusal.
 static uint16_t execute(struct modbus *modbus, uint8_t type, const uint16_t *words, uint16_t count,
                         struct words *reply)
 {
@@ -173,11 +173,9 @@ void modbus_broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length
 {
     uint16_t words[1 + WORDS_MAX], count;
     uint8_t type;
-    struct words reply;
-    if (length == 0 || pdu[0] != WRITE || read_write(pdu, length, &type, words, &count) != 0 ||
-        !message_is_broadcast(type))
+    if (length == 0 || pdu[0] != WRITE || read_write(pdu, length, &type, words, &count) != 0)
         return;
-    if (execute(modbus, type, words + 1, (uint16_t)(count - 1), &reply) == 0 &&
+    if (execute(modbus, type, words + 1, (uint16_t)(count - 1), NULL) == 0 &&
         type == MESSAGE_SET_ADDRESS)
         modbus->unit = modbus->next_unit;
 }

@@ -13,7 +13,7 @@
 // Words of the longer of the replies that are kept.
 #define LONGER(a, b) ((a) > (b) ? (a) : (b))
 #define MODBUS_KEPT LONGER(STATUS_WORDS(CHANNELS_MAX, LAYERS), ACHIEVED_WORDS(CHANNELS_MAX))
-#define MODBUS_BOXES (MESSAGE_GET_READING + 1)
+#define MODBUS_BOXES (MESSAGE_MARK + 1)
 
 struct modbus {
     struct amplifier *amplifier;

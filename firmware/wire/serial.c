@@ -98,7 +98,7 @@ static bool has_good_crc(const uint8_t *frame, uint16_t length)
            sent[2] == (uint8_t)(crc >> 16) && sent[3] == (uint8_t)(crc >> 24);
 }
 
-// Carry a request out. SetAddress takes effect after its reply, which has the address before it.
+// Carry a request out; reply: null of a broadcast. SetAddress takes effect after its reply, which has the address before it.
 static struct verdict handle(struct serial *serial, const uint8_t *request, uint16_t length,
                              struct words *reply)
 {
@@ -106,7 +106,7 @@ static struct verdict handle(struct serial *serial, const uint8_t *request, uint
     uint16_t words[WORDS_MAX], count = (uint16_t)((length - HEADER) / 2);
     if (request[VERSION] != PROTOCOL_VERSION)
         return verdict;
-    verdict.nak = NAK_BAD_LENGTH;
+    verdict.nak = message_is_known(request[TYPE]) ? NAK_BAD_LENGTH : NAK_UNKNOWN_TYPE;
     if ((length - HEADER) % 2 != 0)
         return verdict;
     for (uint16_t i = 0; i < count; i++)
@@ -131,8 +131,7 @@ static uint16_t frame_received(struct serial *serial)
     length = (uint16_t)(length - 4);
     memcpy(frame, request, HEADER); // address and sequence are those of the request
     if (request[ADDRESS] == BROADCAST) {
-        if (message_is_broadcast(request[TYPE]))
-            handle(serial, request, length, &reply);
+        handle(serial, request, length, NULL);
         return 0;
     }
     frame[TYPE] = request[TYPE] | REPLY;
@@ -144,6 +143,8 @@ static uint16_t frame_received(struct serial *serial)
     if (verdict.nak != NAK_NONE) {
         message_nak(&reply, request[TYPE], verdict);
         frame[TYPE] = MESSAGE_NAK | REPLY;
+    } else if (reply.count == 0) {
+        return 0;
     }
     if (verdict.nak == NAK_UNSUPPORTED_VERSION)
         frame[VERSION] = NEUTRAL;

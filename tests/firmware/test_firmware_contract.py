@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from drivers.protocol.clock import ahead
 from drivers.protocol.table import BY_NUMBER, READINGS
 from firmware_requests import RandomHost
 from judged_line import judged
@@ -20,6 +21,7 @@ REQUESTS = 600
 TOLERANCE = 3e-4  # of full level: 16-bit samples, and fixed point in up to 16 voices
 ROUNDED = {"levels": 2, "watchdog_left": 1, "age": 2}
 """Where replies differ by rounding."""
+CLOCK_ERROR = 1e-6  # s; that of config.h
 BOARDS_OWN = {each.name for each in READINGS}
 LIMITED = 4  # the flag: one is foreseen at a commit, the other seen in samples
 BUILDS = {"-DSMALLEST": 4, **{f"-DCHANNELS={channels}": channels for channels in (4, 8, 16)}}
@@ -57,18 +59,20 @@ def agree(name: str, ours: object, theirs: object) -> bool:
         return len(ours) == len(theirs) and all(agree(name, *each) for each in pairs)
     if isinstance(ours, dict) and isinstance(theirs, dict):
         return all(agree(each, ours[each], theirs[each]) for each in ours)
-    if name in ROUNDED:
+    if name in ("clock", *ROUNDED):
         assert isinstance(ours, int)
         assert isinstance(theirs, int)
+        if name == "clock":  # its samples come out when they are due, one later
+            return abs(ahead(theirs, ours) - 1 / RATE) < CLOCK_ERROR
         return abs(ours - theirs) <= ROUNDED[name]
     return ours == theirs
 
 
 def value_at(amplifier: Amplifier, channel: int, time: float) -> float:
-    """What it plays at a time [s]: Im[A(t) exp(2 pi i f (t - origin))], limited."""
-    total = 0.0
+    """What it plays at a time [s]: Im[A(t) exp(2 pi i f clock(t))], limited."""
+    total, seconds = 0.0, amplifier.clock.seconds(time)
     for voice in amplifier.playback.all_voices[channel]:
-        turned = cmath.exp(2j * math.pi * voice.frequency * (time - voice.origin))
+        turned = cmath.exp(2j * math.pi * voice.frequency * seconds)
         total += (voice.transition.at(time) * turned).imag
     return min(max(total, -1.0), 1.0)
 
@@ -89,7 +93,8 @@ def test_random_requests_have_the_same_replies_and_samples(
     pair = Pair(firmware, amplifier)
     host = RandomHost(draw, amplifier.capabilities)
     for _ in range(REQUESTS):
-        for number, words in host.requests(amplifier.latch):
+        clock = amplifier.clock.reading(pair.moment)
+        for number, words in host.requests(amplifier.latch, clock):
             made, expected = pair.ask(number, words)
             assert len(made) == len(expected), (made, expected)
             for ours, theirs in zip(made, expected, strict=True):

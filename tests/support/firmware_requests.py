@@ -7,6 +7,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, token_after
 
 NONSENSE = [*range(2, 14), *range(19, 40)]  # others depend on what is there besides
+MOMENTS = 128
+"""Steps of the clock's high word in which whole numbers of samples pass, at 16 kHz."""
 FREQUENCIES = (2000, 2600, 2605, 5000)  # 0.05 Hz
 
 
@@ -49,13 +51,13 @@ class RandomHost:
         self._token = 1
         self._session = 1
 
-    def requests(self, latch: int) -> Iterator[tuple[int, list[int]]]:
-        """Yield number and words of the next requests; latch: that of the amplifier."""
+    def requests(self, latch: int, clock: int) -> Iterator[tuple[int, list[int]]]:
+        """Yield number and words of the next requests; latch, clock: those of the amplifier."""
         draw, kind = self._draw, self._draw.random()
         if kind < 0.55:
-            yield from self._set()
+            yield from self._set(clock >> 16)
         elif kind < 0.8:
-            yield 12, [self._session if draw.random() < 0.9 else 99]
+            yield 12, [self._session if draw.random() < 0.9 else 99, 0]
             yield 13, [draw.randint(0, 8)]
         elif kind < 0.9:
             yield draw.choice([2, 9, 10, 13]), [draw.randint(0, 3)] * draw.randint(0, 1)
@@ -68,11 +70,11 @@ class RandomHost:
             yield draw.choice(NONSENSE), [draw.choice([0, 1, 2, 300, 65535]) for _ in range(length)]
         if draw.random() < 0.2:
             yield 11, [latch if draw.random() < 0.8 else 7]
-            yield 3, [self._session, 150]
+            yield 3, [self._session, 150, MOMENTS * draw.randint(0, 511)]
         if draw.random() < 0.1:
             self._session += 1
 
-    def _set(self) -> Iterator[tuple[int, list[int]]]:
+    def _set(self, high: int) -> Iterator[tuple[int, list[int]]]:
         draw = self._draw
         if draw.random() < 0.9:
             self._token = token_after(self._token)
@@ -86,11 +88,15 @@ class RandomHost:
             parts.append(stream[:length])
             stream = stream[length:]
         is_now = draw.random() < 0.4
-        order = [*range(len(parts))]
-        draw.shuffle(order)
-        for index in [*order, *order[:1]] if draw.random() < 0.9 else order[1:]:
+        last = len(parts) - 1
+        others = [each for each in range(last) if draw.random() < 0.97]
+        if draw.random() < 0.3:
+            draw.shuffle(others)
+        for index in [*others, *draw.choices(range(last + 1), k=draw.choice([0, 0, 0, 2])), last]:
             bits = index << 8 | len(parts) << 1 | is_now
             yield 5, [self._session, self._token, bits, *parts[index]]
         if not is_now:
-            yield 6, [self._session, self._token]
+            ahead = MOMENTS * draw.randint(1, 11) - high % MOMENTS
+            at = high + draw.choice([0, 0, -300, 2000, ahead if ahead > 2 else 0])
+            yield 6, [self._session, self._token, at % 65536]
             yield 9, []

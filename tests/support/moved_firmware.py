@@ -42,17 +42,17 @@ _SAMPLES = 1 << 21
 class MovedFirmware:
     """The library `era-moved.so` in a folder: one amplifier, whose clock begins at 0.
 
-    channels: with which it was built.
+    channels: with which it was built. buffered: samples that it makes ahead.
     """
 
-    def __init__(self, folder: Path, *, channels: int = 4) -> None:
+    def __init__(self, folder: Path, *, channels: int = 4, buffered: int = 0) -> None:
         self._library = ctypes.CDLL(str(folder / "era-moved.so"))
         self._library.moved_to.argtypes = [ctypes.c_uint64]
         self._library.moved_stall.argtypes = [ctypes.c_uint64, ctypes.c_bool]
         self._sent = ctypes.create_string_buffer(_RING)
         self._made = np.empty(_SAMPLES, np.int16)
         self._channels = channels
-        self._library.moved_begin()
+        self._library.moved_begin(buffered)
 
     def move(self, time: float) -> None:
         """Move its clock to a time [s]."""
@@ -141,7 +141,7 @@ class Pair:
     @property
     def moment(self) -> float:
         """The time, a little later with each request, so that what is due then has happened."""
-        return self.time + 1e-9 * self._requests
+        return self.time + 1e-10 * self._requests
 
     def ask(self, number: int, words: Sequence[int]) -> tuple[list[Sent], list[Sent]]:
         """Return what each sends upon a request with a message's number."""

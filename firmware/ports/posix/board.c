@@ -63,9 +63,11 @@ uint64_t board_microseconds(void)
     return microseconds() - started_at;
 }
 
-uint32_t board_samples_due(void)
+uint32_t board_samples_due(int32_t *ahead)
 {
-    uint64_t due = board_microseconds() * SAMPLE_RATE / 1000000 - samples_counted;
+    uint64_t passed = board_microseconds() * SAMPLE_RATE; // in millionths of a sample
+    uint64_t due = passed / 1000000 - samples_counted;
+    *ahead = (int32_t)((1000000 - passed % 1000000) * 65536 / 1000000);
     samples_counted += due;
     return due > UINT32_MAX ? UINT32_MAX : (uint32_t)due;
 }

@@ -149,8 +149,10 @@ static void serve(struct engine *engine)
 
 // Time and faults.
 
-void engine_gap(struct engine *engine)
+void engine_gap(struct engine *engine, uint32_t samples)
 {
+    for (unsigned i = 0; i < engine->amplifiers; i++)
+        amplifier_skip(&engine->amplifier[i], samples);
     COUNT(engine->counters->gaps, 1);
     engine->gaps_at[engine->gap_count++ % GAPS_MAX] = engine->counters->frames;
 }
@@ -165,10 +167,11 @@ static bool has_too_many_gaps(const struct engine *engine)
 }
 
 // Say what time it is; samples may come later than that by what the device asks for at once.
-static void keep_time(struct engine *engine, uint32_t frames)
+static void keep_time(struct engine *engine, uint32_t frames, double ahead)
 {
     uint64_t now = engine_microseconds();
     for (unsigned i = 0; i < engine->amplifiers; i++) {
+        engine->amplifier[i].ahead = (int32_t)(65536 * fmax(-32767, fmin(ahead, 32767)));
         engine->amplifier[i].slack = (uint32_t)(SLACK * UINT64_C(1000000) * frames / SAMPLE_RATE);
         amplifier_time(&engine->amplifier[i], now);
     }
@@ -219,11 +222,12 @@ static float sample(struct engine *engine, int32_t force, double gain)
     return (float)value;
 }
 
-void engine_render(struct engine *engine, const struct output outputs[], uint32_t frames)
+void engine_render(struct engine *engine, const struct output outputs[], uint32_t frames,
+                   double ahead)
 {
     int32_t forces[CHANNELS_MAX];
     SET(engine->counters->block, frames);
-    keep_time(engine, frames);
+    keep_time(engine, frames, ahead);
     serve(engine);
     measure(engine);
     for (uint32_t frame = 0; frame < frames; frame++)

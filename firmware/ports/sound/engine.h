@@ -64,11 +64,13 @@ struct output {
 int engine_init(struct engine *engine, const struct sound_settings *settings,
                 struct counters *counters);
 
-// Carry out requests, then make the next frames of every channel.
-void engine_render(struct engine *engine, const struct output outputs[], uint32_t frames);
+// Carry out requests, then make the next frames of every channel. ahead: samples by which the first
+// of them leaves the outputs later than now.
+void engine_render(struct engine *engine, const struct output outputs[], uint32_t frames,
+                   double ahead);
 
-// Count a hole in the sample clock before this block.
-void engine_gap(struct engine *engine);
+// Count a hole of so many samples in the sample clock before this block.
+void engine_gap(struct engine *engine, uint32_t samples);
 
 uint64_t engine_microseconds(void);
 

@@ -118,11 +118,12 @@ static void send_replies(void)
 // Without a stream: samples that nobody hears keep the clock of the amplifiers.
 static void render_silently(void)
 {
-    uint64_t due = (engine_microseconds() - silent_since) * engine->settings.rate / 1000000;
-    uint64_t frames = due - silent_samples;
-    silent_samples = due;
+    double due = (double)(engine_microseconds() - silent_since) * engine->settings.rate / 1e6;
+    double ahead = (double)silent_samples - due;
+    uint64_t frames = (uint64_t)due - silent_samples;
+    silent_samples += frames;
     if (frames > 0)
-        engine_render(engine, NULL, (uint32_t)(frames < 10000 ? frames : 10000));
+        engine_render(engine, NULL, (uint32_t)(frames < 10000 ? frames : 10000), ahead);
 }
 
 static void watch(struct pollfd watched[WATCHED])

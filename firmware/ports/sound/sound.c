@@ -10,6 +10,7 @@
 
 #define UNDERFLOW 0x4 // paOutputUnderflow
 #define CONTINUE 0    // paContinue
+#define PLAYBACK 1    // JackPlaybackLatency
 
 static struct engine engine;
 static struct jack_calls jack;
@@ -66,13 +67,18 @@ int sound_jack_process(uint32_t frames, void *ignored)
             memset(outputs[i].samples, 0, frames * sizeof(float));
         return 0;
     }
-    uint32_t frame = jack.frame_time(jack.client);
+    uint32_t frame = next_frame, latency[2] = {0, 0};
+    uint64_t at = jack.time(), next;
+    float period;
+    jack.cycle_times(jack.client, &frame, &at, &next, &period); // filtered by the server
+    jack.latency(jack.ports[0], PLAYBACK, latency);
     note_priority(!has_next && jack.is_realtime(jack.client));
     if (has_next && frame != next_frame)
-        engine_gap(&engine);
+        engine_gap(&engine, frame - next_frame);
     next_frame = frame + frames;
     has_next = true;
-    engine_render(&engine, outputs, frames);
+    double passed = ((double)jack.time() - (double)at) * engine.settings.rate / 1e6;
+    engine_render(&engine, outputs, frames, latency[1] - passed);
     return 0;
 }
 
@@ -125,7 +131,7 @@ int sound_portaudio(const void *input, void *output, unsigned long frames,
     double block = (double)frames / engine.settings.rate;
     double late = time->output - next_output;
     if (has_next && late > block) {
-        engine_gap(&engine);
+        engine_gap(&engine, (uint32_t)(late * engine.settings.rate));
         next_output = time->output + block;
     } else { // times of drivers jitter
         next_output = (has_next ? next_output + late / 8 : time->output) + block;
@@ -135,6 +141,7 @@ int sound_portaudio(const void *input, void *output, unsigned long frames,
         outputs[i].samples = (float *)output + i;
         outputs[i].stride = channels;
     }
-    engine_render(&engine, outputs, (uint32_t)frames);
+    double ahead = (next_output - block - time->now) * engine.settings.rate;
+    engine_render(&engine, outputs, (uint32_t)frames, ahead);
     return CONTINUE;
 }

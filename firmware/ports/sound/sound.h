@@ -29,7 +29,10 @@ struct jack_calls {
     void *client;
     void *ports[SOUND_CHANNELS_MAX];
     void *(*buffer)(void *port, uint32_t frames);
-    uint32_t (*frame_time)(const void *client);
+    int (*cycle_times)(const void *client, uint32_t *frame, uint64_t *at, uint64_t *next,
+                       float *period);
+    uint64_t (*time)(void); // us
+    void (*latency)(void *port, int mode, uint32_t range[2]);
     int (*is_realtime)(void *client);
     void *(*port_by_id)(void *client, uint32_t id);
     int (*is_mine)(const void *client, const void *port);

@@ -41,7 +41,7 @@ extern struct sound_format sound_format;
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-#define CLOCK_ERROR (10000000 / SAMPLE_RATE) // 0.1 us; a reading is that of the next sample
+#define CLOCK_ERROR 500 // 0.1 us; of the time at which the server or driver says that a block is played
 
 #define FAULTS_KEPT 16
 

@@ -17,7 +17,9 @@ CLIENT = "era-soft-amp"
 
 _CALLED_BY_ENGINE = {
     "buffer": "jack_port_get_buffer",
-    "frame_time": "jack_last_frame_time",
+    "cycle_times": "jack_get_cycle_times",
+    "time": "jack_get_time",
+    "latency": "jack_port_get_latency_range",
     "is_realtime": "jack_is_realtime",
     "port_by_id": "jack_port_by_id",
     "is_mine": "jack_port_is_mine",

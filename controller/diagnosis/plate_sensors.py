@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -73,18 +72,19 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
     return PlateSensors(tuple(used), tuple(unused))
 
 
-def start_together(one: Amplifier, other: Amplifier) -> bool:
-    """Whether phases of two amplifiers count from one moment: that of a broadcast commit."""
-    return one.line is other.line
+def have_one_time(one: Amplifier, other: Amplifier) -> bool:
+    """Whether phases of two amplifiers are of one time: their own, or both follow the host's."""
+    return one is other or (one.clock.can_be_steered and other.clock.can_be_steered)
 
 
-def check_common_start(amplifiers: Mapping[str, Amplifier]) -> None:
-    """Raise CommandError unless all open amplifiers, by name, start together."""
-    for (name, one), (other_name, other) in pairwise(amplifiers.items()):
-        if not start_together(one, other):
+def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
+    """Raise CommandError unless all open amplifiers, by name, have one time."""
+    first, *others = amplifiers.items()
+    for name, other in others:
+        if not have_one_time(first[1], other):
             raise CommandError(
-                f"amplifiers {name} and {other_name} must start together to be measured while "
-                "they play, got separate wires; put them on one bus"
+                f"amplifiers {first[0]} and {name} must have clocks that can be steered to be "
+                "measured while they play, got one that has none; see its clock_error"
             )
 
 

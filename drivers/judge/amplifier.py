@@ -161,7 +161,7 @@ class ExpectedAmplifier:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._begin(*self._waiting)
+            self._play_waiting(*self._waiting)
 
     def _trip(self, fault: int, since: Interval, cause: str) -> None:
         self.fault = fault
@@ -328,9 +328,9 @@ class ExpectedAmplifier:
         """Play the set that waits, before another that is played between two times."""
         if self._waiting is not None and token != self.token:
             (early, late), *waiting = self._waiting
-            self._begin((min(early, when[0]), min(late, when[1])), *waiting)
+            self._play_waiting((min(early, when[0]), min(late, when[1])), *waiting)
 
-    def _begin(
+    def _play_waiting(
         self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
     ) -> None:
         """Have the set that waited play from some time between two on."""

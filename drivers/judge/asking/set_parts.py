@@ -76,9 +76,10 @@ def parts_of_sets(subject: Subject) -> Rows:
         first, *others, last = _cut(subject, *made, token=token, now=now)
         incomplete = send("Commit", token=token, code="INCOMPLETE")
         late = [row for each in (*reversed(others), others[-1]) for row in (each, incomplete, last)]
-        end = [] if now else [first, others[0], last, send("Commit", token=token)]
-        begin = [first, last] if now else [last]
-        return [*begin, *late, first, incomplete, last, last, *end, last, 0.05]
+        if now:
+            return [first, last, *others, last, last, 0.05]
+        again = first, others[0], last, send("Commit", token=token), last
+        return [last, *late, first, incomplete, last, last, *again, 0.05]
 
     others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
     at_once, back = _cut(subject, *made, token=6), send("Commit", token=6)
@@ -145,14 +146,18 @@ def refused_parts(subject: Subject) -> Rows:
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
     good = _cut(subject, *long_set(subject), token=5)
     first, *others, last = _cut(subject, half, flawed, token=2)
-    bad = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
+    flawed_one = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
     return [
-        *(subject.arm, quarter, first, *others, bad(last), last),
-        *(stage(half, token=3), bad(play(flawed, token=4)), bad(stage(flawed, token=4))),
+        *(subject.arm, quarter, first, *others, flawed_one(last), last),
+        *(
+            stage(half, token=3),
+            flawed_one(play(flawed, token=4)),
+            flawed_one(stage(flawed, token=4)),
+        ),
         # A last part of a newer set that is not whole changes nothing; one that is kept does.
         *(good[-1], send("Commit", token=3), stage(quarter, token=4), *good[:-1]),
         *(_with(stage(quarter, token=4), code=_OLD), send("Commit", token=4, code=_OLD)),
-        *(bad(stage(flawed, token=6)), good[-1], send("Commit", token=5)),
+        *(flawed_one(stage(flawed, token=6)), good[-1], send("Commit", token=5)),
         *(stage(half, token=6), play(quarter, token=7), send("Commit", token=6, code=_OLD)),
     ]
 

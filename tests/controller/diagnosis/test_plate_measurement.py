@@ -114,10 +114,8 @@ async def measured(
         pytest.param("serial", False, id="two wires", marks=pytest.mark.long),
     ],
 )
-def test_two_amplifiers_hear_each_other_where_they_start_together(
-    wire: str, is_shared: bool, rig: Rig, truth: Rig
-) -> None:
-    """On one bus all responses, on two wires those to an amplifier's own: as a direct solution."""
+def test_two_amplifiers_hear_each_other(wire: str, is_shared: bool, rig: Rig, truth: Rig) -> None:
+    """On one bus and on two wires, whose clocks the host holds together: as a direct solution."""
 
     async def run() -> MeasuredPlate:
         wires = SHARED_WIRES if is_shared else WIRES
@@ -128,11 +126,7 @@ def test_two_amplifiers_hear_each_other_where_they_start_together(
     measurement = taken.measurement
     assert taken.duration < 10
     assert len(measurement.frequencies) == 28
-    wiring = on_two_amplifiers(rig).wiring
-    for s, sensor in enumerate(measurement.sensors):
-        for e, era in enumerate(rig.eras):
-            is_one = wiring[sensor.era].amplifier == wiring[era.name].amplifier
-            assert measurement.known[:, s, e].sum() == (7 if is_shared or is_one else 0)
+    assert (measurement.known.sum(axis=0) == 7).all()
     expected = direct_responder(truth.plate, truth.mesh)(
         truth.eras,
         measurement.frequencies,

@@ -327,8 +327,9 @@ class ExpectedAmplifier:
     def _start_waiting(self, token: int, when: Interval) -> None:
         """Play the set that waits, before another that is played between two times."""
         if self._waiting is not None and token != self.token:
-            (early, late), *waiting = self._waiting
-            self._play_waiting((min(early, when[0]), min(late, when[1])), *waiting)
+            (early, late), waiting, layers, is_exact = self._waiting
+            sooner = min(early, when[0]), min(late, when[1])
+            self._play_waiting(sooner, waiting, layers, is_exact)
 
     def _play_waiting(
         self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool

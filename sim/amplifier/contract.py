@@ -123,7 +123,8 @@ class Amplifier:
         self._intake = SetIntake(can)
         self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
-        self._shown_once = self._marked, False  # by the last status: this, and `_is_limited`
+        # By the last status: this, and whether a sum was limited.
+        self._shown_once: tuple[int | None, bool] = None, False
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
@@ -295,8 +296,8 @@ class Amplifier:
             case "Ping" if self.state == _ENABLED:
                 self.clock.steer(values["rate"], now)
                 if self._waiting is not None:
-                    _, commit, layers = self._waiting
-                    self._waiting = self.clock.reaches(commit["at"], now), commit, layers
+                    _, commit, waiting = self._waiting
+                    self._waiting = self.clock.reaches(commit["at"], now), commit, waiting
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":

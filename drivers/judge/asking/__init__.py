@@ -61,6 +61,7 @@ CHECKS: tuple[Check, ...] = (
     *(staging.newer_sets_replace, staging.committed_together, staging.starts_at_its_moment),
     staging.what_waits_for_its_moment,
     *(playing.layers_add, playing.layers_play_on, playing.valid_for, playing.renew, playing.after),
+    *(playing.after_the_last_onset, playing.what_waits_for_an_onset),
     *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),
     *(playing.endings_amid, playing.extreme_envelopes, playing.phases, playing.voices),
     *(playing.voices_of_layers, playing.limited),

@@ -16,6 +16,7 @@ _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
+_BIT_15 = 1 << 15  # ms
 
 
 @driving(_SETS)
@@ -47,6 +48,7 @@ def valid_for(subject: Subject) -> Rows:
         [subject.one(valid_for=short)],
         [subject.one(ramp=ramp, valid_for=subject.lasting(150))],
         [several, partial(subject.follow, 2 * pause), half, subject.one(level=0.5), pause],
+        [subject.one(valid_for=_BIT_15 + short), 2 * pause],
     ]
 
 
@@ -85,6 +87,48 @@ def after(subject: Subject) -> Rows:
     ]
 
 
+@driving(_SETS)
+def after_the_last_onset(subject: Subject) -> Rows:
+    """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
+    long, short = subject.long_onset, subject.envelope(0.02, 0.5)
+    last = len(subject.channels) - 1
+    both = [subject.tone(0, 0.5, onset=long), subject.tone(last, 0.5, onset=short)]
+    waiting = layer(0, subject.tone(last, 0.25), after=True, ramp=20)
+    rising = subject.one(level=0.5, ramp=subject.ramp)
+    unshaped = subject.one(subject.tone(0, 0.5, onset=replace(subject.envelope(0.1), knots=())))
+    other = layer(1, subject.beside(1, 0.5))
+    shaped = replace(other, commands=(replace(other.commands[0], onset=long),))
+    return [
+        # A channel that is not named falls silent with what waited.
+        (layer(0, *both[: last + 1]), waiting),
+        (layer(0, *reversed(both[: last + 1])), waiting),
+        (play(subject.one(level=0.5), shaped), waiting),
+        (rising, waiting),
+        (unshaped, waiting),
+    ]
+
+
+@driving(_SETS)
+def what_waits_for_an_onset(subject: Subject) -> Rows:
+    """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
+    long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(120)
+    half = subject.one(subject.tone(0, 0.5, onset=long))
+    other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
+    kept = layer(0, subject.tone(0, 0.25, keep=True, onset=short), after=True)
+    timed = layer(0, subject.tone(0, 0.25), after=True, ramp=20, valid_for=lasts)
+    beside = layer(1, subject.beside(1, 0.25), after=True)
+    ends = replace(half, valid_for=subject.lasting(60), ramp=20)
+    renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
+    return [
+        (half, timed),
+        (half, kept),
+        (half, other, timed, beside),
+        (play(half, other), play(timed, beside)),
+        (ends, kept, 0.25 * subject.slowness),
+        (replace(half, valid_for=subject.lasting(900)), timed, renewed),
+    ]
+
+
 @driving(_PLACE)
 def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
@@ -117,7 +161,18 @@ def kept_phase(subject: Subject) -> Rows:
             (1, 180, subject.other),
         )
     ]
-    return [(subject.one(), layer(0, tone, ramp=subject.ramp)) for tone in tones]
+    ramp, amid = subject.ramp, 0.4 * subject.ramp / 1000
+    knots = min(1, subject.can["knots"])
+    ending = subject.envelope(0.1, *[0.75] * knots)
+    again = layer(0, subject.tone(0, 0.5, keep=True), ramp=ramp)
+    shaped = subject.tone(0, 0.5, keep=True, onset=subject.envelope(0.1, *[0.25] * knots))
+    return [
+        *((subject.one(), layer(0, tone, ramp=ramp)) for tone in tones),
+        # Nothing goes on that is of another layer, or has been released.
+        (subject.one(level=0.5), layer(1, shaped)),
+        (subject.one(level=0.5), layer(0, ramp=ramp), amid, again),
+        (subject.one(subject.tone(0, 0.5, ending=ending)), layer(0), 0.02, again),
+    ]
 
 
 @driving(_PLACE)

@@ -327,4 +327,6 @@ async def limited(subject: Subject) -> None:
         "it has one frequency, whose tones interfere",
     )
     over = layer(1, subject.tone(frequency=subject.other))
-    await subject.run([subject.arm, subject.one(), over, layer(1), over, layer(1)])
+    near = layer(1, subject.tone(0, 0.995 / subject.level - 1.0, frequency=subject.other))
+    rows = near, over, layer(1), near, layer(1), over, layer(1)
+    await subject.run([subject.arm, subject.one(), *rows])

@@ -18,6 +18,7 @@ import rig_page
 import ways
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
+from amplifier_json import json_text
 from api_page import api_reference
 from client_stub import status_stub, stub, summaries, table
 from command_page import command_reference
@@ -75,13 +76,17 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "firmware/core/records.h": [whole(records_header)],
     "docs/reference/amplifier.dbc": [whole(dbc_text)],
     "docs/reference/amplifier.eds": [whole(eds_text)],
+    "docs/reference/amplifier.json": [whole(json_text)],
     **{
         f"docs/reference/{page}.md": _of_protocol(page)
         for page in ("protocol", "serial", "modbus", "can")
     },
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
-    "docs/reference/metrics.md": [part("docs/generators/metrics_page.py", metrics)],
+    "docs/reference/metrics.md": [
+        part("docs/generators/metrics_page.py", metrics),
+        *_parts("protocol_tables.py", TABLES["metrics"]),
+    ],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),

@@ -5,9 +5,11 @@ One set and its commit, then other requests, each by a host's wire and a simulat
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.clock import clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, QUANTITIES
@@ -22,16 +24,19 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 SESSION, TOKEN = 0x2A17, 0x0102
+_NOW = 7.5
+"""Time [s] of all that is shown: three eighths of a turn of the clock."""
 _BYTES_PER_LINE = 32
 
 # What protocol.md says in words: frequency, then level and phase of each channel.
 _TONES = (
-    (110.0, ((0.2, 0.0), (0.11, -90.0), (0.06, 135.0), (0.04, 20.5))),
-    (150.0, ((0.05, 60.0), (0.18, 0.0), (0.09, -45.0), (0.07, 170.0))),
-    (190.0, ((0.08, -120.0), (0.03, 15.0), (0.21, 0.0), (0.1, 75.0))),
-    (240.0, ((0.06, 90.0), (0.12, -10.0), (0.05, -60.25), (0.25, 0.0))),
+    (110.0, ((0.2, 0.0), (0.11, -90.0))),
+    (240.0, ((0.25, 0.0), (0.12, -10.0))),
 )
-_BEFORE = ((0.22, 0.1, 0.05, 0.03), (0.04, 0.2, 0.08, 0.06), (0.07, 0.02, 0.23, 0.09))
+_BEFORE = ((0, 110.0, (0.22, 0.1)), (2, 150.0, (0.04, 0.2)), (3, 190.0, (0.07, 0.02)))
+"""Layers before: number, frequency, levels."""
+_ONSET = (0.005, ((0.1, 90.0), (0.3, -0.01)))
+"""Of the new tone on channel 0: step, knots."""
 
 
 def _integer(name: str, value: float) -> int:
@@ -55,43 +60,44 @@ def _wire_set(layers: Sequence[Layer]) -> list[LayerSet]:
     ]
 
 
-_JOINED = _wire_set(
-    [
-        Layer(
-            number,
-            tuple(
-                Tone(channel, frequency, level, phase, keep_phase=number < 3)
-                for channel, (level, phase) in enumerate(tones)
-            ),
-            *(0.02, 0.5),
-        )
-        for number, (frequency, tones) in enumerate(_TONES)
-    ]
-)
-_STREAM = (
-    LayerSet(
-        *(0, 20, 500),
-        (
-            Command(0, _integer("frequency", 110), _integer("level", 0.2), 0),
-            Command(
-                *(3, _integer("frequency", 250.5), _integer("level", 1), _integer("phase", -90)),
-                keep_phase=True,
-                onset=Envelope(
-                    _integer("envelope_step", 0.005),
-                    (
-                        (_integer("level", 0.1), _integer("phase", 90)),
-                        (_integer("level", 1), _integer("phase", -0.01)),
-                    ),
+def _joined() -> list[LayerSet]:
+    """Return the set: layer 0 changes, 1 begins with an onset, 2 is silenced, 3 prolonged."""
+    changed, begun = _wire_set(
+        [
+            Layer(
+                number,
+                tuple(
+                    Tone(channel, frequency, level, phase, keep_phase=number == 0)
+                    for channel, (level, phase) in enumerate(tones)
                 ),
-            ),
-        ),
-    ),
-    LayerSet(2, 10, 0),
-    LayerSet(3, 0, 800, renew=True),
-)
-(_SET,) = parts(pack_layers(_JOINED), session=SESSION, token=TOKEN, now=False)
+                *(0.02, 0.5),
+            )
+            for number, (frequency, tones) in enumerate(_TONES)
+        ]
+    )
+    step, knots = _ONSET
+    onset = Envelope(
+        _integer("envelope_step", step),
+        tuple((_integer("level", level), _integer("phase", phase)) for level, phase in knots),
+    )
+    first, *others = begun.commands
+    begun = replace(begun, commands=(replace(first, onset=onset), *others))
+    return [changed, begun, LayerSet(2, 10, 0), LayerSet(3, 0, 800, renew=True)]
+
+
+def _parts() -> list[tuple[Values, Sequence[LayerSet]]]:
+    """Return the parts of the set, each with its layers: cut behind the first one."""
+    first, *others = _joined()
+    head = {"session": SESSION, "token": TOKEN, "parts": 2, "now": 0}
+    return [
+        ({**head, "index": index, "stream": pack_layers(layers)}, layers)
+        for index, layers in enumerate(([first], others))
+    ]
+
+
+_PARTS = _parts()
 _ARM = {"session": SESSION, "watchdog": 250, "shift": 0}
-_COMMIT = {"session": SESSION, "token": TOKEN, "at": 0}
+_COMMIT = {"session": SESSION, "token": TOKEN, "at": high_word(clock_at(_NOW))}
 _STOP = {"ramp": 5}
 
 
@@ -104,7 +110,7 @@ class _Exchange:
     def __init__(self, kind: str, number: int) -> None:
         self.amplifier = Amplifier("a", channels=4)
         self._lines: list[str] = []
-        self._is_can = kind == "can"
+        self._is_can, self._is_tcp = kind == "can", kind == "tcp"
         far = {1: self.amplifier}
         self._wire: Wire
         self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers
@@ -127,7 +133,7 @@ class _Exchange:
 
     def _send(self, data: bytes) -> None:
         self._note(">", data)
-        self._end.receive(data, 0.0)
+        self._end.receive(data, _NOW)
 
     def _replied(self, data: bytes) -> None:
         self._note("<", data)
@@ -139,22 +145,25 @@ class _Exchange:
         frames = [(each.id, each.data) for each in unpack_frames(data)] if self._is_can else []
         for identifier, content in frames:
             self._lines.append(f"{direction} {identifier:03X} {content.hex(' ').upper()}")
-        if not self._is_can:
-            self._lines.append(f"{direction} {data.hex(' ').upper()}")
+        while data and not self._is_can:
+            # Over TCP several may go out together: each says how many bytes follow the sixth.
+            size = 6 + int.from_bytes(data[4:6], "big") if self._is_tcp else len(data)
+            self._lines.append(f"{direction} {data[:size].hex(' ').upper()}")
+            data = data[size:]
 
 
 def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
     """Return an exchange with an armed amplifier and three layers, after requests by name."""
     exchange = _Exchange(kind, number)
-    exchange.amplifier.handle("Arm", _ARM, 0.0)
+    exchange.amplifier.handle("Arm", _ARM, _NOW)
     layers = [
-        Layer(number, tuple(Tone(channel, tones[0], level) for channel, level in rows), 0.0)
-        for number, (tones, rows) in enumerate(zip(_TONES, map(enumerate, _BEFORE), strict=False))
+        Layer(number, tuple(Tone(at, frequency, level) for at, level in enumerate(levels)), 0.0)
+        for number, frequency, levels in _BEFORE
     ]
     (part,) = parts(pack_layers(_wire_set(layers)), session=SESSION, token=TOKEN - 1, now=True)
-    exchange.amplifier.handle("Set", part, 0.0)
+    exchange.amplifier.handle("Set", part, _NOW)
     for name in before:
-        exchange.request(name, _SET if name == "Set" else {})
+        exchange.request(name, {})
     return exchange
 
 
@@ -179,19 +188,21 @@ def _join(page: str) -> str:
     """Return the set and its commit."""
     number, before = _FIRST[page]
     exchange = _vibrating(_KINDS[page], number, *before.split())
-    frames = exchange.request("Set", _SET)
-    sent = [frame for frame in frames if frame.startswith(">")]
-    title = {
-        "serial": f"Set: {len(sent[0].split()) - 1} bytes",
-        "modbus": "Set: written, then its reply read",
-        "can": f"Set: {len(sent)} frames",
-    }
-    return _block({title[page]: frames, "Commit": exchange.request("Commit", _COMMIT)})
+    first, last = (exchange.request("Set", part) for part, _ in _PARTS)
+    return _block(
+        {
+            "Set, part 0 of 2, without a reply": first,
+            "Set, part 1 of 2": last,
+            "Commit": exchange.request("Commit", _COMMIT),
+        }
+    )
 
 
 def _rtu() -> str:
     """Return the commit on Modbus RTU, and a broadcast."""
-    exchange = _vibrating("rtu", 65531, "GetCaps", "Set")
+    exchange = _vibrating("rtu", 65533, "GetCaps")
+    for part, _ in _PARTS:
+        exchange.amplifier.handle("Set", part, _NOW)
     return _block(
         {
             "The commit on RTU": exchange.request("Commit", _COMMIT),
@@ -298,8 +309,8 @@ def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str
             case Number(name=name, quantity=quantity):
                 size = 2 if quantity.wire == "u32" else 1
                 number = f"{quantity.from_wire(values[name]):.10g} {quantity.unit}".strip()
-                is_token = quantity.name in ("session", "token", "played_token")
-                text = f"{name} {f'{values[name]:04X}' if is_token else number}"
+                is_code = quantity.name in ("session", "token", "played_token", "clock", "at")
+                text = f"{name} {f'{values[name]:0{4 * size}X}' if is_code else number}"
             case Bits(parts=parts):
                 size, text = 1, ", ".join(f"{name} {values.get(name, 0):d}" for name, _ in parts)
             case Numbers(name=name, count=count):
@@ -327,32 +338,31 @@ def _in_lines(rows: Iterable[tuple[Sequence[int], str]]) -> Iterator[tuple[Seque
         yield words, " · ".join(texts)
 
 
-def _set_words() -> str:
-    """Return the words of the set."""
-    head = _in_lines(_fields(MESSAGES["Set"].request, _SET))
-    return _words([*head, *_stream(_JOINED)])
-
-
-def _reply_words() -> str:
-    """Return those of its reply, of the commit and of the reply to that."""
-    amplifier = _vibrating("serial", 7).amplifier
-    shown = {
-        "Taken": (MESSAGES["Set"].reply, amplifier.handle("Set", _SET, 0.0)),
-        "Commit": (MESSAGES["Commit"].request, _COMMIT),
-        "Status": (MESSAGES["Commit"].reply, amplifier.handle("Commit", _COMMIT, 0.0)),
-    }
+def _join_words() -> str:
+    """Return the words of the set, of its reply, of the commit and of the reply to that."""
+    handle = _vibrating("serial", 7).amplifier.handle
     rows = list[tuple[Sequence[int], str]]()
-    for title, (record, values) in shown.items():
-        (words, text), *others = _in_lines(_fields(record, values))
-        rows += [(words, f"{title}: {text}"), *others]
-    return _words(rows)
+    for part, layers in _PARTS:
+        taken = handle("Set", part, _NOW)
+        rows += [*_titled("Set", MESSAGES["Set"].request, part), *_stream(layers)]
+    status = handle("Commit", _COMMIT, _NOW)
+    return _words(
+        [
+            *rows,
+            *_titled("Taken", MESSAGES["Set"].reply, taken),
+            *_titled("Commit", MESSAGES["Commit"].request, _COMMIT),
+            *_titled("Status", MESSAGES["Commit"].reply, status),
+        ]
+    )
+
+
+def _titled(title: str, record: Record, values: Values) -> list[tuple[Sequence[int], str]]:
+    (words, text), *others = _in_lines(_fields(record, values))
+    return [(words, f"{title}: {text}"), *others]
 
 
 BYTES: Mapping[str, Mapping[str, Callable[[], str]]] = {
-    "protocol": {
-        **{"set": _set_words, "replies": _reply_words},
-        "stream": lambda: _words(_stream(_STREAM)),
-    },
+    "protocol": {"join": _join_words},
     "serial": {"join": partial(_join, "serial"), "more": partial(_more, "serial")},
     "modbus": {**{"join": partial(_join, "modbus"), "more": partial(_more, "modbus"), "rtu": _rtu}},
     "can": {"join": partial(_join, "can"), "more": partial(_more, "can")},

@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import get_args
 
 from drivers.protocol.records import (
@@ -49,15 +50,15 @@ _REPLIES: Mapping[str, Record] = {
 }
 _OTHERS: Mapping[str, Record] = {
     **{"layer": LAYER, "command": COMMAND, "envelope": ENVELOPE, "knot": KNOT},
-    **{"Event": EVENT_RECORD, "Nak": NAK_RECORD, "Identity": IDENTITY},
+    **{f"Event, {EVENT}": EVENT_RECORD, f"Nak, {NAK}": NAK_RECORD, "Identity": IDENTITY},
 }
 _MEANINGS = {
-    **{"NOT_READY": "starting; replies if it can, plays nothing, goes to 1 by itself"},
-    **{"SWITCH_ON_DISABLED": "high voltage off, **disarmed**; the state after power-up"},
-    **{"READY_TO_SWITCH_ON": "passed through on the way up, or left out"},
-    **{"SWITCHED_ON": "high voltage on; falling silent after a Disarm"},
+    **{"NOT_READY": "starting, replies if it can"},
+    **{"SWITCH_ON_DISABLED": "**disarmed**, high voltage off"},
+    **{"READY_TO_SWITCH_ON": "passed at once"},
+    **{"SWITCHED_ON": "high voltage on, falling silent after a Disarm"},
     **{"OPERATION_ENABLED": "**armed**: plays, watchdog running"},
-    **{"QUICK_STOP_ACTIVE": "stopped, latched; high voltage off once silent"},
+    **{"QUICK_STOP_ACTIVE": "**stopped**, latched; high voltage off once silent"},
     **{"FAULT_REACTION_ACTIVE": "falling silent because of a fault"},
     **{"FAULT": "silent, high voltage off, latched"},
     **{"NONE": "", "WATCHDOG": "not fed in time", "OVER_TEMPERATURE": "", "OVER_VOLTAGE": ""},
@@ -67,13 +68,13 @@ _MEANINGS = {
     **{"BAD_LENGTH": "words are missing or too many"},
     **{"BAD_VALUE": "a number out of range, or a bit that must be 0"},
     **{"BAD_CHANNEL": "no such channel, or twice in a layer"},
-    **{"WRONG_STATE": "not in this state; Arm with the interlock open"},
-    **{"BAD_TOKEN": "not staged, not newer, or 0"},
+    **{"WRONG_STATE": "not in this state, or Arm with the interlock open"},
+    **{"BAD_TOKEN": "0, not newer, or not staged"},
     **{"BUSY": "the host repeats the request after 5 ms, at most twice"},
     **{"UNSUPPORTED_VERSION": "of the frame: serial lines alone"},
     **{"WRONG_SESSION": "another's, or one that has ended"},
     **{"WRONG_LATCH": "Clear names another stop or fault than the last"},
-    **{"INCOMPLETE": "Commit of a set of which parts are missing"},
+    **{"INCOMPLETE": "of a set under Commit"},
     **{"output": "full level is a linear amplifier's output, not the stroke of a motion"},
     **{"events": "it sends Events on this wire"},
     **{"levels_measured": "the levels of Status are measured, not computed"},
@@ -84,19 +85,45 @@ _MEANINGS = {
 }
 
 
+_WIDTH = 160
+
+
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     lines = [head, ["---"] * len(head), *([str(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _side_by_side(head: Sequence[str], rows: Sequence[Sequence[object]], parts: int) -> str:
+    """Return a table in parts that stand beside each other."""
+    height = -(-len(rows) // parts)
+    filled = [*rows, *[("",) * len(head)] * (height * parts - len(rows))]
+    columns = (filled[height * part : height * (part + 1)] for part in range(parts))
+    return _table((*head,) * parts, [[*chain(*row)] for row in zip(*columns, strict=True)])
 
 
 def quantities() -> str:
     """Return the steps and ranges, a row for all quantities that have the same."""
     groups: dict[tuple[object, ...], list[str]] = {}
     for each in QUANTITIES.values():
-        row = each.wire, each.minimum, each.maximum, each.scale
+        row = f"{each.minimum} to {each.maximum}", each.scale
         groups.setdefault(row, []).append(each.name)
-    rows = ((", ".join(names), *row) for row, names in groups.items())
-    return _table(("quantity", "type", "lowest", "highest", "one step is"), rows)
+    rows = [(", ".join(names), *row) for row, names in groups.items()]
+    return _side_by_side(("quantity", "integers", "one step is"), rows, 3)
+
+
+def heads() -> str:
+    """Return the bits of words that are shared, as a picture: a letter for each bit."""
+    shared = {"Set": MESSAGES["Set"].request, "layer": LAYER, "command": COMMAND}
+    shared |= {"Taken": MESSAGES["Set"].reply, "Status": STATUS}
+    lines = ["bit      " + " ".join(f"{bit:2}" for bit in range(15, -1, -1))]
+    for name, record in shared.items():
+        (bits,) = (field for field in record.fields if isinstance(field, Bits))
+        letters = dict(zip("abcde", bits.parts, strict=False))
+        row = [letter for letter, (_, count) in letters.items() for _ in range(count)]
+        row = ["0"] * (16 - len(row)) + row
+        legend = " · ".join(f"{letter} {part}" for letter, (part, _) in letters.items())
+        lines.append(f"{name:9}" + " ".join(f"{cell:>2}" for cell in row) + f"   {legend}")
+    return textwrap.indent("\n".join(lines), "    ")
 
 
 def messages() -> str:
@@ -108,8 +135,6 @@ def messages() -> str:
             reply = next(name for name, record in _REPLIES.items() if record is each.reply)
             marks = ["yes" if mark else "" for mark in (each.feeds, each.is_broadcast)]
             yield each.name, each.number, layout(each.request) or "–", reply, *marks
-        yield "Event", EVENT, "from the amplifier, unasked: see below", "–", "", ""
-        yield "Nak", NAK, "a reply alone: see below", "–", "", ""
 
     return _table(
         ("message", "number", "words of the request", "reply", "feeds", "broadcast"), rows()
@@ -178,29 +203,20 @@ def transitions() -> str:
     return _table(("request", *(f"in {number}" for number in STATES.values())), rows)
 
 
-def _numbers(named: Mapping[str, int], title: str) -> str:
-    rows = ((name, number, _MEANINGS[name]) for name, number in named.items())
-    return _table((title, "number", ""), rows)
-
-
 def _list(title: str, named: Mapping[str, int]) -> str:
     """Return names and numbers as a sentence, with meanings where the name is not enough."""
     listed = (
         f"{name} {number}" + (f" ({_MEANINGS[name]})" if _MEANINGS[name] else "")
         for name, number in named.items()
     )
-    return textwrap.fill(f"**{title}**: {', '.join(listed)}.", 124, break_on_hyphens=False)
+    text = f"- **{title}**: {', '.join(listed)}."
+    return textwrap.fill(text, _WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def mailboxes() -> str:
     """Return the registers of each message on Modbus."""
     cells = [(each.name, 256 * each.number, 256 * each.number + 128) for each in MESSAGES.values()]
-    half = (len(cells) + 1) // 2
-    rows = [
-        (*left, *right)
-        for left, right in zip(cells[:half], [*cells[half:], ("",) * 3], strict=False)
-    ]
-    return _table(("message", "written from", "reply from register") * 2, rows)
+    return _side_by_side(("message", "written from", "reply from register"), cells, 2)
 
 
 def emergencies() -> str:
@@ -224,17 +240,24 @@ def objects() -> str:
     return _table(("object", "subindex and word, of four channels and eight layers"), rows())
 
 
+def _blocks(*written: str) -> str:
+    return "\n\n".join(written)
+
+
+def _lists(named: Mapping[str, Mapping[str, int]]) -> str:
+    return "\n".join(_list(title, each) for title, each in named.items())
+
+
+_LISTS = {"Features, by bit": FEATURES, "Flags of Status, by bit": STATUS_FLAGS}
 TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "protocol": {
-        **{"quantities": quantities, "messages": messages, "records": records},
-        "readings": readings,
-        "states": lambda: f"{_numbers(STATES, 'state')}\n\n{transitions()}",
-        "faults": lambda: _list("Faults and their numbers", FAULTS),
-        "codes": lambda: _numbers(REFUSALS, "code"),
-        "bits": lambda: "\n\n".join(
-            (_list("Features, by bit", FEATURES), _list("Flags of Status, by bit", STATUS_FLAGS))
+        "numbers": lambda: _blocks(quantities(), heads()),
+        "messages": lambda: _blocks(
+            messages(), records(), _lists({**_LISTS, "Codes of a Nak": REFUSALS})
         ),
+        "states": lambda: _blocks(transitions(), _lists({"States": STATES, "Faults": FAULTS})),
     },
+    "metrics": {"readings": readings},
     "modbus": {"mailboxes": mailboxes},
     "can": {"emergencies": emergencies, "objects": objects},
 }

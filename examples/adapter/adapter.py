@@ -20,7 +20,7 @@ from typing import Protocol
 
 from drivers.playing.playback import Voice
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
+from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
@@ -69,6 +69,7 @@ class AdaptedAmplifier(Amplifier):
         self.identity = {**self.identity, "product": "adapter", "serial_number": name}
         features = (FEATURES[name] for name in ("output", "events", "mark"))
         self.capabilities["features"] = sum(1 << bit for bit in features)
+        self.capabilities["clock_error"] = CLOCK_UNKNOWN  # no generator follows the clock
         self.device_levels = [1.0] * channels
         self.is_lost = True
 

@@ -34,7 +34,7 @@ def text_of(page: str) -> str:
         ("docs/reference/table-file.md", r"must be (\d+) % or more", 100 * MIN_KEPT_SHARE),
         ("docs/architecture.md", r"no frame confirms \((\d+) ms", 1000 * CONTACT_TIMEOUT),
         ("docs/reference/touch.md", r"after (\d+) ms without a frame", 1000 * CONTACT_TIMEOUT),
-        ("docs/reference/protocol.md", r"of its request \| – \| (\d+) ms", 1000 * REACTION),
+        ("docs/reference/protocol.md", r"of its request [^|]*\| – \| (\d+) ms", 1000 * REACTION),
         *(
             (f"docs/{page}.md", stated, MIN_CONTRAST_DB)
             for page, stated in (

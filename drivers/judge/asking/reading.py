@@ -266,7 +266,7 @@ async def broadcasts(subject: Subject) -> None:
     await send_to_all("Clear", latch=subject.latch)
 
 
-@driving("protocol.md#messages")
+@driving("protocol.md#the-clock")
 async def mark(subject: Subject) -> None:
     """It keeps the clock of a Mark, alone or for all, and its next status shows that alone."""
     subject.require("mark")
@@ -283,7 +283,7 @@ async def mark(subject: Subject) -> None:
         expect_equal(len(client.heard), 0, "replies to a Mark for all")
 
 
-@driving("protocol.md#set-the-address")
+@driving("protocol.md#messages")
 async def addresses(subject: Subject) -> None:
     """It takes a new address by its serial number while it is disarmed, and replies there alone."""
     subject.require("address")

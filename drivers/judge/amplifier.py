@@ -136,6 +136,11 @@ class ExpectedAmplifier:
         return high_word(self._clock[0]) if self._clock is not None else 0
 
     @property
+    def is_marked(self) -> bool:
+        """Whether its next status shows the clock of a Mark."""
+        return self._marked is not None
+
+    @property
     def is_enabled(self) -> bool:
         """Whether it is armed, as far as is known."""
         return self.state == ENABLED

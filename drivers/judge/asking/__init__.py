@@ -12,6 +12,7 @@ from functools import partial
 from drivers.errors import LinkError
 from drivers.judge.asking import (
     can_frames,
+    clocks,
     modbus_frames,
     playing,
     reading,
@@ -60,6 +61,7 @@ CHECKS: tuple[Check, ...] = (
     *(staging.stage_and_commit, staging.repeats_change_nothing, staging.tokens_wrap),
     *(staging.newer_sets_replace, staging.committed_together, staging.starts_at_its_moment),
     staging.what_waits_for_its_moment,
+    *(clocks.clock_readings, clocks.clock_shifts, clocks.clock_rate),
     *(playing.layers_add, playing.layers_play_on, playing.valid_for, playing.renew, playing.after),
     *(playing.after_the_last_onset, playing.what_waits_for_an_onset),
     *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),

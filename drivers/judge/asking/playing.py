@@ -9,11 +9,13 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require, require_in_time
 from drivers.judge.asking.material import Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.table import SHORTENED_FADE
 from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
+_LONG = 2.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
 _BIT_15 = 1 << 15  # ms
@@ -251,6 +253,20 @@ async def phases(subject: Subject) -> None:
     for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 1.75), (180.0, 0.5)):
         time = periods * 20 / max(subject.lowest, _SLOW)
         await subject.in_time(partial(_expect_alike, subject, phase, time))
+    await subject.in_time(partial(_expect_cancelled, subject))
+
+
+async def _expect_cancelled(subject: Subject) -> None:
+    """Play the opposite of a tone of seconds before, amid which the clock has gone round."""
+    await subject.status()
+    left = HIGH_WORDS - subject.shown.present - round(_LONG / 2 / HIGH_TIME)
+    await subject.arm(shift=left % HIGH_WORDS)
+    subject.shown.outputs.interferes = True
+    halves = (subject.tone(0, 0.5, each, frequency=subject.near(1) | 1) for each in (0.0, 180.0))
+    for number, tone in enumerate(halves):
+        await subject.play(layer(number, tone))
+        await subject.pause(_LONG * (number == 0))
+    await subject.run([subject.status])
 
 
 async def _expect_alike(subject: Subject, phase: float, time: float) -> None:

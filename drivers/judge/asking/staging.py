@@ -120,7 +120,8 @@ async def _commit(subject: Subject, duration: float) -> None:
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
-    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, 0.4)]
+    ahead = min(0.2 * subject.slowness, 0.4)
+    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, ahead)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     ends: list[Rows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
@@ -128,7 +129,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [arm],
         [play(half)],
         [stage(half), send("Commit", token=2)],
-        [stage(half), partial(_commit, subject, 0.2)],
+        [stage(half), partial(_commit, subject, ahead / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
-    return [[*waits, *each, 0.5] for each in ends]
+    return [[*waits, *each, 1.25 * ahead] for each in ends]

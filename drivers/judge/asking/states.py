@@ -232,7 +232,9 @@ async def _fades(subject: Subject) -> None:
     require_in_time(ahead(began, armed["clock"]) <= _DENSE, "statuses were too far apart")
     while True:
         since = (ahead(seen["clock"], each) for each in (armed["clock"], began))
-        low, high = (_faded(time + by) * full for time, by in zip(since, (_NEAR, -_NEAR), strict=True))
+        low, high = (
+            _faded(time + by) * full for time, by in zip(since, (_NEAR, -_NEAR), strict=True)
+        )
         what = "level amid the fade of the watchdog"
         expect_within(seen["levels"][0], low - _ROUGH, high + _ROUGH, what)
         if not seen["levels"][0]:

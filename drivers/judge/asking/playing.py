@@ -218,10 +218,13 @@ def endings_amid(subject: Subject) -> Rows:
     knots = math.ceil(subject.slowness)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
+    over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]
     towards_0 = subject.tone(0, 0.0, onset=onset)  # a voice counts until its onset has ended
     long = min(500, subject.can["ramp_max"])
     return [
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
+        (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
+        (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
         (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, layer(0, ramp=long)),
     ]
@@ -299,6 +302,7 @@ async def voices(subject: Subject) -> None:
     began = clock.now()
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
+        await subject.status()  # amid the 2 ms of what is cut, on a quick line
         await asyncio.sleep(pause)
     require_in_time(
         last.when.latest - began <= 0.8 * ramp / 1000,
@@ -332,6 +336,28 @@ def voices_of_layers(subject: Subject) -> Rows:
             await subject.play(layer(0, tone, ramp=ramp))
 
     return [(lasting, fade, layer(0))]
+
+
+@driving(_PLACE)
+def voices_of_channels(subject: Subject) -> Rows:
+    """It counts the voices of each channel by itself: fades of others cut none of it."""
+    require(len(subject.channels) > 1, "it has one channel")
+    ramp, count = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES)
+    onset = subject.envelope(0.0001)  # at its level at once
+    tones = [
+        [
+            subject.tone(channel, 1 / count, frequency=subject.near(at), onset=onset)
+            for channel in (0, 1)
+        ]
+        for at in range(count)
+    ]
+
+    async def fade() -> None:
+        for each in tones:
+            await subject.play(layer(0, *each, ramp=ramp))
+            await asyncio.sleep(_PAUSE + onset.step / 10_000)
+
+    return [(fade, layer(0, ramp=ramp))]
 
 
 @driving(_PLACE)

@@ -157,7 +157,9 @@ class Subject(Material):
         if "index" in values and answer.code and self.expected is not None:
             self.expected.part_refused(values, answer.code)
         if not answer.code:  # a refusal may come sooner
-            beyond = max(took - before - client.wire_time(len(raw), len(answer.words)), 0.0)
+            bits = client.wire_time(len(raw), len(answer.words))
+            client.pace = min(client.pace, took / bits if bits else 0.0)
+            beyond = max(took - client.pace * (before + bits), 0.0)
             count = 1 if name in _READ_ALONE else client.transactions
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
             client.reactions[name].append(beyond / count)

@@ -376,8 +376,7 @@ class Line:
 
     def _begins_by(self, job: Job) -> float:
         """Return by when [s] the reply to the request on the line is due: none is from then on."""
-        takes = 0.0 if job.member is None else job.member.exchange_time(job.name)
-        return max(job.started_at + takes, self._free_at) + REACTION
+        return max(job.started_at + job.takes, self._free_at) + REACTION
 
     def _look_by(self, due: float) -> None:
         """Look at the request on the line at a time [s], or before."""

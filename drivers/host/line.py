@@ -17,7 +17,7 @@ from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
-from drivers.protocol.table import BROADCAST
+from drivers.protocol.table import BROADCAST, REACTION
 from drivers.protocol.timing import ATTEMPTS, FAST, REPLY_TIMEOUT
 from drivers.trace import Direction
 from drivers.wires.wire import (
@@ -122,16 +122,8 @@ class Line:
 
     @property
     def awaited(self) -> "asyncio.Future[Values] | None":
-        """The result of the request on the line, unless a set preempts it; None if it is free."""
-        job = self._current
-        if job is None or (job.priority is Priority.READING and self._preempts_readings):
-            return None
-        return job.result
-
-    @property
-    def _preempts_readings(self) -> bool:
-        """Whether a set does: where replies come late a reading that is cut short never ends."""
-        return self.late <= GRACE
+        """The result of the request on the line, which a set waits for; None if it is free."""
+        return None if self._current is None else self._current.result
 
     def arrival(self, words: int) -> float:
         """Return by when [s] a request of so many words arrives that is sent next.
@@ -373,13 +365,18 @@ class Line:
             self._send_further(current)
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
+        first, is_reading = min(waiting, default=8), current.priority is Priority.READING
         free_at = max(self.time(), self._free_at)
-        yields_to = Priority.SET if self._preempts_readings else Priority.SILENCE
-        if current.priority is Priority.READING and min(waiting, default=8) <= yields_to:
-            current.due = min(current.due, free_at)
-        elif min(waiting, default=8) <= Priority.SILENCE:
-            current.due = min(current.due, free_at + GRACE)
+        if first <= Priority.SILENCE:
+            current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
+        # Where replies come late one that is cut short would never end.
+        elif is_reading and first <= Priority.SET and self.late <= GRACE:
+            current.due = min(current.due, max(self.time(), self._begins_by(current)))
         self._look_by(current.due)
+
+    def _begins_by(self, job: Job) -> float:
+        """Return by when [s] the reply to the request on the line is due: none is from then on."""
+        return max(job.started_at + job.takes, self._free_at) + REACTION
 
     def _look_by(self, due: float) -> None:
         """Look at the request on the line at a time [s], or before."""

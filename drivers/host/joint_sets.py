@@ -78,6 +78,18 @@ class JointSets:
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
         Overtaken where it is preempted before that.
         """
+        lines = {self._members.amplifiers[name].line for name in layers}
+        try:
+            for line in lines:
+                line.has_set = len(lines) > 1
+            return await self._play(layers, is_preempted)
+        finally:
+            for line in lines:
+                line.has_set = False
+
+    async def _play(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
+    ) -> Played | DriverError:
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()

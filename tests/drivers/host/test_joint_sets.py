@@ -240,12 +240,14 @@ async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> Non
     assert await started(*ends) == [[], []]
 
 
-@pytest.mark.parametrize(("names", "staged"), [("a", [0]), ("ab", [0, 1])])
+@pytest.mark.parametrize(
+    ("names", "is_busy", "staged"), [("a", True, [0]), ("ab", True, [0, 1]), ("ab", False, [1, 1])]
+)
 @in_virtual_time
 async def test_set_gives_way_until_an_amplifier_is_to_play_it(
-    names: str, staged: list[int]
+    names: str, is_busy: bool, staged: list[int]
 ) -> None:
-    """The line of one is busy for 3 ms; another one stages it, which no commit follows.
+    """The line of one is busy for 3 ms, or its reply takes that; another one has staged it.
 
     What plays goes on, and the next set plays at once.
     """
@@ -256,8 +258,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     for end in ends:
         end.sent.clear()
     ends[0].outward = lambda _, data: [(0.003, data)]
-    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
-    await asyncio.sleep(0)
+    reading = group.amplifiers["a"].read_status() if is_busy else asyncio.sleep(0)
     has_come = False
     ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
     giving_way = asyncio.ensure_future(ending)

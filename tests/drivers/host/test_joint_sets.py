@@ -1,6 +1,7 @@
 """Commits of several lines: at one moment, or none of them; and tokens that fall far behind."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
@@ -37,6 +38,7 @@ LINES: dict[str, tuple[str, Callable[[], Wire], Callable[[bytes], float]]] = {
         lambda d: 135 * len(unpack_frames(d)) / 20_000,
     ),
 }
+STATUS, COMMIT = (f"1:{MESSAGES[name].number}" for name in ("GetStatus", "Commit"))
 SLACK = 0.0002  # s; what is under way for longer than its bits
 
 
@@ -68,7 +70,8 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
 ) -> None:
     """Just armed: within a step of the shift. 3 s later: within 1 us, as their amplifiers state.
 
-    With crystals of +40 and -40 ppm, and a status under way whose reply takes 9 ms.
+    With crystals of +40 and -40 ppm, and a status under way whose reply takes 9 ms. No clock is
+    read before the commit, which would wait for it.
     """
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
     now = ends[0].loop.time
@@ -88,9 +91,12 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
             [(0.009, data)] if name == "GetStatus" else outward(name, data)
         )
         busy = asyncio.ensure_future(keep_busy())
+        ends[0].sent.clear()
         await group.apply({name: [LAYER] for name in group.amplifiers})
         await busy
         ends[1].outward = outward
+        sent = [each for _, each in ends[0].sent]
+        assert sent.index(COMMIT) < (sent.index(STATUS) if STATUS in sent else math.inf)
         ((first,), (second,)) = await started(*ends)
         await group.silence(0.0)
         return abs(first - second)
@@ -258,7 +264,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     for end in ends:
         end.sent.clear()
     ends[0].outward = lambda _, data: [(0.003, data)]
-    reading = group.amplifiers["a"].read_status() if is_busy else asyncio.sleep(0)
+    readings = [group.amplifiers["a"].read_status()] if is_busy else []
     has_come = False
     ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
     giving_way = asyncio.ensure_future(ending)
@@ -266,7 +272,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     has_come = True
     with pytest.raises(Overtaken):
         await giving_way
-    await reading
+    await asyncio.gather(*readings)
     sent = [[each for _, each in end.sent] for end in ends]
     assert [each.count(f"1:{MESSAGES['Set'].number}") for each in sent] == staged
     assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)

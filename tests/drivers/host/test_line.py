@@ -119,7 +119,7 @@ async def test_refusal_after_no_reply_says_that_it_may_have_played(
     assert raised.value.may_play
     await host.stage(6, [Layer(0, ())])
     with pytest.raises(CommandRefused) as raised:
-        await host.commit(6)
+        await host.commit(6, word_passed(end.loop.time()))
     assert not raised.value.may_play
 
 

@@ -149,8 +149,8 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
     if subject.can["knots"]:
         shaped = pack_layers([layer(0, subject.tone(onset=subject.envelope(0.01, 0.5)))])
-        for beyond in (_PHASE.maximum + 1, 0x10000 + _PHASE.minimum - 1):
-            yield _part([*shaped[:-1], beyond], "BAD_VALUE", 0)
+        for phase in (_PHASE.maximum + 1, 0x10000 + _PHASE.minimum - 1):
+            yield _part([*shaped[:-1], phase], "BAD_VALUE", 0)
         yield _part([*shaped[:-2], _LEVEL + 1, 0], "BAD_VALUE", 0)
     for wrong in (words[:-1], [*words, 0], [words[head["count"]] + 1, *words[1:]]):
         yield _part(wrong, "BAD_LENGTH")

@@ -76,6 +76,15 @@ def sim(
         int | None,
         typer.Option(metavar="BIT/S", help="Simulate the transmission time of bytes.", min=300),
     ] = None,
+    line: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]KIND",
+            help="Choose what is between host and amplifiers: native, usb-high-speed, "
+            "usb-full-speed, ftdi, ftdi-low-latency, can, can-usb, ethernet or prompt; repeatable. "
+            "By default what is usual for the wire, and prompt for one amplifier.",
+        ),
+    ] = None,
     faults: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Inject the faults of a fault file.")
     ] = None,
@@ -117,14 +126,23 @@ def sim(
     with exit_on_signal():
         from model.config.points import parse_point
         from model.rig.file import load_rig
-        from sim.far_ends.opening import Wire, assign_wires, links_of
+        from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
         from sim.faults.fault_window import FaultFile, load_faults
         from sim.firmware.processes import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
+        from sim.transport.line_kinds import PROMPT
         from sim.transport.pseudo_terminal import links_by_amplifier
 
-        defaults = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
+        drawn = seed_of_plate(exact=exact, seed=seed)
+        defaults = Wire(
+            "serial",
+            speed=speed,
+            shared=shared,
+            unpluggable=faults is not None,
+            line_kind=PROMPT if virtual_time else None,  # a host has no time that stands still
+            seed=drawn or 0,
+        )
         common = _common_wire(
             defaults,
             {
@@ -137,14 +155,14 @@ def sim(
         )
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
-        drawn = seed_of_plate(exact=exact, seed=seed)
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
-        if firmware and (common is not None or wire or faults or virtual_time):
+        if firmware and (common is not None or wire or line or faults or virtual_time):
             raise InputError("--firmware has a serial line and real time; omit the other options")
         programs = find_firmware() if firmware else None
         to_wire = {} if firmware else loaded.amplifiers
         wires = assign_wires(to_wire, common=common, options=wire or [], defaults=defaults)
+        wires = choose_lines(wires, line or [])
         links = links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers))
         simulation = Simulation(
             loaded,
@@ -206,11 +224,11 @@ def _sensor(text: str) -> "Accelerometer":
 def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
     import asyncio
 
-    from sim.process.simulation import run_simulation
+    from sim.process.simulation import make_fine_loop, run_simulation
     from sim.process.virtual_time import SteppedLoop
 
     view = _LiveView() if sys.stdout.isatty() and simulation.firmware is None else None
-    factory = SteppedLoop if virtual_time else None
+    factory = SteppedLoop if virtual_time else make_fine_loop
     try:
         with asyncio.Runner(loop_factory=factory) as runner:
             message = runner.run(run_simulation(simulation, ready=_announce, view=view))

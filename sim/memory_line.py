@@ -2,8 +2,8 @@
 
 The plate deviates from the rig's within its uncertainty, as that of `era sim`. The amplifiers of a
 rig that are named are under one plate, as are those of one control socket; the only amplifier of a
-rig that is not named has one of its own. Requests and replies are the bytes of a serial line. Not
-modelled: transmission time.
+rig that is not named has one of its own. Requests and replies are the bytes of a serial line, with
+the delays of a USB adapter where a rig has several amplifiers. Not modelled: transmission time.
 """
 
 import asyncio
@@ -30,18 +30,24 @@ from sim.control.server import control_socket
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line import TwoWayLine
+from sim.transport.line_kinds import LINE_KINDS, PROMPT, LineDelays
 
-_FORM = "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, and &seed=N or &exact"
+_FORM = (
+    "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, &line=KIND, and &seed=N or "
+    "&exact"
+)
+_USUAL_LINE = "usb-high-speed"
 
 
 class SimulationUrl:
-    """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&seed=N]`; raises CommandError.
+    """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&line=KIND][&seed=N]`.
 
-    `&exact` in place of a seed, None here: the rig's own plate, with no deviation.
+    `&exact` in place of a seed, None here: the rig's own plate, with no deviation. Raises
+    CommandError.
     """
 
     def __init__(self, url: str) -> None:
-        self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "seed", "exact"))
+        self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "line", "seed", "exact"))
         options = self._url.options
         file = unquote(self._url.place, errors="surrogateescape") + self._url.path
         self._url.require(bool(file), "rig file must be named")
@@ -55,6 +61,17 @@ class SimulationUrl:
         self.seed = None if "exact" in options else self._url.whole_option("seed", 0, 10**9, low=0)
         self.control = Path(options["control"]) if options.get("control") else None
         self.amplifier = options.get("amplifier")
+        self.line_kind = options.get("line")
+        known = (*LINE_KINDS, PROMPT)
+        self._url.require(
+            self.line_kind in (None, *known),
+            f"line must be one of {', '.join(known)}, got {self.line_kind!r}",
+        )
+
+    def delays(self, rig: Rig, amplifier: str) -> LineDelays | None:
+        """Those of an amplifier's line; as is usual where the rig has several amplifiers."""
+        kind = self.line_kind or (_USUAL_LINE if len(rig.amplifiers) > 1 else PROMPT)
+        return None if kind == PROMPT else LINE_KINDS[kind].delays((self.seed, amplifier))
 
     def select(self, names: tuple[str, ...]) -> str:
         """The amplifier that it names, or the only one; raises CommandError."""
@@ -148,7 +165,8 @@ class MemoryPort:
     """The port of a host, with devices at the addresses of their numbers at the other end.
 
     It works in the running event loop. on_data: called with what they send; on_loss: called once
-    with the cause when the first device is unplugged. Raises LinkError while it is.
+    with the cause when the first device is unplugged; delays: see `TwoWayLine`. Raises LinkError
+    while it is.
     """
 
     is_blocked = False
@@ -158,6 +176,7 @@ class MemoryPort:
         devices: Sequence[AmplifierDevice],
         on_data: Callable[[bytes], None],
         on_loss: Callable[[str], None],
+        delays: LineDelays | None = None,
     ) -> None:
         self._first = devices[0]
         if not self._first.is_plugged:
@@ -170,6 +189,7 @@ class MemoryPort:
             to_amplifier=self._end.receive,
             to_host=self._deliver,
             faults=self._first.faults,
+            delays=delays,
         )
         self.running = contextlib.AsyncExitStack()
         """What runs for it, which ends when it is closed."""
@@ -236,6 +256,7 @@ class SimulatedAddress(WireAddress):
             if not isinstance(device, AmplifierDevice):
                 device = AmplifierDevice(context.bench, name)
                 context.devices = {**context.devices, name: device}
-            port = MemoryPort([device], on_data, on_loss)
+            delays = self._url.delays(context.bench.rig, name)
+            port = MemoryPort([device], on_data, on_loss, delays)
             port.running = stack.pop_all()
             return port

@@ -307,6 +307,11 @@ class AmplifierState(Message):
     )
     high_voltage: bool | None
     reply_age_s: float | None = Field(description="time since its last reply")
+    clock_skew_us: float | None = Field(
+        None,
+        description="rms error of its clock against those of the others, as the host sees it; null "
+        "for one alone, and where it is not held to them",
+    )
     degraded: bool = Field(
         False, description="whether it does not reply but may still play, so that nothing new plays"
     )

@@ -91,6 +91,7 @@ class Daemon:
                 are_open=self._controller.group.is_open,
                 lost=self._supervisor.operation.lost,
                 what_may_play=self._supervisor.what_may_play,
+                clock_errors=self._controller.group.clock_errors,
                 targets=self._publisher.view.targets,
             ),
             layouts=self._layouts,

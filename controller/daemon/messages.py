@@ -1,5 +1,6 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -286,13 +287,14 @@ def amplifier_statuses(
     are_open: bool,
     lost: Loss | None,
     what_may_play: Callable[[str], Stopped],
+    clock_errors: Mapping[str, float],
     targets: Sequence[str] = (),
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last statuses, without sending a request.
 
     are_open: whether all are open together; else their last statuses are left out. lost: the loss
-    that has closed the others. what_may_play: by name, of those that do not reply. targets: the
-    fingers that feel something now.
+    that has closed the others. what_may_play: by name, of those that do not reply. clock_errors:
+    see `Group`. targets: the fingers that feel something now.
     """
     missing = () if lost is None else lost.names
     return [
@@ -303,6 +305,7 @@ def amplifier_statuses(
             is_open=are_open,
             closed_with_lost=bool(missing) and name not in missing,
             what_may_play=what_may_play,
+            clock_error=clock_errors.get(name, math.inf) if len(urls) > 1 else math.inf,
             targets=targets,
         )
         for name, url in urls.items()
@@ -317,6 +320,7 @@ def _amplifier_status(
     is_open: bool,
     closed_with_lost: bool,
     what_may_play: Callable[[str], Stopped],
+    clock_error: float,
     targets: Sequence[str],
 ) -> AmplifierStatus:
     """closed_with_lost: whether it was closed because another amplifier was lost."""
@@ -347,6 +351,7 @@ def _amplifier_status(
         high_voltage=has_flag(status, "high_voltage") if status else None,
         **readings,
         reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
+        clock_skew_us=1e6 * clock_error if status and clock_error < math.inf else None,
         degraded=is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,

@@ -43,6 +43,11 @@ _AMPLIFIER_GAUGES: tuple[tuple[str, str, Callable[[AmplifierStatus], float | Non
     ),
     ("reply_age_seconds", "Time since the last reply.", lambda a: a.reply_age_s),
     (
+        "clock_skew_seconds",
+        "RMS error of its clock against those of the others.",
+        lambda a: None if a.clock_skew_us is None else a.clock_skew_us / 1e6,
+    ),
+    (
         "round_trip_seconds",
         "From the last request to its reply.",
         lambda a: a.statistics.round_trip_ms and a.statistics.round_trip_ms / 1e3,

@@ -136,6 +136,7 @@ class Amplifier(Dialogue):
             self._ledger.adopt(can)
         self.identity, self.capabilities = identity, can
         self._times.clear()
+        self.clock.stated = can["clock_error"]
         self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()
@@ -166,10 +167,14 @@ class Amplifier(Dialogue):
             bounds = f"{_WATCHDOG.from_wire(low):g} to {_WATCHDOG.from_wire(high):g}"
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
         self.feeding.watchdog = max(self.feeding.watchdog, watchdog)
-        values = {"session": session, "watchdog": wire, "shift": 0}
+
+        def make() -> list[Values]:
+            shift = self.clock.shift(self._time())
+            return [{"session": session, "watchdog": wire, "shift": shift}]
+
         was_armed = self.may_be_armed
         try:
-            status = await self.line.submit(self, Priority.ARM, "Arm", values)
+            status = await self.line.submit(self, Priority.ARM, "Arm", make)
         except CommandRefused as error:
             if not (isinstance(error, Preempted) or error.may_play):
                 self.may_be_armed = was_armed
@@ -228,10 +233,17 @@ class Amplifier(Dialogue):
         self.may_be_armed = False
 
     def ping(self) -> "asyncio.Future[Values]":
-        """Feed the watchdog; the future has the status, CommandRefused if it is not armed."""
-        return self.line.submit(
-            self, Priority.HEARTBEAT, "Ping", {"session": self.session, "rate": 0}
-        )
+        """Feed the watchdog and steer the clock; the future has the status.
+
+        Or CommandRefused if it is not armed.
+        """
+
+        def make() -> list[Values]:
+            is_playing = any(self.ledger.playback.all_voices)
+            rate = self.clock.rate(self._time(), is_playing=is_playing)
+            return [{"session": self.session, "rate": rate}]
+
+        return self.line.submit(self, Priority.HEARTBEAT, "Ping", make)
 
     def read_status(self, priority: Priority = Priority.OTHER) -> "asyncio.Future[Values]":
         """Read the status, which feeds nothing."""

@@ -16,9 +16,10 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
+from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import Make, Priority
+from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger, is_silence
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -30,13 +31,12 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import clock_at, high_word, moment_of
+from drivers.protocol.clock import moment_of, word_at
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
 from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
-from registry import clock
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -68,19 +68,6 @@ class Staged:
     until: float
 
 
-def commit_of(session: int, token: int, at: int | None) -> Make:
-    """Return a commit; at: high word of the clock when the set starts, None for the present one.
-
-    Which is at once: it has passed when the commit arrives.
-    """
-
-    def make() -> list[Values]:
-        present = high_word(clock_at(clock.now())) if at is None else at
-        return [{"session": session, "token": token, "at": present}]
-
-    return make
-
-
 class Dialogue:
     """The exchanges with one amplifier, whose line is open; as it sees it."""
 
@@ -109,6 +96,8 @@ class Dialogue:
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.known = UNREACHED
         """What it may play by what is known beside its statuses and what fed it."""
+        self.clock = HeldClock()
+        """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -143,6 +132,15 @@ class Dialogue:
             words = request_words(name), reply_words(name, *size) + event
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
+
+    @property
+    def status_time(self) -> float:
+        """How long a Status takes on the wire [s]."""
+        if "Status" not in self._times:
+            can = self.capabilities
+            size = (can["channels"], can["layers"]) if can else WIDEST
+            self._times["Status"] = self.line.wire.transit(reply_words("GetStatus", *size))
+        return self._times["Status"]
 
     async def stage(
         self,
@@ -226,8 +224,9 @@ class Dialogue:
         stop or disarm came first, CommandRefused where it is too late for what the ledger has
         admitted.
         """
-        make = commit_of(self.session, token, at)
-        return self.line.submit(self, Priority.SET, "Commit", make)
+        at = word_at(self._time()) if at is None else at  # which has passed when it arrives
+        values = {"session": self.session, "token": token, "at": at}
+        return self.line.submit(self, Priority.SET, "Commit", values)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -274,6 +273,7 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
+        self.clock.sent(name, values, now, arrives)
         if name == "Hello":
             return
         feeding = self.feeding
@@ -327,7 +327,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        for kind in reports_of(reply):
+        self.clock.replied(name, values, reply, now, bits=self.status_time)
+        for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds
         if ledger is not None and name in _SILENCING:

@@ -19,6 +19,7 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
+from drivers.host.clocks import Clocks
 from drivers.host.feeding import Stopped
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
@@ -70,11 +71,17 @@ class Group:
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
         """What they play together."""
-        self._heartbeats = Heartbeats(self.members, self.sets, restored)
+        self._clocks = Clocks(self.amplifiers)
+        self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
+
+    @property
+    def clock_errors(self) -> Mapping[str, float]:
+        """Errors of the clocks [s rms] by amplifier, see `Clocks.errors`."""
+        return self._clocks.errors
 
     @property
     def is_open(self) -> bool:

@@ -14,12 +14,13 @@ from typing import TypeAlias
 
 from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import commit_of
+from drivers.host.clocks import Clocks
 from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
 from drivers.playing.contents import Layer
+from drivers.protocol.clock import word_at
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.timing import HEARTBEAT
@@ -35,8 +36,11 @@ Feed: TypeAlias = Callable[[], Awaitable[object]]
 class Heartbeats:
     """Feeds the watchdogs of a group. restored: called where one that was mute replies again."""
 
-    def __init__(self, members: Members, sets: JointSets, restored: Callable[[], None]) -> None:
+    def __init__(
+        self, members: Members, sets: JointSets, clocks: Clocks, restored: Callable[[], None]
+    ) -> None:
         self._members, self._sets, self._restored = members, sets, restored
+        self._clocks = clocks
         self._running_due: dict[Amplifier, float] = {}  # statuses just before a heartbeat
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
 
@@ -64,6 +68,8 @@ class Heartbeats:
                 mute.add(each.line)
         feeds: list[tuple[float, Feed]] = []
         for line, of_line in by_line.items():
+            if line not in mute:
+                self._clocks.look(line, of_line)
             feeds += self._feeds(line, of_line, may_read=line not in mute)
         feeds.sort(key=itemgetter(0))
         return self._members.all([feed() for _, feed in feeds])
@@ -96,6 +102,8 @@ class Heartbeats:
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
                 feed = partial(self._read_and_feed, each, self._members.epoch, reading)
+            elif later := self._clocks.dither(line):
+                feed = partial(self._feed_later, each.ping, self._members.epoch, later)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))
         return feeds
@@ -113,6 +121,12 @@ class Heartbeats:
         await reading
         self._members.check_none_since(before)
         return await amplifier.ping()
+
+    async def _feed_later(self, feed: Feed, before: int, later: float) -> object:
+        """Feed after a time [s], unless a stop or disarm has come since an epoch."""
+        await asyncio.sleep(later)
+        self._members.check_none_since(before)
+        return await feed()
 
     def _listen(self, amplifier: Amplifier) -> None:
         """Read the status of one that is mute, until it replies or is lost."""
@@ -151,10 +165,10 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            messages = commit_of(session, token, None)()
+            values = {"session": session, "token": token, "at": word_at(line.time())}
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
-                each.next_request(request, messages[0], Priority.SET)
-            return messages
+                each.next_request(request, values, Priority.SET)
+            return [values]
 
         return make

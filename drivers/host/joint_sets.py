@@ -1,25 +1,26 @@
 """What amplifiers play together: a set is staged on all that it names, then committed on them.
 
-At one moment on all, or on none: by one broadcast on a line that they share, on several lines at a
-moment that is ahead for the slowest. On one alone it plays with its last part. A token is newer than another by less than half of 2^16 (RFC
-1982): an amplifier that was left out of 40 000 sets would take the next one for an older one. It
-commits one that changes nothing before.
+At one moment on all, or on none: by one broadcast on a line that they share, on several lines for a
+moment that is ahead for the slowest. On one amplifier it plays with its last part. A token is newer
+than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000 sets
+would take the next one for an older one. It commits one that changes nothing before.
 """
 
 import asyncio
 import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged, commit_of
-from drivers.host.jobs import Make, Priority
+from drivers.host.dialogue import Staged
+from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import at_behind
+from drivers.protocol.clock import word_at, word_behind
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
@@ -149,17 +150,17 @@ class JointSets:
         by_line: dict[Line, list[Amplifier]] = {}
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
-        token, at = self.token, None
+        token, at = self.token, word_at(clock.now())  # at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
-            at = at_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+            at = word_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
             if len(sharing) == 1:
                 requests[sharing[0]] = sharing[0].commit(token, at)
                 continue
-            make = _commit_of(sharing, token, at)
+            make = partial(_commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
@@ -201,16 +202,12 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
-def _commit_of(several: Sequence[Amplifier], token: int, at: int | None) -> Make:
-    """Return the commit of all amplifiers of a line; it raises unless each may have it then."""
-
-    def make() -> list[Values]:
-        messages = commit_of(several[0].session, token, at)()
-        for amplifier in several:
-            amplifier.next_request("Commit", messages[0], Priority.SET)
-        return messages
-
-    return make
+def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values]:
+    """Return the commit of all amplifiers of a line; raises unless each may have it now."""
+    values = {"session": several[0].session, "token": token, "at": at}
+    for amplifier in several:
+        amplifier.next_request("Commit", values, Priority.SET)
+    return [values]
 
 
 async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:

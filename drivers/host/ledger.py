@@ -113,8 +113,9 @@ class Ledger:
     ) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt.
 
-        starts: the moment [s] that its commit names, None for at once. Again, where its commit is repeated: it may have played since the first time, also where a
-        status said that it did not, which may have overtaken the commit.
+        starts: the moment [s] that its commit names, None for at once. Again, where its commit is
+        repeated: it may have played since the first time, also where a status said that it did
+        not, which may have overtaken the commit.
         """
         if self.doubt is not None and self.doubt.token == token:
             return

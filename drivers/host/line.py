@@ -277,7 +277,7 @@ class Line:
         job.due = max(job.due, begins + job.longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self._current = job
-        if job.has_further_parts and not self.wire.confirms_parts:
+        if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:  # often: without a call
             self._send_further(job)
         elif self._timer is None:
             self._timer = self._loop.call_at(min(job.due, now + _LOOK_INTERVAL), self._look)

@@ -13,7 +13,13 @@ _PER_DEGREE = QUANTITIES["temperature"].per_unit
 _LIMITED, _OPEN = 1 << STATUS_FLAGS["limited"], 1 << STATUS_FLAGS["interlock_open"]
 _HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
 
-ReportKind = Literal["limited", "interlock_open", "hot"]
+CLOCK_SETTLING = 3.0
+"""Seconds within which a clock must follow, and for which one that has jumped is not trusted."""
+MAX_CLOCK_RATE = 2e-4
+"""Of a crystal against the host's; one that is faster or slower is broken."""
+
+ClockProblem = Literal["clock_not_steered", "clock_jumped", "clock_rate", "clock_unsettled"]
+ReportKind = Literal["limited", "interlock_open", "hot", ClockProblem]
 
 REPORTS: dict[ReportKind, tuple[str, str]] = {
     "limited": (
@@ -25,13 +31,32 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
         f"it is hotter than {_HOT:g} °C",
         "let it cool, and check its fan and its load; it may play less, or stop with a fault",
     ),
+    "clock_not_steered": (
+        "its clock cannot be steered: its ERAs are not held together with those of others",
+        "update its firmware, or exchange it",
+    ),
+    "clock_jumped": (
+        "its clock jumps, stands still, or is read wrong by more than it states",
+        "check its clock and clock_error: era amp conformance; less is promised meanwhile",
+    ),
+    "clock_rate": (
+        f"its clock is more than {MAX_CLOCK_RATE * 1e6:g} ppm too fast or too slow",
+        "check its crystal, and what its clock counts; less is promised meanwhile",
+    ),
+    "clock_unsettled": (
+        f"its clock does not follow the host's within {CLOCK_SETTLING:g} s",
+        "check that it obeys shift and rate: era amp conformance; less is promised meanwhile",
+    ),
 }
-"""Cause and remedy of the reports of a status that are no fault, by kind."""
+"""Cause and remedy of what a status shows that is no fault, by kind."""
 
 
-def reports_of(status: Values) -> Sequence[ReportKind]:
-    """Return the kinds of reports of a status; few calls, since every heartbeat has one."""
-    kinds: list[ReportKind] = []
+def reports_of(status: Values, of_clock: ClockProblem | None = None) -> Sequence[ReportKind]:
+    """Return the kinds of reports of a status; few calls, since every heartbeat has one.
+
+    of_clock: what is known of its clock by now.
+    """
+    kinds: list[ReportKind] = [] if of_clock is None else [of_clock]
     if status["flags"] & _LIMITED:
         kinds.append("limited")
     if status["flags"] & _OPEN:

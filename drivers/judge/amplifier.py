@@ -161,7 +161,7 @@ class ExpectedAmplifier:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._begin(*self._waiting)
+            self._play_waiting(*self._waiting)
 
     def _trip(self, fault: int, since: Interval, cause: str) -> None:
         self.fault = fault
@@ -327,10 +327,11 @@ class ExpectedAmplifier:
     def _start_waiting(self, token: int, when: Interval) -> None:
         """Play the set that waits, before another that is played between two times."""
         if self._waiting is not None and token != self.token:
-            (early, late), *waiting = self._waiting
-            self._begin((min(early, when[0]), min(late, when[1])), *waiting)
+            (early, late), waiting, layers, is_exact = self._waiting
+            sooner = min(early, when[0]), min(late, when[1])
+            self._play_waiting(sooner, waiting, layers, is_exact)
 
-    def _begin(
+    def _play_waiting(
         self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
     ) -> None:
         """Have the set that waited play from some time between two on."""
@@ -370,10 +371,14 @@ class ExpectedAmplifier:
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
         self._note_clock(shown["clock"], when)
-        if self._waiting is None or when[1] < self._waiting[0][0] - self.slack:
+        if not self.may_start(when):
             self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
+
+    def may_start(self, when: Interval) -> bool:
+        """Whether a set that waits may have started by the end of an interval."""
+        return self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
 
     def _note_clock(self, clock: int, when: Interval) -> None:
         """Note the clock that a status shows, or compare it with that of a Mark before it."""
@@ -504,8 +509,7 @@ class ExpectedAmplifier:
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
         outputs = self.outputs
-        is_starting = self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
-        if is_starting or not (sure := outputs.sure(when)):
+        if self.may_start(when) or not (sure := outputs.sure(when)):
             return
         possible = outputs.tokens_of(number, sure)
         problem: Problem | None = None

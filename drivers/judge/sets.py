@@ -71,8 +71,7 @@ class ExpectedSet:
         token = last["token"]
         self._expire(when)
         is_unclear, is_under_way = self._is_unclear, token == self._parts.token
-        stream = 0 if is_under_way and self.staged else self._parts.whole(last)
-        is_missing = isinstance(stream, int) and not (is_under_way and self.staged)
+        stream = [] if is_under_way and self.staged else self._parts.whole(last)
         if reply["staged"] or reply["played"]:
             self.is_exact = bool(reply["exact"]) or token == self._replaced
             if not is_under_way:
@@ -85,7 +84,9 @@ class ExpectedSet:
             self._parts.collected.pop(reply["missing"], None)
         if is_unclear:
             return None
-        return (stream, 0, 0) if is_missing else (0, 1 - last["now"], last["now"])
+        if isinstance(stream, int):
+            return stream, 0, 0
+        return 0, 1 - last["now"], last["now"]
 
     def refused(self, last: Values) -> None:
         """Note that a last part was refused, with its set where all others are there."""

@@ -24,7 +24,12 @@ def ahead(clock: int, of: int) -> float:
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
 
 
-def at_behind(seconds: float) -> int:
+def word_at(seconds: float) -> int:
+    """Return the high word that a clock of `clock_at` shows at a time [s]."""
+    return high_word(clock_at(seconds))
+
+
+def word_behind(seconds: float) -> int:
     """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
     return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
 

@@ -163,9 +163,9 @@ def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet
             raise Refusal("renew must be without commands, after with some")
         if any(head["layer"] == other.layer for other in layers):
             raise Refusal(f"layer {head['layer']} must occur once in a set")
-        for name, most in (("layer", can["layers"] - 1), ("ramp", can["ramp_max"])):
-            if head[name] > most:
-                raise Refusal(f"{name} must be at most {most}, got {head[name]}")
+        for name, highest in (("layer", can["layers"] - 1), ("ramp", can["ramp_max"])):
+            if head[name] > highest:
+                raise Refusal(f"{name} must be at most {highest}, got {head[name]}")
         commands: list[Command] = []
         for _ in range(count):
             channel = words[at] >> _CHANNEL & _CHANNELS - 1

@@ -23,9 +23,7 @@ from drivers.protocol.records import (
     Text,
     Values,
 )
-from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
-    BROADCAST,
     EVENT,
     EVENT_RECORD,
     IDENTITY,
@@ -99,11 +97,6 @@ class Written:
 
 
 Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More | Written
-
-
-def has_reply(address: int, name: str, values: Values) -> bool:
-    """Whether a request is replied to: not if it is of all, nor a part of a set but the last."""
-    return address != BROADCAST and (name != "Set" or is_last(values))
 
 
 def read_event(
@@ -181,7 +174,10 @@ class Wire(Protocol):
     """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 
     def request(self, address: int, name: str, values: Values) -> bytes:
-        """Return the bytes of a request, which is on the wire from now on; address 0: of all."""
+        """Return the bytes of a request, which is on the wire from now on; address 0: of all.
+
+        Of the parts of a set the last alone has a reply: what comes to another is none.
+        """
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""

@@ -73,15 +73,13 @@ class AdaptedAmplifier(Amplifier):
         self.device_levels = [1.0] * channels
         self.is_lost = True
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def handle(self, name: str, values: Values, now: float) -> Values:
         """Reply to a request; armed only while the device is known to be well."""
         if name in ("GetMeasured", "SetAddress"):
             raise Refusal(f"there is no {name}", "UNKNOWN_TYPE")
         if name == "Arm" and self.is_lost:
             raise Refusal("the device must reply first", "WRONG_STATE")
-        return super().handle(name, values, now, is_broadcast=is_broadcast)
+        return super().handle(name, values, now)
 
     def status(self, now: float) -> Values:
         """Return the status with what the device may still play, without what is not measured."""

@@ -457,6 +457,8 @@ export interface AmplifierStatus {
   high_voltage: boolean | null;
   /** time since its last reply */
   reply_age_s: number | null;
+  /** rms error of its clock against those of the others, as the host sees it; null for one alone, and where it is not held to them */
+  clock_skew_us?: number | null;
   /** whether it does not reply but may still play, so that nothing new plays */
   degraded?: boolean;
   /** whether the link to it is lost */
@@ -566,7 +568,7 @@ export interface AmplifierReport {
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
-  kind: "limited" | "interlock_open" | "hot";
+  kind: "limited" | "interlock_open" | "hot" | "clock_not_steered" | "clock_jumped" | "clock_rate" | "clock_unsettled";
 }
 
 /** Counters of the link to an amplifier since it was opened; see the wire protocol. */

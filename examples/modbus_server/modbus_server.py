@@ -55,7 +55,9 @@ class Unit:
         message = BY_NUMBER[number]
         if is_broadcast and not message.is_broadcast:
             return None
-        result, reply = self._carry_out(message, words[1:], is_broadcast=is_broadcast)
+        result, reply = self._carry_out(message, words[1:])
+        if is_broadcast and not result:
+            self.amplifier.withdraw_status()
         if not is_broadcast:
             self._replies[number] = words[0], result, *reply
         if message.name == "SetAddress" and result == 0:
@@ -85,13 +87,11 @@ class Unit:
         row = [tag, result, *words]
         return row + [0] * (AREA - len(row))
 
-    def _carry_out(
-        self, message: Message, words: list[int], *, is_broadcast: bool = False
-    ) -> tuple[int, list[int]]:
+    def _carry_out(self, message: Message, words: list[int]) -> tuple[int, list[int]]:
         """Return the result of a message and the words of its reply."""
         try:
             name, values = read_request(message.number, words)
-            done = self.amplifier.handle(name, values, clock.now(), is_broadcast=is_broadcast)
+            done = self.amplifier.handle(name, values, clock.now())
         except Refusal as refusal:
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, []

@@ -123,6 +123,8 @@ class Amplifier:
         self._intake = SetIntake(can)
         self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
+        # By the last status: this, and whether a sum was limited.
+        self._shown_once: tuple[int | None, bool] = None, False
         self._watchdog = 0.0
         self._last_fed = 0.0
         self.token = 0
@@ -167,13 +169,10 @@ class Amplifier:
         if self.is_derated and self._heat.at(now) < GOOD_BELOW:
             self.is_derated = False
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
-        """Return the values of the reply to a request at a time [s].
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Return the values of the reply to a request at a time [s]; none to a part but the last.
 
-        None to a broadcast, nor to a part of a set but the last. Raises Refusal, which means that
-        nothing was applied.
+        Raises Refusal, which means that nothing was applied.
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
@@ -187,8 +186,6 @@ class Amplifier:
         reply = self._carry_out(name, values, following, now)
         if message.feeds and self.state == _ENABLED:
             self._last_fed = now
-        if is_broadcast:
-            return {}
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
 
@@ -203,6 +200,7 @@ class Amplifier:
             "interlock_open": self._is_interlock_open,
             "limited": self._is_limited,
         }
+        self._shown_once = self._marked, self._is_limited
         self._is_limited = False
         clock = self.clock.reading(now) if self._marked is None else self._marked
         self._marked = None
@@ -222,6 +220,10 @@ class Amplifier:
             temperature=self._heat.at(now),
             supply=1.0 if is_on else math.exp(min(0.0, (self._discharged_from - now) / _DISCHARGE)),
         )
+
+    def withdraw_status(self) -> None:
+        """Take the last status back, as that of a broadcast: the next one shows the same."""
+        self._marked, self._is_limited = self._shown_once
 
     def summary(self, now: float) -> AmplifierSummary:
         """What it does at a time [s] up to which it has been ticked; unlike a status, no report."""
@@ -294,8 +296,8 @@ class Amplifier:
             case "Ping" if self.state == _ENABLED:
                 self.clock.steer(values["rate"], now)
                 if self._waiting is not None:
-                    _, commit, layers = self._waiting
-                    self._waiting = self.clock.reaches(commit["at"], now), commit, layers
+                    _, commit, waiting = self._waiting
+                    self._waiting = self.clock.reaches(commit["at"], now), commit, waiting
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":

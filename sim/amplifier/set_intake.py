@@ -106,8 +106,8 @@ class SetIntake:
 
     def _checked(self, stream: Sequence[int]) -> Layers:
         if len(stream) > self.capabilities["set_words"]:
-            most = self.capabilities["set_words"]
-            raise Refusal(f"a set must have at most {most} words", "BAD_LENGTH")
+            room = self.capabilities["set_words"]
+            raise Refusal(f"a set must have at most {room} words", "BAD_LENGTH")
         return unpack_layers(stream, self.capabilities)
 
 

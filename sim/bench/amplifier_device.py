@@ -67,14 +67,16 @@ class AmplifierDevice:
         """Advance the bench to a time [s]."""
         self._bench.advance(now)
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def handle(self, name: str, values: Values, now: float) -> Values:
         """Return the values of the reply to a request at a time [s], if any; raises Refusal."""
         has_reply = name != "Set" or is_last(values)
         if has_reply and self.faults.now("nak_storm", now):
             raise Refusal("it refuses everything", "BUSY")
-        return self._bench.exchange(self.name, name, values, now=now, is_broadcast=is_broadcast)
+        return self._bench.exchange(self.name, name, values, now=now)
+
+    def withdraw_status(self) -> None:
+        """Take the last status back, as that of a broadcast."""
+        self._amplifier.withdraw_status()
 
     def restart(self, moment: float) -> None:
         """Power-cycle it at a time [s]."""

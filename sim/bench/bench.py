@@ -151,15 +151,12 @@ class Bench:
         """
         return self._shapes_at(points.tobytes())
 
-    def exchange(
-        self, amplifier: str, name: str, values: Values, *, now: float, is_broadcast: bool = False
-    ) -> Values:
+    def exchange(self, amplifier: str, name: str, values: Values, *, now: float) -> Values:
         """Return the values of an amplifier's reply to a request at a time [s]; raises Refusal."""
         if now > self.time:
             self._advance(now)
         try:
-            far = self.amplifiers[amplifier]
-            return far.handle(name, values, self.time, is_broadcast=is_broadcast)
+            return self.amplifiers[amplifier].handle(name, values, self.time)
         finally:
             self._update_plant()
 

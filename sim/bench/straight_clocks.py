@@ -14,6 +14,7 @@ WRONG = 0.5e-6
 """Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""
 
 _SOON = 0.05  # s; of a clock that is wrong then: a rate that is no correction of the last
+_ALIKE = 10e-6  # of a pace; rates that a host chooses by readings that are not exact
 _DRIFT = 0.1e-6  # s; by which the warm-up of a crystal may change it unseen
 
 
@@ -43,7 +44,8 @@ class StraightClocks:
             now = clock.straight(time)
             lasts = _lasts(self.straight[name], now)
             if lasts < _SOON:
-                self.straight[name], lasts = now, math.inf
+                self.straight[name] = _renewed(self.straight[name], now)
+                lasts = _lasts(self.straight[name], now)
                 renewed.append(name)
             self._due[name] = time + min(lasts / 2, clock.steady(time, _DRIFT))
         return renewed
@@ -51,8 +53,17 @@ class StraightClocks:
 
 def _lasts(known: StraightClock, now: StraightClock) -> float:
     """Return for how long [s] a clock is right enough, negative if it is wrong."""
-    half = CLOCK_TURN / 2
-    wrong = abs((now.shown - known.at(now.time) + half) % CLOCK_TURN - half)
-    drift = abs(now.pace - known.pace)
-    left = WRONG - wrong
+    drift, left = abs(now.pace - known.pace), WRONG - abs(_behind(known, now))
     return left / drift if drift else math.copysign(math.inf, left)
+
+
+def _renewed(known: StraightClock, now: StraightClock) -> StraightClock:
+    """Return the clock of now, at its mean pace since another was right where that is alike."""
+    mean = known.pace + _behind(known, now) / max(now.time - known.time, _SOON)
+    return now._replace(pace=mean) if abs(mean - now.pace) < _ALIKE else now
+
+
+def _behind(known: StraightClock, now: StraightClock) -> float:
+    """Return by how much a clock is behind that of now [s]."""
+    half = CLOCK_TURN / 2
+    return (now.shown - known.at(now.time) + half) % CLOCK_TURN - half

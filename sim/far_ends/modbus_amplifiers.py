@@ -137,16 +137,18 @@ class _Unit:
         request = parse_request(adu)
         message = None if request is None else _written(request)
         if request is not None and message is not None and message.is_broadcast:
-            result, _ = self._execute(message, request.registers[1:], now, is_broadcast=True)
+            result, _ = self._execute(message, request.registers[1:], now)
+            if not result:
+                self.amplifier.withdraw_status()
             self.is_moving = message.name == "SetAddress" and result == 0
 
     def _execute(
-        self, message: Message, words: Sequence[int], now: float, *, is_broadcast: bool = False
+        self, message: Message, words: Sequence[int], now: float
     ) -> tuple[int, Sequence[int]]:
         """Return the result and the words of the reply to a message."""
         try:
             name, values = read_request(message.number, words)
-            reply = self.amplifier.handle(name, values, now, is_broadcast=is_broadcast)
+            reply = self.amplifier.handle(name, values, now)
         except Refusal as refusal:
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, ()

@@ -28,6 +28,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults.fault_window import Faults
 from sim.transport.far_end import HOST, TcpEnd, TerminalEnd
+from sim.transport.line_kinds import LINE_KINDS, PROMPT, LineDelays
 
 _SERIAL_BITS, _MODBUS_BITS = 10, 11  # of a byte: start, eight data, parity on Modbus, stop
 
@@ -39,10 +40,12 @@ Devices = Sequence[AmplifierDevice]
 class Wire:
     """How simulated amplifiers are reached.
 
-    kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time; port: on the loopback
-    interface, 0 for any; shared: all amplifiers on one serial line, at addresses 1, 2, ...;
-    unpluggable: URLs stay valid when the wire is unplugged and plugged in again; line: tells apart
-    wires that are otherwise equal; address: unit, node or address there, None for any.
+    kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time, or that of the kind
+    where its line is not prompt; port: on the loopback interface, 0 for any; shared: all amplifiers
+    on one serial line, at addresses 1, 2, ...; unpluggable: URLs stay valid when the wire is
+    unplugged and plugged in again; line: tells apart wires that are otherwise equal; line_kind: one
+    of `LINE_KINDS`, None for what is usual where there are several amplifiers, else prompt; seed:
+    of its delays; address: unit, node or address there, None for any.
     """
 
     kind: str
@@ -51,7 +54,14 @@ class Wire:
     shared: bool = False
     unpluggable: bool = False
     line: str = ""
+    line_kind: str | None = None
+    seed: int = 0
     address: int | None = field(default=None, compare=False)
+
+    @property
+    def is_one_line(self) -> bool:
+        """Whether all amplifiers on it share one line."""
+        return self.shared or self.kind != "serial"
 
 
 @asynccontextmanager
@@ -60,10 +70,9 @@ async def open_wire(wire: Wire, devices: Devices) -> Urls:
 
     Amplifiers that do not share a serial wire have a line each.
     """
-    is_apart = wire.kind == "serial" and not wire.shared
     async with AsyncExitStack() as stack:
         urls: dict[str, str] = {}
-        for line in [[device] for device in devices] if is_apart else [devices]:
+        for line in [devices] if wire.is_one_line else [[device] for device in devices]:
             urls |= await stack.enter_async_context(_OPENERS[wire.kind](wire, line))
         yield urls
 
@@ -76,7 +85,10 @@ async def open_wires(wires: Mapping[str, Wire], devices: Devices) -> Urls:
     """
     lines: dict[Wire, list[AmplifierDevice]] = {}
     for device in devices:
-        lines.setdefault(wires[device.name], []).append(device)
+        wire = wires[device.name]
+        if len(devices) > 1 and wire.line_kind is None:
+            wire = replace(wire, line_kind=_usual_line(wire))
+        lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
         for wire, together in lines.items():
@@ -88,18 +100,33 @@ def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
     return {device.address: device for device in devices}
 
 
-def _byte_time(wire: Wire, bits: int) -> float:
-    """Transmission time of a byte of so many bits [s]."""
-    return bits / wire.speed if wire.speed else 0.0
+def _usual_line(wire: Wire) -> str:
+    """The kind of line that is usual for a wire; of a serial line by the port of its URL."""
+    port = Path(wire.line).name.rstrip("0123456789")
+    return _LINE_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
+
+
+def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
+    """Those of a line, None where it is prompt."""
+    if wire.line_kind in (None, PROMPT):
+        return None
+    return LINE_KINDS[wire.line_kind].delays((wire.seed, devices[0].name))
+
+
+def _speed(wire: Wire, usual: int) -> int | None:
+    """Bits per second of a line: as given, the usual ones where it is not prompt, or None."""
+    return wire.speed or (None if wire.line_kind in (None, PROMPT) else usual)
 
 
 @asynccontextmanager
 async def _serial(wire: Wire, devices: Devices) -> Urls:
     numbered = _numbered(devices) if len(devices) > 1 else {ADDRESS: devices[0]}
+    speed = _speed(wire, BAUD)
     async with TerminalEnd(
         devices[0],
         partial(SerialAmplifiers, numbered),
-        byte_time=_byte_time(wire, _SERIAL_BITS),
+        delays=_delays(wire, devices),
+        byte_time=_SERIAL_BITS / speed if speed else 0.0,
         unpluggable=wire.unpluggable,
     ) as end:
         line = f"serial://{end.port}?baud={wire.speed or BAUD}"
@@ -111,10 +138,12 @@ async def _serial(wire: Wire, devices: Devices) -> Urls:
 
 @asynccontextmanager
 async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
+    speed = _speed(wire, RTU_BAUD)
     async with TerminalEnd(
         devices[0],
         partial(ModbusAmplifiers, _numbered(devices), is_rtu=True),
-        byte_time=_byte_time(wire, _MODBUS_BITS),
+        delays=_delays(wire, devices),
+        byte_time=_MODBUS_BITS / speed if speed else 0.0,
         unpluggable=wire.unpluggable,
     ) as end:
         line = f"modbus+rtu://{end.port}?baud={wire.speed or RTU_BAUD}"
@@ -124,31 +153,42 @@ async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
 @asynccontextmanager
 async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
     registers = ModbusAmplifiers(_numbered(devices), lambda data: None, is_rtu=False)
-    async with TcpEnd(devices[0], registers.of_connection, port=wire.port) as end:
+    delays = _delays(wire, devices)
+    async with TcpEnd(devices[0], registers.of_connection, delays=delays, port=wire.port) as end:
         line = f"modbus+tcp://{HOST}:{end.port}"
         yield {device.name: f"{line}/{device.address}" for device in devices}
 
 
 @contextmanager
-def _bus_with(devices: Devices, bitrate: int | None) -> Iterator[CanBus]:
-    with closing(CanBus(bitrate)) as bus, closing(BusNodes(bus, devices)):
+def _bus_with(wire: Wire, devices: Devices) -> Iterator[CanBus]:
+    with closing(CanBus(_speed(wire, BITRATE))) as bus, closing(BusNodes(bus, devices)):
         yield bus
 
 
 @asynccontextmanager
 async def _slcan(wire: Wire, devices: Devices) -> Urls:
-    with _bus_with(devices, wire.speed) as bus:
-        make, is_kept = partial(SlcanAdapter, bus), wire.unpluggable
-        async with TerminalEnd(devices[0], make, faults=Faults(), unpluggable=is_kept) as end:
+    with _bus_with(wire, devices) as bus:
+        async with TerminalEnd(
+            devices[0],
+            partial(SlcanAdapter, bus),
+            faults=Faults(),
+            delays=_delays(wire, devices),
+            unpluggable=wire.unpluggable,
+        ) as end:
             line = f"can+slcan://{end.port}?bitrate={wire.speed or BITRATE}"
             yield {device.name: f"{line}#{device.address}" for device in devices}
 
 
 @asynccontextmanager
 async def _socketcand(wire: Wire, devices: Devices) -> Urls:
-    with _bus_with(devices, wire.speed) as bus:
-        make = partial(SocketcandClient, bus)
-        async with TcpEnd(devices[0], make, faults=Faults(), port=wire.port) as end:
+    with _bus_with(wire, devices) as bus:
+        async with TcpEnd(
+            devices[0],
+            partial(SocketcandClient, bus),
+            faults=Faults(),
+            delays=_delays(wire, devices),
+            port=wire.port,
+        ) as end:
             line = f"can+socketcand://{HOST}:{end.port}/{BUS_NAME}"
             speed = f"?bitrate={wire.speed}" if wire.speed not in (None, BITRATE) else ""
             yield {device.name: f"{line}{speed}#{device.address}" for device in devices}
@@ -175,6 +215,20 @@ _KIND_OF_SCHEME = {
     "can+slcan": "slcan",
 }
 _EXAMPLE = "; as in --wire main=serial"
+_LINE_OF_WIRE = {
+    "serial": "usb-high-speed",
+    "modbus-tcp": "ethernet",
+    "modbus-rtu": "usb-high-speed",
+    "socketcand": "can",
+    "slcan": "can-usb",
+}
+_LINE_OF_PORT = {
+    "ttyUSB": "ftdi-low-latency",
+    "ttyACM": "usb-full-speed",
+    "ttyS": "native",
+    "ttyAMA": "native",
+}
+"""By the name of a port without its number."""
 
 
 def assign_wires(
@@ -200,6 +254,29 @@ def assign_wires(
     return {
         name: assigned.get(name) or common or _wire_of_url(name, url, defaults)
         for name, url in amplifiers.items()
+    }
+
+
+def choose_lines(wires: Mapping[str, Wire], options: Sequence[str]) -> dict[str, Wire]:
+    """Wires by amplifier with the kinds of line that options name: `KIND` or `NAME=KIND`.
+
+    A name stands for all amplifiers of its line, and counts more than what is for all. Raises
+    InputError.
+    """
+    kinds: dict[str, str] = {}
+    for text in sorted(options, key=lambda text: "=" in text):
+        name, equals, kind = text.rpartition("=")
+        if equals and name not in wires:
+            raise InputError(f"--line {text}: amplifier must be one of {', '.join(wires)}")
+        if kind not in (*LINE_KINDS, PROMPT):
+            known = ", ".join((*LINE_KINDS, PROMPT))
+            raise InputError(f"--line {text}: must be KIND or NAME=KIND, KIND one of {known}")
+        for each, wire in wires.items():
+            if not equals or each == name or (wire.is_one_line and wire == wires[name]):
+                kinds[each] = kind
+    return {
+        name: replace(wire, line_kind=kinds.get(name, wire.line_kind))
+        for name, wire in wires.items()
     }
 
 

@@ -84,8 +84,7 @@ class SerialAmplifiers(FarEnd):
             raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
         words = unpack_words(frame.payload) if frame.type in BY_NUMBER else ()
         name, values = read_request(frame.type, words)
-        is_broadcast = frame.address == BROADCAST
-        reply = amplifier.handle(name, values, now, is_broadcast=is_broadcast)
+        reply = amplifier.handle(name, values, now)
         if name == "SetAddress":
             self._amplifiers = {
                 values["address"] if each is amplifier else address: each
@@ -101,6 +100,7 @@ class SerialAmplifiers(FarEnd):
             if amplifier.is_answering:
                 with suppress(Refusal):
                     self._payload(frame, amplifier, now)
+                    amplifier.withdraw_status()
 
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()

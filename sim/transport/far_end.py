@@ -13,6 +13,7 @@ from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
+from sim.transport.line_kinds import LineDelays
 from sim.transport.pseudo_terminal import make_terminal
 
 HOST = "127.0.0.1"
@@ -83,8 +84,8 @@ class Served:
 class TerminalEnd:
     """A pseudo-terminal in front of a far end, as an asynchronous context.
 
-    device: has the faults of the wire, those of frames if none are given; unpluggable: see
-    `make_terminal`.
+    device: has the faults of the wire, those of frames if none are given; delays: see
+    `TwoWayLine`; unpluggable: see `make_terminal`.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class TerminalEnd:
         make_end: MakeEnd,
         *,
         faults: Faults | None = None,
+        delays: LineDelays | None = None,
         byte_time: float = 0.0,
         unpluggable: bool = False,
     ) -> None:
@@ -100,6 +102,7 @@ class TerminalEnd:
             to_amplifier=lambda data, now: self._served.receive(data, now),
             to_host=lambda data: self._terminal.write(data),
             faults=device.faults if faults is None else faults,
+            delays=delays,
             byte_time=byte_time,
         )
         self._served = Served(make_end(self._line.outward.send))
@@ -128,8 +131,8 @@ class TerminalEnd:
 class TcpEnd:
     """A TCP port on the loopback interface, 0 for any, as an asynchronous context.
 
-    make_end: of each connection; device, faults: see `TerminalEnd`. An unplugged port closes its
-    connections, unlike a cable. Entering it raises LinkError where the port is in use.
+    make_end: of each connection; device, faults and delays: see `TerminalEnd`. An unplugged port
+    closes its connections, unlike a cable. Entering it raises LinkError where the port is in use.
     """
 
     def __init__(
@@ -138,9 +141,11 @@ class TcpEnd:
         make_end: MakeEnd,
         *,
         faults: Faults | None = None,
+        delays: LineDelays | None = None,
         port: int = 0,
     ) -> None:
         self.port = port
+        self.delays = delays
         self.faults = device.faults if faults is None else faults
         self.make_end = make_end
         self.connections: set[_Connection] = set()
@@ -197,6 +202,7 @@ class _Connection(asyncio.Protocol):
             to_amplifier=lambda data, now: self._served.receive(data, now),
             to_host=self._send,
             faults=self._port.faults,
+            delays=self._port.delays,
             finds_damage=True,
         )
         self._served = Served(self._port.make_end(self._line.outward.send))

@@ -58,6 +58,40 @@ async def opened_group(line: Line) -> Group:
     return group
 
 
+ROUND_TRIPS = {"&line=prompt": (0.0, 0.0), "": (28e-6, 1e-3), "&line=ftdi": (10e-3, 12e-3)}
+"""Medians of an exchange without bits, 5 ms after the one before [s].
+
+Two frames of 125 us at most and the operating system; 16 ms after an FTDI chip's last packet.
+"""
+
+
+@pytest.mark.parametrize("option", ROUND_TRIPS)
+@in_virtual_time
+async def test_line_is_that_of_its_url_and_of_usb_where_a_rig_has_several(
+    option: str, tmp_path: Path
+) -> None:
+    """By default as a USB adapter of high speed delays, and not at all as `prompt`."""
+    rig = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS)
+    lines = Lines()
+    main = await lines.amplifier(f"sim://{rig}?amplifier=main{option}", LIMITS, name="main")
+    await main.open()
+    taken = []
+    for _ in range(51):
+        await asyncio.sleep(0.005)
+        await main.read_status()
+        taken.append(main.counts.last_round_trip)
+    await lines.close()
+    shortest, longest = ROUND_TRIPS[option]
+    assert shortest <= sorted(taken)[25] <= longest
+
+
+@pytest.mark.parametrize("option", ["line=usb", "line="])
+async def test_url_of_an_unknown_line_is_refused(option: str) -> None:
+    """As any other option that is invalid."""
+    with pytest.raises(CommandError, match="line must be one of"):
+        await Lines().amplifier(f"sim://rig.yaml?amplifier=a&{option}", LIMITS, name="a")
+
+
 async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:
     """By URLs with names: the control socket sees both play, and ends with them."""
     rig, control = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS), tmp_path / "control"

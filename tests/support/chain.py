@@ -294,8 +294,9 @@ class FarEnd:
 
     def _handle(self, name: str, values: Values, now: float) -> Values:
         self.asked.append((now, name, values))
-        answer = self.answer(name, values)
-        reply = self.obey(name, values, now) if answer is None else answer
+        reply = self.answer(name, values)
+        if reply is None:
+            reply = self.obey(name, values, now)
         self._note(name, values, reply, now)
         return reply
 
@@ -306,7 +307,7 @@ class FarEnd:
         if name == "Set":
             parts = self._staged.setdefault(values["token"], {})
             parts[values["index"]] = list(values["stream"])
-        if name == "Commit" or (name == "Set" and reply["played"]):
+        if name == "Commit" or reply.get("played"):
             parts = self._staged.pop(values["token"], {})  # none if it was repeated
             words = [word for index in sorted(parts) for word in parts[index]]
             if words:

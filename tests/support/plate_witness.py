@@ -386,7 +386,7 @@ def _check_measured(
     """Compare levels, which may be low where a fault is possible that is not shown yet."""
     amplifier, when = session.amplifier, (time, time)
     amplifier.advance(time)
-    if amplifier.unanswered:
+    if amplifier.unanswered or amplifier.may_start(when):
         return
     outputs = amplifier.outputs
     is_fault_possible = amplifier.is_enabled or not amplifier.is_shown

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import cast
@@ -67,8 +67,8 @@ def after_each(
     """Call with each request that a device carries out: its name, values, reply and time [s]."""
     obey = device.handle
 
-    def handle(name: str, values: Values, now: float, *, is_broadcast: bool = False) -> Values:
-        reply = obey(name, values, now, is_broadcast=is_broadcast)  # a refusal changes nothing
+    def handle(name: str, values: Values, now: float) -> Values:
+        reply = obey(name, values, now)  # a refusal changes nothing
         note(name, values, reply, now)
         return reply
 
@@ -91,6 +91,8 @@ async def far_side(
     machine = live_in_memory() if is_virtual else None
     bench, devices = make_bench(rig, seed=seed, imperfections=imperfections)
     wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
+    if machine is not None and len(bench.amplifiers) > 1:
+        machine.passing = (0.0, 0.0)  # the lines have delays of their kinds
     async with open_wires(wires, [*devices.values()]) as urls:
         try:
             yield FarSide(urls, devices, bench, machine)
@@ -134,13 +136,19 @@ SHARED_WIRES: Mapping[str, Wire] = {
 """Those on which several amplifiers hear one broadcast."""
 
 
-def on_two_amplifiers(rig: Rig) -> Rig:
-    """Wire the ERAs of a rig to two amplifiers, east and west, in turn."""
+def on_amplifiers(rig: Rig, names: Sequence[str]) -> Rig:
+    """Wire the ERAs of a rig to amplifiers of these names in turn."""
+    count = len(names)
     wiring = {
-        era: Channel("west" if number % 2 else "east", number // 2)
+        era: Channel(names[number % count], number // count)
         for number, era in enumerate(rig.wiring)
     }
-    return replace(rig, wiring=wiring, amplifiers={"east": "sim://", "west": "sim://"})
+    return replace(rig, wiring=wiring, amplifiers=dict.fromkeys(names, "sim://"))
+
+
+def on_two_amplifiers(rig: Rig) -> Rig:
+    """Wire the ERAs of a rig to two amplifiers, east and west, in turn."""
+    return on_amplifiers(rig, ("east", "west"))
 
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)

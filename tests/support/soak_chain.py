@@ -24,8 +24,9 @@ from model.rig.rig import Rig
 from paper_plate import make_paper_rig
 from plate_witness import PlateTimes
 from registry import clock
-from rig_on_wire import after_each, on_two_amplifiers
+from rig_on_wire import after_each, on_amplifiers
 from sim.far_ends.opening import Wire
+from sim.transport.line_kinds import LINE_KINDS, PROMPT
 from small_table import small_table
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
@@ -46,6 +47,7 @@ _GAPS_BETWEEN_FEEDS = 8 * 4 * 0.00175  # s
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
+NAMES = ("east", "west", "north")
 _QUIET_END = 1.0  # s; duration of the check for silence after closing
 
 
@@ -104,8 +106,10 @@ async def _run(
             shared=len(plan.lines) < len(rig.amplifiers),
             unpluggable=True,
             line=str(number % len(plan.lines)),
+            line_kind=line.line_kind,
+            seed=plan.seed,
         )
-        for number, (name, line) in enumerate(zip(rig.amplifiers, 2 * plan.lines, strict=False))
+        for number, (name, line) in enumerate(zip(rig.amplifiers, 3 * plan.lines, strict=False))
     }
     options: dict[str, Any] = {"timing": _timing(), "judged": _judged(plan), "seed": plan.seed}
     async with Soak.on(wires, rig, small_table(), **options) as soak:
@@ -128,7 +132,7 @@ def _timing() -> Timing:
 @cache
 def _rig(amplifiers: int) -> Rig:
     rig = make_paper_rig(12, 9)
-    return rig if amplifiers == 1 else on_two_amplifiers(rig)
+    return rig if amplifiers == 1 else on_amplifiers(rig, NAMES[:amplifiers])
 
 
 def _judged(plan: Plan) -> Mapping[str, Any]:
@@ -137,18 +141,24 @@ def _judged(plan: Plan) -> Mapping[str, Any]:
     def release(preceding: int) -> float:
         """How long after the last finger the plate may play [s], after bytes on the line."""
         on_wire = [preceding * 10 / line.speed if line.speed else 0.0 for line in plan.lines]
-        return _RELEASE + max(on_wire) + _ON_THE_WIRE
+        return _RELEASE + max(on_wire) + _ON_THE_WIRE + _late(plan)
 
     gaps = any(line.kind == "modbus-rtu" for line in plan.lines) * _GAPS_BETWEEN_FEEDS
     return {
         "limits": PlateTimes(
             lift=release(_BYTES),
             release=release(_BYTES) + _RAMP,
-            touch=_TOUCH,
+            touch=_TOUCH + _late(plan),
             stop=release(_BYTES),
         ),
         "times": TimeLimits(heartbeat=_HEARTBEAT + release(_BYTES_BETWEEN_FEEDS) + gaps),
     }
+
+
+def _late(plan: Plan) -> float:
+    """By how much the slowest line lets an exchange take longer [s]."""
+    kinds = [LINE_KINDS[line.line_kind] for line in plan.lines if line.line_kind != PROMPT]
+    return max([kind.longest for kind in kinds], default=0.0)
 
 
 @dataclass

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 from sim.faults.fault_window import FaultKind, FaultWindow
+from sim.transport.line_kinds import PROMPT
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),
@@ -22,6 +23,15 @@ KINDS: Mapping[str, Sequence[int | None]] = {
     "slcan": (500_000,),
 }
 """The wires, and the speeds [bit/s] at which they run."""
+_SERIAL_LINES = ("native", "usb-high-speed", "usb-full-speed", "ftdi-low-latency", "ftdi")
+LINES: Mapping[str, Sequence[str]] = {
+    "serial": _SERIAL_LINES,
+    "modbus-rtu": _SERIAL_LINES,
+    "modbus-tcp": ("ethernet",),
+    "socketcand": ("can",),
+    "slcan": ("can-usb",),
+}
+"""The kinds of line behind them, where there are several amplifiers."""
 
 SOURCES = ("panel", "table", "page")
 BEGIN = 0.5  # s; all wires are open by then
@@ -52,10 +62,11 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 @dataclass(frozen=True)
 class Line:
-    """A wire: kind as `sim.far_ends.opening` has it, and speed [bit/s]."""
+    """A wire: kind and kind of line as `sim.far_ends.opening` has them, and speed [bit/s]."""
 
     kind: str
     speed: int | None
+    line_kind: str = PROMPT
 
 
 @dataclass(frozen=True)
@@ -130,12 +141,12 @@ class Plan:
 def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Plan:
     """The plan of a seed; wire: its kind, None for any; short: one scene of seconds."""
     rng = random.Random(seed)
-    amplifiers = rng.choice((1, 1, 1, 2))
-    count = 1 if amplifiers == 1 else rng.choice((1, 2))
+    amplifiers = rng.choice((1, 1, 2, 3))
     lines = []
-    for _ in range(count):
+    for _ in range(rng.choice((1, amplifiers))):
         kind = wire or rng.choice(tuple(KINDS))
-        lines.append(Line(kind, rng.choice(KINDS[kind])))
+        line_kind = PROMPT if amplifiers == 1 else rng.choice(LINES[kind])
+        lines.append(Line(kind, rng.choice(KINDS[kind]), line_kind))
     actions: list[Action] = []
     time, busy = BEGIN, BEGIN
     for _ in range(1 if short else rng.randint(2, 5)):

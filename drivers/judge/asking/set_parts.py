@@ -9,6 +9,7 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require
 from drivers.judge.asking.material import Material, Rows, Send, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
 from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, STAGED_LIFE
 
@@ -76,8 +77,10 @@ def parts_of_sets(subject: Subject) -> Rows:
         first, *others, last = _cut(subject, *made, token=token, now=now)
         incomplete = send("Commit", token=token, code="INCOMPLETE")
         late = [row for each in (*reversed(others), others[-1]) for row in (each, incomplete, last)]
-        end = [] if now else [first, others[0], last, send("Commit", token=token)]
-        return [last, *late, first, last, last, *end, last, 0.05]
+        if now:
+            return [first, last, *others, last, last, 0.05]
+        again = first, others[0], last, send("Commit", token=token), last
+        return [last, *late, first, incomplete, last, last, *again, 0.05]
 
     others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
     at_once, back = _cut(subject, *made, token=6), send("Commit", token=6)
@@ -102,12 +105,12 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
     made = long_set(subject)
     first, second, *others, last = _cut(subject, *made, token=9)
     count = len(others) + 3
-    dropped = [
+    dropped: list[Values] = [
         {"session": subject.next_session % 0xFFFF + 1},
         *({"token": token} for token in (5, 4, 8, 5 + 0x8000)),
         {"parts": count + 1},
     ]
-    refused = [
+    refused: list[tuple[Values, str]] = [
         *(({"index": count}, "BAD_VALUE"), ({"index": count, "token": 10}, "BAD_VALUE")),
         *(({"index": 255, "token": 10}, "BAD_VALUE"), ({"parts": 1, "index": 0}, "BAD_VALUE")),
         *(({"token": 8}, _OLD), ({"token": 4}, _OLD), ({"token": 10}, "")),
@@ -117,7 +120,10 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
         *(_with(second, **each) for each in dropped),
         *(_with(last, code=code, **each) for each, code in refused),
         _with(last, token=5),
-        *(last, *others, second, last, *(_with(second, **each) for each in dropped)),
+        last,
+        *others,
+        *(second, last),
+        *(_with(second, **each) for each in dropped),
         *(send("Commit", token=9), send("Disarm", ramp=0), subject.settle, first),
         _with(last, code="WRONG_STATE"),
     ]
@@ -130,7 +136,9 @@ def parts_again(subject: Subject) -> Rows:
     first, *others, last = _cut(subject, *long_set(subject), token=2)
     nonsense = [0xFFFF] * 3
     return [
-        *(subject.arm, subject.one(), _with(first, stream=nonsense), *others, first, last),
+        *(subject.arm, subject.one(), _with(first, stream=nonsense)),
+        *others,
+        *(first, last),
         *(_with(first, stream=nonsense), _with(last, stream=nonsense), last),
         *(send("Commit", token=2), _with(last, stream=nonsense, now=1), _with(last, index=0)),
     ]
@@ -142,17 +150,24 @@ def refused_parts(subject: Subject) -> Rows:
     _require_quick(subject)
     flawed = layer(len(subject.layers) - 1, subject.tone(), subject.tone())
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
-    good = _cut(subject, *long_set(subject), token=4)
+    good = _cut(subject, *long_set(subject), token=5)
     first, *others, last = _cut(subject, half, flawed, token=2)
-    bad = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
+    flawed_one = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
     return [
-        *(subject.arm, quarter, first, *others, bad(last), last),
-        *(stage(half, token=3), bad(play(flawed, token=4)), bad(stage(flawed, token=4))),
+        *(subject.arm, quarter, first),
+        *others,
+        *(flawed_one(last), last),
+        *(
+            stage(half, token=3),
+            flawed_one(play(flawed, token=4)),
+            flawed_one(stage(flawed, token=4)),
+        ),
         # A last part of a newer set that is not whole changes nothing; one that is kept does.
-        *(good[-1], stage(half, token=3), *good[:-1], _with(stage(half, token=3), code=_OLD)),
-        *(bad(stage(flawed, token=5)), good[-1], send("Commit", token=3, code=_OLD)),
-        *(send("Commit", token=4), stage(half, token=6), play(quarter, token=7)),
-        send("Commit", token=6, code=_OLD),
+        *(good[-1], send("Commit", token=3), stage(quarter, token=4)),
+        *good[:-1],
+        *(_with(stage(quarter, token=4), code=_OLD), send("Commit", token=4, code=_OLD)),
+        *(flawed_one(stage(flawed, token=6)), good[-1], send("Commit", token=5)),
+        *(stage(half, token=6), play(quarter, token=7), send("Commit", token=6, code=_OLD)),
     ]
 
 
@@ -190,7 +205,9 @@ def sets_expire(subject: Subject) -> Rows:
     return [
         *(subject.arm, stage(subject.one()), shorter, send("Commit", token=1)),
         *(stage(subject.one()), 1.1 * STAGED_LIFE, send("Commit", token=2, code=_OLD)),
-        *(first, 0.6 * STAGED_LIFE, *others, last, 0.5 * STAGED_LIFE),
-        *(send("Commit", token=3, code=_OLD), last, *others),
+        *(first, 0.6 * STAGED_LIFE),
+        *others,
+        *(last, 0.5 * STAGED_LIFE, send("Commit", token=3, code=_OLD), last),
+        *others,
         *(0.6 * STAGED_LIFE, first, 0.5 * STAGED_LIFE, last),
     ]

@@ -128,6 +128,7 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         yield _part(pack_layers([good, layer_set]))
     if ramp < 1000:
         yield _part(pack_layers([good, layer(0, ramp=ramp + 1, renew=True)]))
+        yield _part(pack_layers([good, layer(0, tone, tone, ramp=ramp + 1)]))
     words = pack_layers([layer(0, tone)])
     head, command = LAYER.places, COMMAND.places
     for at, word, named in (

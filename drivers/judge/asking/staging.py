@@ -120,7 +120,7 @@ async def _commit(subject: Subject, duration: float) -> None:
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
-    waits = [stage(subject.one(level=0.25)), partial(_commit, subject, 0.4)]
+    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, 0.4)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     ends: list[Rows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
@@ -131,4 +131,4 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [stage(half), partial(_commit, subject, 0.2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
-    return [(*waits, *each, 0.5) for each in ends]
+    return [[*waits, *each, 0.5] for each in ends]

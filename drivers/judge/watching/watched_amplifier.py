@@ -105,6 +105,8 @@ class WatchedAmplifier(ExpectedAmplifier):
         if request.name in FEEDING:
             self._fed_before = self.fed[1]
             self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
+        if request.name == "Mark" and request.key is None:
+            self._marked = request.started_at, request.since + REACTION
         if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 

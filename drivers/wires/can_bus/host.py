@@ -7,6 +7,7 @@ from collections import deque
 
 from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
     BROADCAST,
     BY_NUMBER,
@@ -43,7 +44,6 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
-    has_reply,
     read_event,
     read_nak,
 )
@@ -96,8 +96,8 @@ class CanWire(Wire):
         if name == "Hello":
             start = CanFrame(cob_id("nmt"), bytes((_START, address)))
             frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
-        is_replied = has_reply(address, name, values)
-        self._pending = (address, number, kind) if is_replied else None
+        has_reply = address != BROADCAST and (name != "Set" or is_last(values))
+        self._pending = (address, number, kind) if has_reply else None
         self._requested = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)

@@ -18,6 +18,7 @@ from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_last
 from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.protocol.timing import BOOT_TIME
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
@@ -55,7 +56,6 @@ from drivers.wires.wire import (
     Several,
     Wire,
     Written,
-    has_reply,
     read_nak,
     reply_words,
 )
@@ -125,7 +125,7 @@ class ModbusWire(Wire):
             self._request = self._sent(name, 0, message)
         else:
             self._request = self._written(address, name, values)
-            self._request.has_reply = has_reply(address, name, values)
+            self._request.has_reply = name != "Set" or is_last(values)
             if name == "Set" and not self.confirms_parts:
                 return self._without_pause(self._request)
         return self._request.frame
@@ -160,12 +160,12 @@ class ModbusWire(Wire):
             if adu.transaction in self._unawaited:
                 self._unawaited.remove(adu.transaction)
                 continue
-            if (write := self._write) is not None:
-                if (response := response_to(write.message, adu)) is not None:
-                    self._write = None
-                    if response.exception and (arrival := self._arrival(write, response)):
-                        arrivals.append(arrival)
-                    continue
+            write = self._write
+            if write is not None and (response := response_to(write.message, adu)) is not None:
+                self._write = None
+                if response.exception and (arrival := self._arrival(write, response)):
+                    arrivals.append(arrival)
+                continue
             response = response_to(sent, adu)
             if request is None or response is None:
                 self.counters.unexpected_frames += 1

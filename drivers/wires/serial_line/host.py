@@ -11,7 +11,9 @@ from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
+    BROADCAST,
     BY_NUMBER,
     EVENT,
     HELLO,
@@ -38,7 +40,6 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
-    has_reply,
     read_event,
     read_nak,
 )
@@ -70,7 +71,8 @@ class SerialWire(Wire):
             kind, version, words = message.number, VERSION, message.request.append([], values)
         frame = Frame(kind, address, self._sequence, b"", version)
         data = encode_frame(frame, words)
-        self._pending = frame if has_reply(address, name, values) else None
+        has_reply = address != BROADCAST and (name != "Set" or is_last(values))
+        self._pending = frame if has_reply else None
         self.counters.frames_out += 1
         self.takes = self._byte_time * len(data)
         return data

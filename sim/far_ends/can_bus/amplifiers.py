@@ -191,7 +191,10 @@ class _Node:
         name, values = read_request(message.type, message.words)
         if name == "SetAddress" and values["address"] > NODE_MAX:
             raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
-        reply = self._amplifier.handle(name, values, now, is_broadcast=not message.number)
+        reply = self._amplifier.handle(name, values, now)
+        if not message.number:
+            self._amplifier.withdraw_status()
+            reply = {}
         if name == "SetAddress":
             self.number = values["address"]
         return BY_NUMBER[message.type].reply.pack(reply) if reply else []

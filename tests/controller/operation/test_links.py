@@ -223,6 +223,7 @@ async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixtur
                 are_open=True,
                 lost=None,
                 what_may_play=daemon.supervisor.what_may_play,
+                clock_errors=daemon.controller.group.clock_errors,
                 targets=["panel 1"],
             )
             return {each.kind: each.cause + each.remedy for each in shown.reports}

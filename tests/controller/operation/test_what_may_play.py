@@ -36,6 +36,7 @@ def said_by_status(daemon: Watched) -> Mapping[str, Mapping[str, object]]:
         are_open=controller.group.is_open,
         lost=supervisor.operation.lost,
         what_may_play=supervisor.what_may_play,
+        clock_errors=controller.group.clock_errors,
     )
     now = clock.now()
     said = {name: supervisor.what_may_play(name).rows(now) for name in controller.urls}

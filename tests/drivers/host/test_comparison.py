@@ -111,8 +111,8 @@ async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None
     group = await group_of(end)
     take, handle = far._take, far.handle
 
-    def handled(name: str, values: Values, now: float, *, is_broadcast: bool) -> Values:
-        reply = handle(name, values, now, is_broadcast=is_broadcast)
+    def handled(name: str, values: Values, now: float) -> Values:
+        reply = handle(name, values, now)
         if name == "GetAchieved":
             reply["commands"] = [{**each, "frequency": said} for each in reply["commands"]]
         return reply
@@ -180,8 +180,8 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
         ],
     }
     handle = far.handle
-    far.handle = lambda name, given, now: (  # type: ignore[method-assign]
-        values if name == "GetMeasured" else handle(name, given, now)
+    far.handle = lambda name, given, now, **options: (  # type: ignore[method-assign]
+        values if name == "GetMeasured" else handle(name, given, now, **options)
     )
     await host.open()
     assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]

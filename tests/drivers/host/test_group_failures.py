@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -13,7 +14,6 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier as FarEnd
-from virtual_loop import in_virtual_time
 from words_line import MemoryLine, grouped, layer, losing, tone
 
 
@@ -22,7 +22,9 @@ def altered(
 ) -> None:
     """Have a far end reply by a function of the request, its time, and what it does itself."""
     handle = far.handle
-    far.handle = lambda name, values, now: change(name, values, now, handle)  # type: ignore[method-assign]
+    far.handle = lambda name, values, now, **options: change(  # type: ignore[method-assign]
+        name, values, now, partial(handle, **options)
+    )
 
 
 @grouped(("a",), ("b",), wire="serial")

@@ -105,10 +105,10 @@ async def test_refusal_after_no_reply_says_that_it_may_have_played(
     far = end.far["a"]
     handle, commits = far.handle, iter([True])
 
-    def once(name: str, values: Values, now: float) -> Values:
+    def once(name: str, values: Values, now: float, **options: bool) -> Values:
         if name == "Commit" and not next(commits, False):
             raise Refusal("not now", "WRONG_STATE")
-        return handle(name, values, now)
+        return handle(name, values, now, **options)
 
     far.handle = once  # type: ignore[method-assign]
     lost = iter([True])

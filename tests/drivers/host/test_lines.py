@@ -176,8 +176,9 @@ class OnLines(Taken):
         far = self.far.a
         handle = far.handle
 
-        def obey(name: str, values: Values, now: float) -> Any:
-            return handle(instead.get(name, name), {} if name in instead else values, now)
+        def obey(name: str, values: Values, now: float, **options: bool) -> Any:
+            given = {} if name in instead else values
+            return handle(instead.get(name, name), given, now, **options)
 
         far.handle = obey
 

@@ -49,11 +49,9 @@ class Recorded(Amplifier):
         super().__init__("a", channels=2)
         self.asked: list[tuple[str, Values]] = []
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def handle(self, name: str, values: Values, now: float) -> Values:
         self.asked.append((name, values))
-        return super().handle(name, values, now, is_broadcast=is_broadcast)
+        return super().handle(name, values, now)
 
 
 @pytest.mark.parametrize("kind", ["serial", "rtu", "tcp"])

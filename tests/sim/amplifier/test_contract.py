@@ -128,7 +128,7 @@ def test_rate_is_of_an_armed_session() -> None:
 
 
 def test_watchdog_ends_the_rate_and_counts_real_time() -> None:
-    """3276.7 ppm fast, it trips after 0.25 s as all others, and its clock is its crystal's again."""
+    """3276.7 ppm fast, it trips after 0.25 s, and its clock is as fast as its crystal again."""
     amplifier, events = armed(), []
     amplifier.listeners.append(lambda event, at: events.append(at))
     amplifier.handle("Ping", {"session": 7, "rate": 32767}, 0.0)

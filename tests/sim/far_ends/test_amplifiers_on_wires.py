@@ -8,12 +8,22 @@ from typing import Any
 import pytest
 
 from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.table import FAULTS, STATES, STATUS
+from drivers.protocol.table import FAULTS, MESSAGES, STATES, STATUS, VERSION
+from drivers.urls import ADDRESS
+from drivers.wires.serial_line.frames import Frame, encode_frame
 from model.errors import InputError
 from model.rig.rig import Rig
 from registry import clock
-from rig_on_wire import SHARED_WIRES, WIRES, layer, on_two_amplifiers, rig_on_wire
-from sim.far_ends.opening import Wire, assign_wires, links_of
+from rig_on_wire import (
+    SHARED_WIRES,
+    WIRES,
+    after_each,
+    far_side,
+    layer,
+    on_two_amplifiers,
+    rig_on_wire,
+)
+from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 
@@ -95,6 +105,62 @@ def test_assign_wires_refuses_a_url_without_a_wire(url: str) -> None:
     assert url in str(problem.value)
 
 
+def test_choose_lines_prefers_a_name_to_all_and_keeps_a_line_whole() -> None:
+    """Amplifiers of one line have one kind, in whatever order the options come."""
+    wires = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
+    chosen = choose_lines(wires, ["b=ftdi", "native"])
+    assert [wire.line_kind for wire in chosen.values()] == ["ftdi", "ftdi", *["native"] * 4]
+    assert chosen["a"] == chosen["b"]
+    assert choose_lines(wires, []) == wires
+
+
+@pytest.mark.parametrize("option", ["ftdy", "z=ftdi", "a=", ""])
+def test_choose_lines_refuses_an_invalid_option(option: str) -> None:
+    """The error names the option as given."""
+    wires = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
+    with pytest.raises(InputError, match=f"--line {option}: "):
+        choose_lines(wires, [option])
+
+
+WAITS = {"/tmp/a": 125e-6, "/dev/ttyUSB0": 1e-3, "/dev/ttyACM0": 1e-3, "/dev/ttyS0": 0.0}
+"""Longest wait for a frame of USB on the way out, by the port of a URL [s] (USB 2.0, 4.4)."""
+READ_STATUS = encode_frame(Frame(MESSAGES["GetStatus"].number, ADDRESS, 1, b"", VERSION))
+
+
+async def delays_of_requests(port: str, rig: Rig) -> list[float]:
+    """How long each of 200 requests is on its way to the first amplifier of a rig [s], sorted."""
+    urls = {name: f"serial://{port}{n or ''}" for n, name in enumerate(rig.amplifiers)}
+    wires = assign_wires(urls, common=None, options=[], defaults=DEFAULTS)
+    arrived: list[float] = []
+    async with far_side(wires, rig) as far:
+        assert far.machine is not None
+        far.machine.passing = (0.0, 0.0)
+        after_each(far.device, lambda name, values, reply, now: arrived.append(now))
+        place = far.url.removeprefix("serial://").partition("?")[0]
+        open_port = await far.machine.open_port(place, lambda data: None, lambda why: None)
+        sent = []
+        for _ in range(200):
+            await asyncio.sleep(0.0207)
+            sent.append(clock.now())
+            open_port.write(READ_STATUS)
+        await asyncio.sleep(0.02)
+    return sorted(after - before for after, before in zip(arrived, sent, strict=True))
+
+
+@pytest.mark.parametrize("port", WAITS)
+@in_virtual_time
+async def test_line_of_several_amplifiers_delays_as_its_port_does(
+    port: str, coarse_rig: Rig
+) -> None:
+    """Requests to one of two wait for a frame of USB and for their bits, those to one alone not."""
+    late = await delays_of_requests(port, on_two_amplifiers(coarse_rig))
+    bits = 10 * 12 / 921_600  # a frame without words has 12 bytes
+    assert late[0] > bits
+    longest = late[-10] - bits  # of all that the operating system does not stall
+    assert 0.9 * WAITS[port] < longest < WAITS[port] + 100e-6
+    assert (await delays_of_requests(port, coarse_rig))[-1] < 1e-6
+
+
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
 
 
@@ -118,9 +184,9 @@ async def test_broadcast_commit_starts_all_at_one_moment(
         loop, exchange = asyncio.get_running_loop(), rig.bench.exchange
         assert isinstance(loop, VirtualLoop)
 
-        def exchange_slowly(name: str, *request: Any, now: float, is_broadcast: bool) -> Any:
+        def exchange_slowly(name: str, *request: Any, now: float) -> Any:
             loop.now += 0.002
-            return exchange(name, *request, now=now, is_broadcast=is_broadcast)
+            return exchange(name, *request, now=now)
 
         monkeypatch.setattr(rig.bench, "exchange", exchange_slowly)
         await rig.group.arm()

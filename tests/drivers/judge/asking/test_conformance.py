@@ -292,12 +292,10 @@ def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
 class _LongWatchdog(Amplifier):
     """An amplifier that takes a watchdog shorter than 120 ms as one of 1.5 s."""
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def handle(self, name: str, values: Values, now: float) -> Values:
         if name == "Arm" and values["watchdog"] < 120:
             values = {**values, "watchdog": 1500}
-        return super().handle(name, values, now, is_broadcast=is_broadcast)
+        return super().handle(name, values, now)
 
 
 def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(

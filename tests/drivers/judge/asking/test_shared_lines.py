@@ -31,12 +31,10 @@ class Neighbour(Amplifier):
         self.got: list[str] = []
         super().__init__(name, channels=2)
 
-    def handle(
-        self, name: str, values: Values, now: float, *, is_broadcast: bool = False
-    ) -> Values:
+    def handle(self, name: str, values: Values, now: float) -> Values:
         """Carry out a request, and note it."""
         self.got.append(name)
-        return super().handle(name, values, now, is_broadcast=is_broadcast)
+        return super().handle(name, values, now)
 
     def restart(self, now: float) -> None:
         """Begin anew, and note it."""

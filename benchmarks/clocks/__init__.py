@@ -1,0 +1,1 @@
+"""`python -m benchmarks.clocks`: how far apart the clocks of three amplifiers are, by lines."""

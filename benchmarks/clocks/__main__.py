@@ -1,0 +1,110 @@
+"""Print how far apart clocks, clicks and sets of three amplifiers are, for each kind of line.
+
+clocks: rms of one clock, from the differences of each two, over a second from 1 s, 30 s and 10 min
+after arming on; a finger rests from 0.5 s on. click: the longest of 40 from the first amplifier's
+start to the last one's. set: median from a touch until all play, of three amplifiers and of one.
+"""
+
+import argparse
+import asyncio
+import statistics
+from collections.abc import Sequence
+
+from benchmarks.clocks.session import NAMES, Lines3, Session, armed, run_virtual
+from registry import clock
+
+ARRANGEMENTS = {
+    "native UART, each its own": Lines3("serial", "native"),
+    "USB high speed, each its own": Lines3("serial", "usb-high-speed"),
+    "USB full speed, each its own": Lines3("serial", "usb-full-speed"),
+    "FTDI, 1 ms, each its own": Lines3("serial", "ftdi-low-latency"),
+    "FTDI, 16 ms, each its own": Lines3("serial", "ftdi"),
+    "Modbus TCP, each its own": Lines3("modbus-tcp", "ethernet"),
+    "CAN of the board, one bus": Lines3("socketcand", "can", is_bus=True),
+    "CAN by USB, one bus": Lines3("slcan", "can-usb", is_bus=True),
+    "USB high speed, one bus": Lines3("serial", "usb-high-speed", is_bus=True),
+    "USB full speed, one bus": Lines3("serial", "usb-full-speed", is_bus=True),
+    "Modbus RTU, USB high speed": Lines3("modbus-rtu", "usb-high-speed", is_bus=True),
+}
+_WINDOW, _STEP = 1.0, 0.05  # s
+_TAPS, _HELD, _APART = 40, 0.05, 0.25  # s
+
+
+async def skews(lines: Lines3, seed: int, moments: Sequence[float]) -> list[list[float]]:
+    """Return the differences of clocks [s] in a second from each moment after arming on."""
+    found = []
+    async with armed(lines, seed) as session:
+        begin = clock.now()
+        await asyncio.sleep(0.5)
+        for moment in moments:
+            session.touch((0.3, 0.4))
+            await asyncio.sleep(max(0.0, begin + moment - clock.now()))
+            differences: list[float] = []
+            while clock.now() < begin + moment + _WINDOW:
+                differences += session.differences()
+                await asyncio.sleep(_STEP)
+            found.append(differences)
+            session.touch()
+    return found
+
+
+async def taps(lines: Lines3, seed: int, names: tuple[str, ...]) -> list[tuple[float, float]]:
+    """Return for each tap how long after the first the last amplifier starts, and after the touch.
+
+    In seconds.
+    """
+    found = []
+    async with armed(lines, seed, names) as session:
+        await asyncio.sleep(5.0)
+        for number in range(_TAPS):
+            touched = session.touch((0.2 + 0.6 * number / _TAPS, 0.4))
+            await asyncio.sleep(_HELD)
+            if starts := _starts(session, touched):
+                found.append((max(starts) - min(starts), max(starts) - touched))
+            session.touch()
+            await asyncio.sleep(_APART)
+    return found
+
+
+def _starts(session: Session, since: float) -> list[float]:
+    """When each amplifier began to play what it plays [s]; none before a time."""
+    return [
+        min(begun)
+        for each in session.far.bench.amplifiers.values()
+        if (
+            begun := [
+                voice.transition.start
+                for voices in each.outputs
+                for voice in voices
+                if voice.transition.start >= since
+            ]
+        )
+    ]
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=4, help="runs of each arrangement")
+    parser.add_argument("--moments", type=float, nargs="*", default=[1.0, 30.0, 600.0])
+    parser.add_argument("--only", default="", help="arrangements with this in their name")
+    options = parser.parse_args()
+    heads = "".join(f"{moment:>7g} s" for moment in options.moments)
+    print(f"{'rms of one clock [us]':<30}{heads}{'click [us]':>12}{'set [ms]':>10}{'of one':>10}")
+    for name, lines in ARRANGEMENTS.items():
+        if options.only not in name:
+            continue
+        runs = [run_virtual(skews(lines, n, options.moments)) for n in range(options.seeds)]
+        row = ""
+        for window in zip(*runs, strict=True):
+            square = statistics.mean(each**2 for run in window for each in run)
+            row += f"{1e6 * (square / 2) ** 0.5:>9.1f}"
+        apart, late = zip(*run_virtual(taps(lines, 0, NAMES)), strict=True)
+        _, alone = zip(*run_virtual(taps(lines, 0, NAMES[:1])), strict=True)
+        row += f"{1e6 * max(apart):>12.1f}"
+        row += "".join(f"{1e3 * statistics.median(each):>10.2f}" for each in (late, alone))
+        print(f"{name:<30}{row}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""A host with three amplifiers on lines as they are, in virtual time: the daemon's own control loop.
+
+Crystals are 50 ppm off and warm up, as `draw_imperfections` has them.
+"""
+
+import asyncio
+import math
+import sys
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from controller.play.loop import Controller
+from controller.sources.touch import Touch, TouchFrame
+from drivers.opening import Lines
+from drivers.protocol.table import CLOCK_TURN
+from model.answer.timing import Timing
+from registry import clock
+from sim.far_ends.opening import Wire
+from sim.plant.imperfections import draw_imperfections
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+_rig_on_wire: Any = import_module("rig_on_wire")
+_small_table: Any = import_module("small_table").small_table
+_intents: Any = import_module("newest_contact").BuzzNewestContact
+_rig: Any = import_module("paper_plate").make_paper_rig
+run_virtual: Any = import_module("virtual_loop").run_virtual
+
+NAMES = ("west", "middle", "east")
+SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
+
+
+@dataclass(frozen=True)
+class Lines3:
+    """How three amplifiers are connected: wire and kind of line; is_bus: all on one line."""
+
+    wire: str
+    line_kind: str
+    is_bus: bool = False
+
+    def wires(self, names: tuple[str, ...], seed: int) -> Mapping[str, Wire]:
+        """The wires by amplifier."""
+        return {
+            name: Wire(
+                self.wire,
+                SPEEDS.get(self.wire),
+                shared=True,
+                line="" if self.is_bus else name,
+                line_kind=self.line_kind,
+                seed=seed,
+            )
+            for name in names
+        }
+
+
+@dataclass
+class Session:
+    """An armed host, and the far side of its lines."""
+
+    controller: Controller
+    far: Any
+
+    def touch(self, *places: tuple[float, float]) -> float:
+        """Report these fingers alone; returns the time [s]."""
+        touches = tuple(Touch(number, *place) for number, place in enumerate(places, start=1))
+        now = clock.now()
+        self.controller.cycle.deliver(TouchFrame("panel", now, touches))
+        return now
+
+    def differences(self) -> list[float]:
+        """Return by how much the clocks of each two amplifiers differ now [s]."""
+        now = clock.now()
+        shown = [each.clock.seconds(now) for each in self.far.bench.amplifiers.values()]
+        return [math.remainder(one - other, CLOCK_TURN) for one, other in combinations(shown, 2)]
+
+
+@asynccontextmanager
+async def armed(lines: Lines3, seed: int, names: tuple[str, ...] = NAMES) -> AsyncIterator[Session]:
+    """Open and arm a host."""
+    rig = _rig_on_wire.on_amplifiers(_rig(12, 9), names)
+    drawn = draw_imperfections(rig, seed=seed)
+    async with _rig_on_wire.far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
+        far.machine.passing = (0.0, 0.0)
+        controller = Controller(
+            rig,
+            _small_table(),
+            lines=Lines,
+            urls=far.urls,
+            intent_source=_intents(),
+            timing=Timing(_small_table()),
+        )
+        await controller.open()
+        running = asyncio.create_task(controller.cycle.run())
+        await controller.arm()
+        try:
+            yield Session(controller, far)
+        finally:
+            await controller.close()
+            await running

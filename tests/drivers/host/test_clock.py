@@ -1,0 +1,248 @@
+"""One clock as its host sees it: readings of a counter that is made by hand, in a time of its own."""
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from drivers.host.clock import HeldClock
+
+ARMED, OFF = 4, 1
+STEP = 20 / 65536  # s; of shift: the clock goes round in 20 s
+START = 1000.0  # s
+
+
+@dataclass
+class Counter:
+    """A clock that counts seconds on a crystal, and obeys shift and rate."""
+
+    crystal: float = 0.0
+    shown: float = 0.0  # s, at a time
+    at: float = START
+    rate: float = 0.0
+    is_deaf: bool = False
+
+    def go(self, time: float) -> None:
+        """Count to a time."""
+        self.shown += (time - self.at) * (1 + self.crystal) * (1 + self.rate)
+        self.at = time
+
+    @property
+    def word(self) -> int:
+        """What a Status shows."""
+        return int(self.shown % 20 / 20 * 2**32)
+
+    @property
+    def lead(self) -> float:
+        """By how much it is ahead of the host's clock [s], by less than half a turn."""
+        return math.remainder(self.shown - self.at, 20)
+
+
+@dataclass
+class Exchanges:
+    """Exchanges of a host with a counter; delay: draws how long a request takes beside its bits."""
+
+    counter: Counter
+    delay: Callable[[], float] = lambda: 0.0
+    bits: float = 0.0  # s; of a request
+    stated: int = 10  # clock_error, 0.1 us
+    now: float = START
+    state: int = OFF
+    lost: Callable[[], bool] = lambda: False
+    is_playing: bool = True
+    held: HeldClock = field(default_factory=HeldClock)
+    leads: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Identify it."""
+        self.held.stated = self.stated
+        self.held.is_alone = False
+
+    def send(self, name: str, **values: int) -> None:
+        """Send a request, and take the reply."""
+        counter, sent = self.counter, self.now
+        self.held.sent(name, values, sent, sent + self.bits)
+        if self.lost():
+            return
+        counter.go(sent + self.bits + self.delay())
+        if not counter.is_deaf:
+            if name == "Arm":
+                counter.shown += values["shift"] * STEP
+            elif name == "Ping" and self.state == ARMED:
+                counter.rate = values["rate"] * 1e-7
+        if name == "Arm":
+            self.state = ARMED
+        status = {"state": self.state, "clock": counter.word}
+        self.held.replied(name, values, status, counter.at + 2e-3, bits=1e-3)
+
+    def arm(self) -> int:
+        """Read it for a second, then arm; returns the shift."""
+        self.run(1.0)
+        self.send("Arm", shift=(shift := self.held.shift(self.now)))
+        return shift
+
+    def run(self, duration: float) -> None:
+        """Exchange for some time: Pings each 50 ms while armed, else statuses."""
+        for _ in range(round(duration / 0.05)):
+            self.now += 0.05
+            if self.state == ARMED:
+                rate = self.held.rate(self.now, is_playing=self.is_playing)
+                self.send("Ping", rate=rate)
+                self.leads.append(self.counter.lead)
+            else:
+                self.send("GetStatus")
+
+
+def frames(seed: int, frame: float) -> Callable[[], float]:
+    """Delays until the next frame of USB [s]."""
+    rng = random.Random(seed)
+    return lambda: rng.uniform(0.0, frame)
+
+
+def rms(values: list[float]) -> float:
+    """Root of the mean square."""
+    return math.sqrt(sum(each * each for each in values) / len(values))
+
+
+def test_shift_is_the_nearest_step_and_the_rate_undoes_the_crystal() -> None:
+    """3.2001 s ahead at 40 ppm: 10486 steps of 305.2 us back, then -400 in tenths of a ppm."""
+    talk = Exchanges(Counter(40e-6, shown=START + 3.2001 - 40e-6))
+    assert talk.arm() == 65536 - 10486
+    assert abs(talk.counter.lead) <= STEP / 2 + 1e-6
+    talk.run(10.0)
+    assert talk.counter.rate == pytest.approx(-40e-6, abs=0.5e-6)
+    assert abs(talk.counter.lead) < 2e-6
+
+
+@pytest.mark.parametrize(
+    ("frame", "bound"), [(125e-6, 10e-6), (1e-3, 60e-6)], ids=["high speed", "full speed"]
+)
+def test_frames_of_usb_only_add(frame: float, bound: float) -> None:
+    """Uniform delays: the lowest tell, not their mean of half a frame, and their error is said."""
+    leads, said = list[float](), list[float]()
+    for seed in range(8):
+        talk = Exchanges(Counter(-50e-6 + 14e-6 * seed, shown=START + seed), frames(seed, frame))
+        talk.arm()
+        talk.run(15.0)
+        leads += talk.leads[-100::10]
+        said.append(talk.held.error(talk.now))
+    assert rms(leads) < bound
+    assert 0.5 * rms(leads) < rms(said) < 4 * rms(leads)
+
+
+def test_lost_pings_make_it_swing_no_further() -> None:
+    """Every second Ping lost, in bursts: after 5 s it never again is 20 us off."""
+    rng = random.Random(3)
+    talk = Exchanges(Counter(50e-6), frames(1, 125e-6))
+    talk.arm()
+    talk.lost = lambda: rng.random() < 0.5
+    for is_playing in (False, True):
+        talk.is_playing = is_playing
+        talk.run(5.0)
+        talk.leads.clear()
+        talk.run(30.0)
+        assert max(map(abs, talk.leads)) < 20e-6
+
+
+def test_bits_of_a_request_are_no_lead() -> None:
+    """A request of 5 ms: the clock of its last bit is compared with that moment."""
+    talk = Exchanges(Counter(), bits=5e-3)
+    talk.arm()
+    talk.run(3.0)
+    assert abs(talk.counter.lead) < 2e-6
+
+
+def test_clock_goes_round_unnoticed() -> None:
+    """30 s at 30 ppm without an Arm, over the end of its 20 s: 900 us more, nothing is said."""
+    talk = Exchanges(Counter(30e-6, shown=START + 9.9995))
+    talk.run(1.0)
+    before = talk.held.lead(talk.now)
+    talk.run(30.0)
+    gained = math.remainder(talk.held.lead(talk.now) - before, 20)
+    assert gained == pytest.approx(900e-6, abs=5e-6)
+    assert talk.held.problem(talk.now) is None
+
+
+def jumps(counter: Counter) -> None:
+    counter.shown += 0.01
+
+
+def jumps_back(counter: Counter) -> None:
+    counter.shown -= 0.01
+
+
+def stands_still(counter: Counter) -> None:
+    counter.crystal = -1.0
+
+
+@pytest.mark.parametrize("fault", [jumps, jumps_back, stands_still])
+def test_clock_that_jumps_is_not_trusted(fault: Callable[[Counter], None]) -> None:
+    """Its error is infinite at once; after a single jump it is led back and trusted again."""
+    talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
+    talk.arm()
+    talk.run(5.0)
+    assert talk.held.error(talk.now) < 10e-6
+    fault(talk.counter)
+    talk.run(0.1)
+    assert talk.held.problem(talk.now) == "clock_jumped"
+    assert talk.held.error(talk.now) == math.inf
+    talk.is_playing = False
+    talk.run(15.0)
+    is_still = fault is stands_still
+    assert (talk.held.problem(talk.now) == "clock_jumped") is is_still
+    assert (abs(talk.counter.lead) < 10e-6) is not is_still
+
+
+def test_restart_is_no_jump() -> None:
+    """Disarmed with another clock, as after its supply was away: read anew, nothing is said."""
+    talk = Exchanges(Counter(20e-6))
+    talk.arm()
+    talk.run(5.0)
+    talk.state, talk.counter.shown, talk.counter.rate = OFF, 0.0, 0.0
+    talk.run(1.0)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=60e-6)
+
+
+@pytest.mark.parametrize(("crystal", "is_deaf"), [(400e-6, False), (-400e-6, False), (60e-6, True)])
+def test_clock_that_does_not_follow_has_the_error_that_it_has(
+    crystal: float, is_deaf: bool
+) -> None:
+    """A broken crystal, and one that ignores shift and rate: said within 6 s, its lead counts."""
+    talk = Exchanges(Counter(crystal, is_deaf=is_deaf), frames(1, 125e-6))
+    talk.arm()
+    talk.run(6.0)
+    for _ in range(20):
+        talk.run(0.5)
+        assert talk.held.problem(talk.now) is not None
+        assert talk.held.error(talk.now) >= 0.8 * abs(talk.counter.lead)
+
+
+def test_what_it_states_is_in_its_error() -> None:
+    """30 us at the most are 17.3 us rms; one of which nothing is known is not steered at all."""
+    stating = Exchanges(Counter(), stated=300)
+    stating.arm()
+    stating.run(5.0)
+    assert 30e-6 / math.sqrt(3) <= stating.held.error(stating.now) < 19e-6
+    unknown = Exchanges(Counter(40e-6, shown=3.0), stated=65535)
+    assert unknown.arm() == 0
+    unknown.run(5.0)
+    assert unknown.counter.rate == 0
+    assert unknown.held.error(unknown.now) == math.inf
+    assert unknown.held.problem(unknown.now) == "clock_not_steered"
+
+
+def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
+    """The reply to Arm is lost: its clock is read anew, whether it was shifted or not."""
+    for is_obeyed in (True, False):
+        talk = Exchanges(Counter(shown=START + 5.0))
+        talk.run(1.0)
+        shift = talk.held.shift(talk.now)
+        talk.lost = lambda: True
+        talk.send("Arm", shift=shift)
+        talk.lost = lambda: False
+        talk.counter.shown += is_obeyed * shift * STEP
+        talk.run(0.2)
+        assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)

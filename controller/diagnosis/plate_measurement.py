@@ -8,20 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from controller.diagnosis.interleaved_tones import Step, ToneSchedule, interleaved
-from controller.diagnosis.plate_sensors import (
-    PlateSensor,
-    plate_sensors,
-    start_together,
-)
+from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
 from controller.play.routing import Drive
 from drivers.errors import CommandError, CommandRefused
+from drivers.host.reports import CLOCK_SETTLING
 from drivers.host.sensors import Reading, measure_tones
 from drivers.opening import Lines
 from drivers.protocol.timing import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.choice import best_first, best_of
+from model.ensemble.delays import MAX_HELD
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.progress import Progress, unseen
@@ -36,6 +34,7 @@ HIGHEST = 10**-0.5
 """Highest level of every tone as a share of the highest allowed one, 10 dB below it."""
 
 _COMPARED = 2  # tones of a repeated step
+_AGREED = 5e-6  # s; of clocks: 0.5 degrees of 300 Hz
 _READINGS = 2  # of a step, where the first is disturbed or overloaded
 
 
@@ -84,8 +83,9 @@ class PlateSelfMeasurement:
                 _frequency_range(can.limits.frequencies, sensors.used),
                 is_quick=self._is_quick,
             )
-            started = clock.now()
             await self._player.group.arm()
+            await self._hold_clocks()
+            started = clock.now()
             heard, half, last = await self._all(tones, sensors.used)
             await self._player.silence()
             await self._wait(self._player.ramp)
@@ -100,6 +100,12 @@ class PlateSelfMeasurement:
             notes=sensors.unused,
             details={"settling_s": tones.settling, "window_s": tones.window},
         )
+
+    async def _hold_clocks(self) -> None:
+        """Wait until the clocks of the amplifiers agree, or as long as that takes at most."""
+        end = clock.now() + CLOCK_SETTLING
+        while clock.now() < end and max(self._player.group.clock_errors.values()) > _AGREED:
+            await self._wait(HEARTBEAT)
 
     async def _all(
         self, tones: ToneSchedule, sensors: Sequence[PlateSensor]
@@ -191,8 +197,8 @@ class PlateSelfMeasurement:
         readings: Mapping[str, Reading],
         sensors: Sequence[PlateSensor],
     ) -> _StepResponses:
-        """Responses to the tones that ERAs play, of sensors whose phases count from theirs."""
-        rig = self._rig
+        """Responses to the tones that ERAs play, of sensors whose clocks are held to theirs."""
+        rig, held = self._rig, self._clock_errors
         number = {era.name: n for n, era in enumerate(rig.eras)}
         played = np.full(len(rig.eras), np.nan)
         responses = np.full((len(sensors), len(rig.eras)), np.nan, dtype=complex)
@@ -200,13 +206,19 @@ class PlateSelfMeasurement:
             heard = sensor.accelerations(readings[sensor.amplifier], frequencies)
             for era, frequency, acceleration in zip(eras, frequencies, heard, strict=True):
                 played[number[era]] = frequency
-                plays_it = self._player.amplifiers[rig.wiring[era].amplifier]
-                if start_together(self._player.amplifiers[sensor.amplifier], plays_it):
+                both = sensor.amplifier, rig.wiring[era].amplifier
+                if both[0] == both[1] or max(held[name] for name in both) <= MAX_HELD:
                     command = plays[era]
                     base = command.level * rig.era(era).stroke
                     turned = np.exp(-1j * math.radians(command.phase))
                     responses[row, number[era]] = acceleration * turned / base
         return _StepResponses(played, responses)
+
+    @property
+    def _clock_errors(self) -> dict[str, float]:
+        """Errors of the clocks of several amplifiers with ERAs, by name, rms [s]."""
+        used, errors = self._rig.channel_counts, self._player.group.clock_errors
+        return {name: errors[name] for name in used} if len(used) > 1 else {}
 
     async def _wait(self, seconds: float) -> None:
         """Wait [s], feeding the watchdogs."""
@@ -234,6 +246,7 @@ class PlateSelfMeasurement:
         loudest, at_half = half
         return replace(
             measurement,
+            clock_errors=self._clock_errors,
             half_level=self._repeats(heard[loudest], at_half),
             at_end=self._repeats(heard[0], last),
         )

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -73,18 +72,15 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
     return PlateSensors(tuple(used), tuple(unused))
 
 
-def start_together(one: Amplifier, other: Amplifier) -> bool:
-    """Whether phases of two amplifiers count from one moment: that of a broadcast commit."""
-    return one.line is other.line
-
-
-def check_common_start(amplifiers: Mapping[str, Amplifier]) -> None:
-    """Raise CommandError unless all open amplifiers, by name, start together."""
-    for (name, one), (other_name, other) in pairwise(amplifiers.items()):
-        if not start_together(one, other):
+def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
+    """Raise CommandError unless all open amplifiers, by name, have one time."""
+    if len(amplifiers) < 2:
+        return
+    for name, each in amplifiers.items():
+        if not each.clock.can_be_steered:
             raise CommandError(
-                f"amplifiers {name} and {other_name} must start together to be measured while "
-                "they play, got separate wires; put them on one bus"
+                f"amplifier {name} must have a clock that can be steered to be measured beside "
+                "others while they play, got none; see its clock_error"
             )
 
 
@@ -101,15 +97,15 @@ def _of_amplifier(
         if derivatives is None:
             unused.append(f"sensor {name} measures {sensor.unit.lower()}")
         elif era:
-            place = Sensor(era, era)
+            place = Sensor(era, era, amplifier=amplifier)
             if any(each.place == place for each in used):
-                place = Sensor(name, era)
+                place = Sensor(name, era, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
         elif sensor.channel is not None:
             unused.append(f"sensor {name} is at channel {sensor.channel}, which has no ERA")
         elif sensor.x is None or sensor.y is None:
             unused.append(f"sensor {name} states no place")
         else:
-            place = Sensor(name, x=sensor.x, y=sensor.y)
+            place = Sensor(name, x=sensor.x, y=sensor.y, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
     return used, unused

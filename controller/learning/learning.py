@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from controller.api.schema import BAD, LearningState, LearningStatus
-from controller.diagnosis.plate_sensors import PlateSensor, check_common_start, plate_sensors
+from controller.diagnosis.plate_sensors import PlateSensor, check_clocks, plate_sensors
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator_process import (
     DEFAULT_TIMEOUTS,
@@ -159,7 +159,7 @@ class Learning:
         """Ask the amplifiers for their sensors until they tell; start an estimator if they have."""
         while True:
             try:
-                check_common_start(self._controller.amplifiers)
+                check_clocks(self._controller.amplifiers)
                 found = await plate_sensors(self._rig, self._controller.amplifiers)
             except CommandError as error:
                 self._say("off", str(error))

@@ -38,7 +38,7 @@ _logger = logging.getLogger(__name__)
 class SettledReadings:
     """Follows what the control loop reports, and reads it.
 
-    sensors: of amplifiers, by name, that start together; settling [s]: of the plate; take: receives
+    sensors: of amplifiers, by name, of one time; settling [s]: of the plate; take: receives
     each pattern with what was read of it, at the time [s] when the window ended; disturbed: called
     for each reading that a change, an overload or the link has spoilt.
     """

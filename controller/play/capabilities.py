@@ -1,7 +1,8 @@
 """Capabilities of the open amplifiers of a rig together, in the terms of the table.
 
-A set takes its onset and its ending with it, so a touch waits for them. The knots that the wires
-carry in time are arithmetic, done once when the amplifiers are open.
+A set takes its onset with it, so a touch waits for that; its ending follows in a set of its own,
+which takes no longer. The knots that the wires carry in time are arithmetic, done once when the
+amplifiers are open.
 """
 
 import math
@@ -28,7 +29,6 @@ _PHASE_STEP = QUANTITIES["phase_step"]
 _STEP = QUANTITIES["envelope_step"]
 _LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
 _PART_WORDS = 3  # of a message: session, token, part
-_LEAST_ONSET = 5  # knots that an ending must leave
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +133,9 @@ def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeS
     ]
     each = min(map(_knots_of, (amplifiers[name] for name in wired)), default=0)
     knots, onset, ending = max(min(carried, default=0), 0), ONSET_KNOTS - 1, ENDING_KNOTS - 1
-    if each < ending or knots < ending + _LEAST_ONSET:
+    if min(knots, each) < ending:
         ending = 0
-    return EnvelopeSupport(min(knots - ending, each, onset), ending)
+    return EnvelopeSupport(min(knots, each, onset), ending)
 
 
 def _knots_of(amplifier: Amplifier) -> int:
@@ -157,5 +157,5 @@ def _knots_in(words: int, channels: list[int]) -> int:
     """Return the knots of each channel for which a number of words suffices."""
     parts = -(-words // MAX_WORDS)
     heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
-    each = _COMMAND_WORDS + 2 * _ENVELOPE_WORDS
+    each = _COMMAND_WORDS + _ENVELOPE_WORDS
     return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))

@@ -284,6 +284,8 @@ class Cycle:
             until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
+            if self.planner is not None and now < (due := self.planner.layers.ending_due):
+                until = min(until, due)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

@@ -44,6 +44,8 @@ STRENGTH_FADE = 0.100
 _MIN_VALID_FOR = 2.0
 _MARGIN = 0.2  # s; after the contact is lifted, for late frames
 _MIN_LEFT = 0.001  # s; of a pulse that is about to end
+_SURELY_SETTLED = 0.005  # s; by which a set starts later than its last reply, and clocks differ
+_MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch would wait for it
 _VALID_FOR = QUANTITIES["valid_for"]
 
 Check = Callable[[Mapping[str, Sequence[Layer]]], CommandRefused | None]
@@ -56,16 +58,20 @@ _logger = logging.getLogger(__name__)
 class LayerContent:
     """A content in its layer.
 
-    layer: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
-    [s]: when its onset has ended. confirmed_until [s]: when its first target would have been
-    lifted, as known when it was sent; between renewal_due and renewable_until it is renewed if all
-    targets have been confirmed since. ends_at: when it has ended by itself unless it was renewed.
+    layer: with the ramp, onset and ending of its sets; drive: by ERA, as confirmed; settled_at
+    [s]: when its onset has ended. is_shaped: whether it may have an ending, which is sent at
+    ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its
+    first target would have been lifted, as known when it was sent; between renewal_due and
+    renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
+    ended by itself unless it was renewed.
     """
 
     content: Content
     layer: answer.Layer
     drive: Drive = field(default_factory=dict)
     settled_at: float = math.inf
+    is_shaped: bool = False
+    ending_due: float = math.inf
     confirmed_until: float = math.inf
     renewal_due: float = math.inf
     renewable_until: float = math.inf
@@ -84,13 +90,14 @@ class Sets:
     """What is sent to all amplifiers for one moment; nothing where there is neither.
 
     layers: those that change, by number; started: of these, those that play another content;
-    silence: ramp [s] along which all layers fall silent instead; settled_after [s]: when the last
-    ramp or onset has ended. skipped: contents that a ledger does not admit, for a reason; retry_at
-    [s]: when it may.
+    endings: of those that play on, which get an ending; silence: ramp [s] along which all layers
+    fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents
+    that a ledger does not admit, for a reason; retry_at [s]: when it may.
     """
 
     layers: Mapping[int, PlateLayer] = field(default_factory=dict)
     started: frozenset[int] = frozenset()
+    endings: Mapping[int, answer.Layer] = field(default_factory=dict)
     silence: float | None = None
     settled_after: float = 0.0
     skipped: Sequence[Content] = ()
@@ -131,10 +138,14 @@ class Layers:
         self.check, self._expiry_of = check, expiry_of
         self.builder = SetBuilder(rig, capabilities.envelope_support, capabilities.ramp_max, timing)
         """Makes the sets."""
+        has_endings = capabilities.envelope_support.ending_knots > 0
+        self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf
-        """When [s] the next content is to be renewed, or has ended by itself."""
+        """When [s] the next content is to be renewed, gets its ending, or has ended by itself."""
+        self.ending_due = math.inf
+        """When [s] the next content gets its ending."""
         self.may_play: frozenset[int] = frozenset()
         """Layers that may play, since all were silent."""
         self.is_silent = False
@@ -178,11 +189,36 @@ class Layers:
         self.is_silent, self._layer_of, self._fades_until = True, {}, now + FADED_AFTER
         return Sets(silence=ramp)
 
+    def endings(self, now: float) -> Sets:
+        """Return the sets that give endings to what plays, where that is due at a time [s].
+
+        By a set of its own, so that no touch waits for them. What a ledger refuses fades.
+        """
+        layers: dict[int, PlateLayer] = {}
+        endings: dict[int, answer.Layer] = {}
+        for number, one in self.contents.items():
+            if one.ending_due <= now:
+                content = one.content
+                layers[number], endings[number] = self.builder.build_ending(
+                    number,
+                    replace(content.layer, ramp=one.layer.ramp),
+                    content.placement,
+                    playing=self._drive_of(number),
+                    valid_for=self._lasts(content, _all_left(content, now), now),
+                )
+        sets = Sets(layers, endings=endings)
+        if layers and (refusal := self.check(sets.by_amplifier)) is not None:
+            self.not_renewed(sets, refusal)
+            return Sets()
+        return sets
+
     def renewal(self, now: float) -> Sets:
         """Return the sets that prolong what plays, where that is due at a time [s].
 
         What a ledger refuses for good ends by itself.
         """
+        if endings := self.endings(now):
+            return endings
         sets = {
             number: self.builder.build_renewal(
                 number,
@@ -202,7 +238,9 @@ class Layers:
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
         """Note that layers are not prolonged; one refused for good lets them end."""
-        for number in renewal.layers:
+        for number in renewal.endings:
+            self._change(number, ending_due=math.inf)
+        for number in renewal.layers.keys() - renewal.endings.keys():
             due = math.inf if refusal.until is None else refusal.until
             self._change(number, renewal_due=due)
 
@@ -222,7 +260,14 @@ class Layers:
             one, lasts = self.contents[number], _shortest(played, number)
             if number in sets.started:
                 drive = tones_by_era(played.layers, self._rig, number)
-                self._change(number, drive=drive, settled_at=now + one.settled_after)
+                settled_at = now + one.settled_after
+                due = settled_at + _SURELY_SETTLED
+                has_ending = one.is_shaped and due < now + lasts and self._may_follow
+                due = due if has_ending else math.inf
+                self._change(number, drive=drive, settled_at=settled_at, ending_due=due)
+            if number in sets.endings:
+                layer = replace(one.layer, ending=sets.endings[number].ending)
+                self._change(number, layer=layer, ending_due=math.inf)
             self._change(
                 number,
                 confirmed_until=self._confirmed_until(one.content),
@@ -330,10 +375,10 @@ class Layers:
                 restarts=number in restarting,
                 is_led=is_led,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
-                lasts=min(left, default=math.inf),
                 among=len(starting),
             )
-            playing[number] = LayerContent(content, played)
+            may_end = is_shaped and not content.targets[0][1].is_short
+            playing[number] = LayerContent(content, played, is_shaped=may_end)
             settled.append(playing[number].settled_after)
         for number in self.may_play - numbers.keys():
             has_endings = is_shaped and self._may_end_shaped(number, now)
@@ -370,9 +415,11 @@ class Layers:
         self._replace({**self.contents, number: replace(self.contents[number], **values)})
 
     def _replace(self, contents: Mapping[int, LayerContent]) -> None:
-        self.contents, self.due = contents, math.inf
+        self.contents, self.due, self.ending_due = contents, math.inf, math.inf
         for one in contents.values():
+            self.ending_due = min(self.ending_due, one.ending_due)
             self.due = min(self.due, one.renewal_due, one.ends_at if one.drive else math.inf)
+        self.due = min(self.due, self.ending_due)
 
     def _confirmed_until(self, content: Content) -> float:
         """Return when [s] the first target of a content is lifted unless a frame arrives."""

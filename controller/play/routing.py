@@ -23,8 +23,7 @@ from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.transients.base_motion import KNOT_STEP, BaseEnvelope, Envelopes
-from model.transients.knots import ONSET_KNOTS
+from model.transients.base_motion import BaseEnvelope, Envelopes
 from model.vibration import excitation as physics
 
 Drive = Mapping[str, Tone]
@@ -56,21 +55,21 @@ class SetBuilder:
         layer: answer.Layer,
         is_continued: bool,
         *,
-        is_ended: bool = True,
+        adds_ending: bool = True,
     ) -> answer.Layer:
         """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
 
-        is_continued: whether it needs no onset; is_ended: whether it may have an ending.
+        is_continued: whether it needs no onset; adds_ending: whether the ending is added, too.
         """
         has_onset = self.support.onset_knots > 0 and not is_continued
-        has_ending = self.support.ending_knots > 0 and is_ended
+        has_ending = self.support.ending_knots > 0
         layer = replace(
             layer,
             onset=layer.onset if has_onset else None,
             ending=layer.ending if has_ending else None,
         )
         adds_onset = has_onset and layer.onset is None
-        adds_ending = has_ending and layer.ending is None
+        adds_ending = adds_ending and has_ending and layer.ending is None
         if not (adds_onset or adds_ending):
             return layer
         return self.timing.with_envelopes(layer, placement, onset=adds_onset, ending=adds_ending)
@@ -86,7 +85,6 @@ class SetBuilder:
         restarts: bool = False,
         is_led: bool = False,
         is_shaped: bool = True,
-        lasts: float = math.inf,
         among: int = 1,
     ) -> tuple[PlateLayer, answer.Layer]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
@@ -94,19 +92,17 @@ class SetBuilder:
         playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
         it restarts; nor does one that is led along its ramp, though an ERA joins it.
         valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
-        onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
-        among: layers that change at once, which share the time on the wires.
+        onset; its ending follows (`build_ending`). among: layers that change at once, which share
+        the time on the wires.
         """
         tones, ramp = layer.excitation, min(layer.ramp, self.ramp_max)
-        onset = ending = None
+        onset = None
         restarted = restarted_by(tones, {} if restarts else playing)
         if is_shaped:
             is_continued = is_led or not restarted.issuperset(
                 [tone.frequency for tone in tones.values()]
             )
-            is_ended = lasts > KNOT_STEP * ONSET_KNOTS
-            layer = self.shape(placement, layer, is_continued, is_ended=is_ended)
-            onset, ending = layer.onset, layer.ending
+            onset = self.shape(placement, layer, is_continued, adds_ending=False).onset
             if onset:
                 onset = thinned(onset, knots=max(1, self.support.onset_knots // among))
         layers = route(
@@ -118,10 +114,35 @@ class SetBuilder:
             restarted=restarted,
             valid_for=valid_for,
             onset=onset,
-            ending=ending,
         )
         ramp = next(iter(layers.values())).ramp
-        return layers, replace(layer, ramp=ramp, onset=onset, ending=ending)
+        return layers, replace(layer, ramp=ramp, onset=onset, ending=None)
+
+    def build_ending(
+        self,
+        number: int,
+        layer: answer.Layer,
+        placement: Placement,
+        *,
+        playing: Drive,
+        valid_for: float,
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Build the set that gives an ending to a pattern, which plays on as it is.
+
+        playing: what each ERA plays now in this layer; valid_for [s]: as of a pattern.
+        """
+        layer = self.shape(placement, layer, is_continued=True)
+        layers = route(
+            layer.excitation,
+            self.rig,
+            ramp=layer.ramp,
+            number=number,
+            playing=playing,
+            restarted=frozenset(),
+            valid_for=valid_for,
+            ending=layer.ending,
+        )
+        return layers, layer
 
     def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
         """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""

@@ -18,8 +18,8 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 _RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
 _PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_SILENT = 0.2, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
-_COMMON = 0.2  # of an error, between clocks that were read by the same Marks
+_SILENT = 0.25, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
+_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
 _SLACK = 50e-6  # s; what is computed of bits and read of clocks, at the most
@@ -42,6 +42,7 @@ class HeldClock:
         self._rate = 0
         self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
         self._mark: tuple[float, float] | None = None
+        self._pinged: float | None = None  # when the first Ping without reply arrives
         self._arming = 0  # the shift of an Arm without a reply
         self._is_armed = False
         self._jumped_at = -math.inf
@@ -66,17 +67,17 @@ class HeldClock:
         lead = self._fit.lead(time) + self._added_until(time)
         return math.remainder(lead, CLOCK_TURN)
 
-    def error(self, time: float, *, is_common: bool = False) -> float:
+    def error(self, time: float, *, common: float | None = None) -> float:
         """Return its error [s rms] against the host's, with what it states; infinite if unknown.
 
-        While armed with what is still to be led to zero. is_common: against those of others whose
-        readings have the same errors.
+        While armed with what is still to be led to zero. common: against those of others whose
+        readings have the same errors, the lead [s] that all of them have.
         """
         if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
             return math.inf
-        lead = self.lead(time) if self._is_armed else 0.0
+        lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
         stated = _ERROR.from_wire(self.stated) / math.sqrt(3)
-        seen = self._fit.error(time) * (_COMMON if is_common else 1.0)
+        seen = self._fit.error(time) * (1.0 if common is None else _COMMON)
         return math.hypot(stated, seen, lead)
 
     def scatter(self, time: float) -> float:
@@ -106,7 +107,9 @@ class HeldClock:
             return self._rate
         within, most = _PLAYING if is_playing else _SILENT
         crystal = min(max(self._fit.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        rate = min(max(-self.lead(time) / within, -most), most) - crystal
+        lead = self.lead(time)
+        lead /= 1 + (self._fit.error(time) / max(abs(lead), 1e-9)) ** 2  # of what is seen well
+        rate = min(max(-lead / within, -most), most) - crystal
         return round(rate * _RATE.per_unit)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
@@ -117,6 +120,8 @@ class HeldClock:
         self._request = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
+        elif name == "Ping" and self._pinged is None:
+            self._pinged = arrives
 
     def replied(
         self, name: str, values: Values, status: Values, received: float, *, bits: float
@@ -136,13 +141,16 @@ class HeldClock:
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
         was_armed, self._is_armed = self._is_armed, is_armed
+        # Whether a Ping without reply was heard is not known before that to the next one.
+        is_kept &= self._pinged is None or name == "Ping"
         if is_kept or not self._fit:
             bounds = time - sent, received - time
             self._read(status["clock"], time, bounds, is_told=is_armed and was_armed)
-        if name == "Ping" and is_armed:
-            self._run(values["rate"])
+        if name == "Ping" and is_armed:  # of several attempts any may have been the first heard
+            self._run(values["rate"], ((self._pinged or arrives) + arrives) / 2)
         elif not is_armed:
-            self._run(0)
+            self._run(0, arrives)
+        self._pinged = None
         self._watch(time)
 
     def _read(self, clock: int, time: float, bounds: tuple[float, float], *, is_told: bool) -> None:
@@ -171,11 +179,10 @@ class HeldClock:
     def _added_until(self, time: float) -> float:
         return self._added + self._rate / _RATE.per_unit * (time - self._added_at)
 
-    def _run(self, rate: int) -> None:
-        """Note that it runs by a rate since the last request came."""
+    def _run(self, rate: int, since: float) -> None:
+        """Note that it runs by a rate since a time."""
         if rate != self._rate:
-            arrives = self._request[1]
-            self._added, self._added_at = self._added_until(arrives), arrives
+            self._added, self._added_at = self._added_until(since), since
             self._rate = rate
 
     def _watch(self, time: float) -> None:

@@ -113,10 +113,10 @@ class ClockFit:
         self._rate_error = _LIKELY_RATE
         if (span := -points[0][0]) > 0:
             seen = _SLOPE * (self._end + _LEAST) / span
-            trust = _LIKELY_RATE**2 / (_LIKELY_RATE**2 + seen**2)
-            slope = trust * slope
             if count >= 2 * _FEW:
-                self._rate_error = math.sqrt(trust) * seen
+                self._rate_error = seen
+            else:  # what is likely of crystals counts, too
+                slope *= _LIKELY_RATE**2 / (_LIKELY_RATE**2 + seen**2)
         self._rate, self._lead = slope, min([lead - slope * time for time, lead in points])
 
 

@@ -52,7 +52,7 @@ class Clocks:
         errors: dict[str, float] = {}
         for name, each in amplifiers.items():
             now = each.line.time()
-            shown = each.clock.error(now, is_common=self._is_common(each.line, now))
+            shown = each.clock.error(now, common=self._common(each.line, now))
             errors[name] = shown if is_alike else math.hypot(shown, each.clock.shortest / 2)
         return errors
 
@@ -95,10 +95,13 @@ class Clocks:
             if is_free and each.silence_cause is None and each.line.loss is None:
                 self._readings[each] = each.read_status(Priority.READING)
 
-    def _is_common(self, line: Line, now: float) -> bool:
-        """Whether what delays readings of a line delays those of all amplifiers alike."""
-        is_only = all(each.line is line for each in self._amplifiers.values())
-        return is_only and now - self._marked_from.get(line, math.inf) > WINDOW
+    def _common(self, line: Line, now: float) -> float | None:
+        """Return the mean lead [s] where the readings of all have the same delays; else None."""
+        clocks = [each.clock for each in self._amplifiers.values() if each.line is line]
+        is_only = len(clocks) == len(self._amplifiers)
+        if not is_only or now - self._marked_from.get(line, math.inf) <= WINDOW:
+            return None
+        return sum([each.lead(now) for each in clocks]) / len(clocks)
 
 
 def _has_marks(of_line: Sequence[Amplifier]) -> bool:

@@ -31,10 +31,27 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_of, word_at
+from drivers.protocol.clock import moment_of, word_passed
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_last, is_newer_token, pack_layers, parts
-from drivers.protocol.table import ENABLED, EVENT_RECORD, MESSAGES, QUANTITIES, STATUS
+from drivers.protocol.sets import (
+    PART_WORDS,
+    LayerSet,
+    is_last,
+    is_newer_token,
+    pack_layers,
+    parts,
+)
+from drivers.protocol.table import (
+    COMMAND,
+    ENABLED,
+    ENVELOPE,
+    EVENT_RECORD,
+    KNOT,
+    LAYER,
+    MESSAGES,
+    QUANTITIES,
+    STATUS,
+)
 from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
@@ -211,6 +228,8 @@ class Dialogue:
         """
         attempts = ATTEMPTS * len(self.line.members)
         delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
+        if (words := _words_of(layers)) > PART_WORDS:  # parts of all of the line, and those again
+            delay += 2 * len(self.line.members) * self.line.wire.transit(words)
         admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
@@ -224,7 +243,7 @@ class Dialogue:
         stop or disarm came first, CommandRefused where it is too late for what the ledger has
         admitted.
         """
-        at = word_at(self._time()) if at is None else at  # which has passed when it arrives
+        at = word_passed(self._time()) if at is None else at  # which has passed when it arrives
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
@@ -273,7 +292,8 @@ class Dialogue:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        self.clock.sent(name, values, now, arrives)
+        # What was sent before may be lost: it may arrive as soon as its own bits have passed.
+        self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
         feeding = self.feeding
@@ -299,7 +319,7 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                self.played_at = now
+                self.played_at = arrives if is_now else now  # behind the other parts
                 starts = None if is_now else moment_of(values["at"], now)
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
@@ -425,3 +445,15 @@ class Dialogue:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
+
+
+def _words_of(layers: Sequence[Layer]) -> int:
+    """Return how many words the stream of layers has."""
+    words = 0
+    for layer in layers:
+        words += LAYER.words + COMMAND.words * len(layer.tones)
+        for tone in layer.tones:
+            for shape in (tone.onset, tone.ending):
+                if shape is not None:
+                    words += ENVELOPE.words + KNOT.words * len(shape.knots)
+    return words

@@ -20,7 +20,7 @@ from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_at, word_behind
+from drivers.protocol.clock import word_behind, word_passed
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
@@ -150,7 +150,7 @@ class JointSets:
         by_line: dict[Line, list[Amplifier]] = {}
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
-        token, at = self.token, word_at(clock.now())  # at once
+        token, at = self.token, word_passed(clock.now())  # at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
             at = word_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))

@@ -32,7 +32,7 @@ from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_START_ERROR = 0.001  # s; of a moment at which a set starts
+_START_ERROR = 0.003  # s; of a moment at which a set starts, by a clock that is hardly steered
 _STEPS = 2  # of levels, by which a status may differ
 _MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, relative to a weak level

@@ -159,9 +159,9 @@ class UncertainPlayback:
         for ways in groups.values():
             amplitudes = [_reached(way, (start + end) / 2) for way in ways]
             radius = sum(radius_of(way, start, end) for way in ways)
-            level, most = abs(sum(amplitudes)), sum(map(abs, amplitudes))
+            level, added = abs(sum(amplitudes)), sum(map(abs, amplitudes))
             lowest += max(level - radius, 0.0)
-            highest += (level if is_exact else most) + radius
+            highest += (level if is_exact else added) + radius
         for at, way, until in self._ghosts:
             if at == channel and until > start:
                 extra += abs(_reached(way, start - way.half)) + way.radius

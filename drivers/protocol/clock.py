@@ -12,6 +12,7 @@ HIGH_WORDS = SPAN // HIGH_STEPS
 HIGH_TIME = CLOCK_TURN / HIGH_WORDS
 """Seconds of a step of the high word."""
 _PER_SECOND = SPAN / CLOCK_TURN
+_PASSED = 0.25  # s
 
 
 def clock_at(seconds: float) -> int:
@@ -24,9 +25,12 @@ def ahead(clock: int, of: int) -> float:
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
 
 
-def word_at(seconds: float) -> int:
-    """Return the high word that a clock of `clock_at` shows at a time [s]."""
-    return high_word(clock_at(seconds))
+def word_passed(seconds: float) -> int:
+    """Return a high word that is no moment ahead at a time [s], by a clock near `clock_at`.
+
+    A quarter of a second behind: before it is steered, a clock may be some steps behind.
+    """
+    return high_word(clock_at(seconds - _PASSED))
 
 
 def word_behind(seconds: float) -> int:

@@ -16,10 +16,9 @@ enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 // Real time [us], of another clock than the converter's: it ends watchdog and vibrations even where
 // no samples are taken.
 uint64_t board_microseconds(void);
-// Samples that are due since the last call, by the clock of the converter. Read together with them:
-// by how much the next one will come out later than now, in 2^-16 of a sample; at most 2^16 of one
-// that is made when it is due, less what the converter's timer has counted, and more by what lies in
-// a buffer before it. The host steers the clock by it, so it must not be biased.
+// Samples that are due since the last call, by the clock of the converter. ahead, read together with
+// them and unbiased: by how much the next one will come out later than now, in 2^-16 of a sample: of
+// one, less what the converter's timer has counted, and what lies in a buffer before it.
 uint32_t board_samples_due(int32_t *ahead);
 // Hand the next sample of every channel to the converter; 32767 is full level.
 void board_output(const int16_t samples[CHANNELS_MAX]);

@@ -91,12 +91,6 @@ const struct voice *channel_voice(const struct channel *channel, uint8_t layer)
     return NULL;
 }
 
-void channel_stop_silent(struct channel *channel)
-{
-    for (unsigned i = 0; i < VOICES_KEPT; i++)
-        voice_stop_if_silent(&channel->voices[i]);
-}
-
 bool channel_is_silent(const struct channel *channel)
 {
     for (unsigned i = 0; i < VOICES_KEPT; i++)

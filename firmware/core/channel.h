@@ -26,9 +26,6 @@ void channel_silence(struct channel *channel, uint16_t ramp, uint64_t sample);
 // The voice that a layer plays and that has not ended, or null.
 const struct voice *channel_voice(const struct channel *channel, uint8_t layer);
 
-// Stop the voices that have fallen silent with the last sample.
-void channel_stop_silent(struct channel *channel);
-
 bool channel_is_silent(const struct channel *channel);
 
 // Present level: the largest amplitude of the sum.

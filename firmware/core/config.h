@@ -57,8 +57,7 @@
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-// Of a reading, beyond what all amplifiers of the product share: board_samples_due knows microseconds.
-#define CLOCK_ERROR 10 // 0.1 us
+#define CLOCK_ERROR 10 // 0.1 us; board_samples_due knows microseconds
 
 #define FAULTS_KEPT 16
 

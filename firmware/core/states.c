@@ -193,8 +193,6 @@ void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
     amplifier->sample++;
     amplifier->clock += amplifier->step;
     layers_sample(amplifier);
-    for (unsigned i = 0; i < CHANNELS; i++)
-        channel_stop_silent(&amplifier->channels[i]);
     settle(amplifier);
     if (timer_sample(&amplifier->intake.life))
         intake_drop(&amplifier->intake);

@@ -46,7 +46,7 @@ static struct complex target(const struct voice *voice, uint8_t knot)
     return amplitude_of(voice->path.knot[knot].level, voice->path.knot[knot].phase);
 }
 
-void voice_stop_if_silent(struct voice *voice)
+static void stop_if_silent(struct voice *voice)
 {
     if (voice->stride == 0 && voice->level == 0)
         voice->is_playing = false;
@@ -67,7 +67,7 @@ static void send(struct voice *voice, const struct envelope *shape, uint16_t ram
     voice->stride = stride_of(shape != NULL ? shape->step : 10u * ramp);
     voice->to = target(voice, 0);
     voice->next = 1;
-    voice_stop_if_silent(voice);
+    stop_if_silent(voice);
 }
 
 void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number)
@@ -131,6 +131,7 @@ static void move_on(struct voice *voice)
         return;
     if (voice->next > voice->path.knots) { // the end of the last line
         voice->stride = 0;
+        stop_if_silent(voice);
         return;
     }
     voice->from = voice->to;

@@ -45,10 +45,6 @@ void voice_fade(struct voice *voice, uint16_t ramp, uint64_t sample);
 // Let it fall silent along its ending, or along a ramp [ms] without one.
 void voice_end(struct voice *voice, uint16_t ramp, uint64_t sample);
 
-// Stop it where it stands at level 0. At the end of its way that is left to the caller, since a set that
-// waited for that end may continue it.
-void voice_stop_if_silent(struct voice *voice);
-
 // Samples until it stands still.
 uint32_t voice_samples_left(const struct voice *voice);
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
@@ -62,7 +63,8 @@ def choose_by_numpy(
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
     if contents.drive_mode == UNRESTRICTED:
-        kept = ranked(fingers, contents) if contents.is_ranked and not any(ringing) else rows
+        is_ranked = contents.is_ranked and not any(ringing) and not table.clocks.groups
+        kept = ranked(fingers, contents) if is_ranked else rows
         found, is_limited = _candidates(fingers, contents, kept, ringing)
         if len(kept) < len(rows) and (not found.drives or is_limited):
             found, is_limited = _candidates(fingers, contents, rows, ringing)
@@ -118,7 +120,10 @@ def _candidates(
     rows: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Candidates, bool]:
-    """The best tones of each content in each band, and whether a level was hard to reach."""
+    """The best tones of each content in each band, and whether a level was hard to reach.
+
+    Of all ERAs together, or of each group whose clocks are held together.
+    """
     count, hertz = len(contents.streams), fingers.table.frequencies
     formed = fingers.forms(rows, with_fine=None in ringing)
     apart_hz = contents.apart_hz if count > 1 else 0.0
@@ -135,17 +140,26 @@ def _candidates(
                 short = _short_candidates(asked, here, stream.targets, others, over)
                 found += [(number, band, score, drive) for score, drive in short]
                 continue
-            searched, forms = search_to_level(asked)
-            is_limited |= len(searched.level_limited) > 0 or forms is not asked
-            ways = [searched]
-            if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
-                ways.append(search(here.by_point(forms, others)))
-            for way in ways:
-                for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
-                    drive = [(int(here.rows[each]), way.weights[each])]
-                    found.append((number, band, float(way.score[each]), drive))
+            groups = [asked.among(each) for each in _groups(fingers.table)]
+            searches = [(each, *search_to_level(each)) for each in groups]
+            reaching = [each for each in searches if each[2] is each[0]]
+            for own, searched, forms in reaching or searches:
+                is_limited |= len(searched.level_limited) > 0 or forms is not own
+                ways = [searched]
+                if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
+                    ways.append(search(here.by_point(forms, others)))
+                for way in ways:
+                    for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
+                        drive = [(int(here.rows[each]), way.weights[each])]
+                        found.append((number, band, float(way.score[each]), drive))
     streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
+    """Which ERAs may play one content together (n,), for each group of them."""
+    groups = np.array(table.clocks.groups or [0] * len(table.eras))
+    return [groups == each for each in np.unique(groups)]
 
 
 def _short_candidates(
@@ -161,8 +175,10 @@ def _short_candidates(
     for a vibration that lasts.
     """
     count = MAX_DURING_EFFECT if others else MAX_ALONE
-    found, _ = search_to_level(_forms_over(steady, formed, targets, others, over))
-    best = _drives_of(found, formed.rows, best_first(found.score)[:count])
+    forms, best = _forms_over(steady, formed, targets, others, over), []
+    for is_driven in _groups(formed.fingers.table):
+        found, _ = search_to_level(forms.among(is_driven))
+        best += _drives_of(found, formed.rows, best_first(found.score)[:count])
     if not others:
         return best
     rows = np.unique([row for _, ((row, _),) in best])
@@ -170,7 +186,10 @@ def _short_candidates(
     during = forms_of(
         steady.at(some), formed.at(some), targets, others, responses.fields(), responses.count
     )
-    return best + _drives_of(search_all(during), rows, np.arange(len(rows)))
+    for is_driven in _groups(formed.fingers.table):
+        found = search_all(during.among(is_driven))
+        best += _drives_of(found, rows, np.arange(len(rows)))
+    return best
 
 
 def _forms_over(

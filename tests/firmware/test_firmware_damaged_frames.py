@@ -117,4 +117,4 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
         assert (status["watchdog_left"] > 0) <= is_armed
         latch, clock = status["latch"], status["clock"]
         tokens.add(status["token"])
-    assert len(tokens) > COUNT / 500  # sets were played
+    assert len(tokens) > COUNT / 1000  # sets were played; on CAN each is dozens of frames

@@ -130,7 +130,7 @@ def _expect_turned(
     expect_within(apart + by, by - slack, by + slack, what)
 
 
-async def _turn(subject: Subject, request: Values) -> None:
+async def _lead(subject: Subject, request: Values) -> None:
     """Play each channel at 0 and at 90 degrees: where it is loudest, the second tone leads."""
     (tone,), slack = request["frequencies"], _ANGLE + subject.can["phase_step"]
     for channel in subject.channels:
@@ -173,7 +173,7 @@ async def readings(subject: Subject) -> None:
             expect_within(other["amplitude"], 0, _LEAK * loud, "amplitude of a silent tone")
     for first, second in pairwise(tones):
         _expect_turned(first, second, 0, "phase against that read before")
-    await _turn(subject, _request(15, tone))
+    await _lead(subject, _request(15, tone))
     began = await _start(subject, _request(121, tone))
     await subject.play(full)
     for frequencies in ([_LOW], [tone, tone], [tone, tone + 1]):

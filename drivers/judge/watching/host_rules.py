@@ -18,7 +18,7 @@ _OTHER_HOST = 2.0  # s; for which a host that hears another one sends nothing th
 _ATTEMPTS = 3  # of a request that has no reply
 _REPEATED = 0.1  # s; within which a stop that is not confirmed goes on, for each amplifier
 CONFIRMED = 0.3  # s; then the host says that it is not
-_READINGS = ("GetSensors", "Measure", "GetReading", "GetMeasured")
+_READINGS = ("GetStatus", "GetSensors", "Measure", "GetReading", "GetMeasured")
 SILENCING = ("Stop", "Disarm", "Silence")
 
 
@@ -61,12 +61,11 @@ class HostRules:
         """Check that no reply is pending that a request must wait for.
 
         preempted_by: number of the last request before which others may lose their replies. A
-        reading gives way, and the status of an amplifier that has left a request without a reply.
+        reading gives way: a status, too, by which a clock is read.
         """
-        mute = {each.address for each in pending if each.is_overdue}
         for each in pending:
             name = each.name
-            is_reading = name in _READINGS or (name == "GetStatus" and each.address in mute)
+            is_reading = name in _READINGS
             waits = request.started_at - each.started_at
             is_preempted = each.number < preempted_by
             # The host counts from its write: the bytes may have waited in a transport since.

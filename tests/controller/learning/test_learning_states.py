@@ -109,7 +109,7 @@ def estimators(monkeypatch: pytest.MonkeyPatch) -> Estimators:
     monkeypatch.setattr(module, "EstimatorProcess", found)
     monkeypatch.setattr(module, "SettledReadings", Readings)
     monkeypatch.setattr(module, "plate_sensors", sensors)
-    monkeypatch.setattr(module, "check_common_start", lambda amplifiers: None)
+    monkeypatch.setattr(module, "check_clocks", lambda amplifiers: None)
     return found
 
 

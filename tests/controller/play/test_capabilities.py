@@ -117,15 +117,15 @@ def test_capabilities_are_the_tightest_limits() -> None:
     ("words", "is_shared", "expected"),
     [
         (10_000, False, (20, 7)),
-        (25 + 4 * 27, False, (20, 7)),
-        (25 + 4 * 26, False, (19, 7)),
-        (22 + 4 * 12, False, (5, 7)),
-        (22 + 4 * 11, False, (11, 0)),
-        (22 + 4 * 1, False, (1, 0)),
-        (22 + 3, False, (0, 0)),
+        (18 + 4 * 20, False, (20, 7)),
+        (18 + 4 * 19, False, (19, 7)),
+        (18 + 4 * 7, False, (7, 7)),
+        (18 + 4 * 6, False, (6, 0)),
+        (18 + 4 * 1, False, (1, 0)),
+        (18 + 3, False, (0, 0)),
         (0, False, (0, 0)),
-        (36 + 6 * 12, True, (5, 7)),
-        (36 + 6 * 11, True, (11, 0)),
+        (30 + 6 * 7, True, (7, 7)),
+        (30 + 6 * 6, True, (6, 0)),
     ],
 )
 def test_envelopes_have_as_many_knots_as_wires_carry(
@@ -133,8 +133,8 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
 ) -> None:
     """So many words in 10 ms, on a wire for each amplifier, or on one for both.
 
-    By hand: two channels on the left have 22 words of heads, 3 more beyond 120 words, and 4 words
-    for each knot; with the third channel 36 and 6. An ending has 7 knots, an onset at least 5.
+    By hand: two channels on the left have 18 words of heads, and 4 words for each knot; with the
+    third channel 30 and 6. An ending has 7 knots, in a set of its own.
     """
     lines = [Line(Wire(0.010 / (words + 0.5))) for _ in range(2)]
     left, right = (Opened(lines[0 if is_shared else number]) for number in range(2))
@@ -148,7 +148,7 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
         ({"knots": 6}, (6, 0)),
         ({"knots": 0}, (0, 0)),
         ({"envelope_step_min": 100}, (0, 0)),
-        ({"set_words": 22 + 4 * 20}, (13, 7)),
+        ({"set_words": 18 + 4 * 13}, (13, 7)),
     ],
 )
 def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[int, int]) -> None:

@@ -1,6 +1,7 @@
 """Several fingers, each with a content of its own, on the plate in virtual time."""
 
 import asyncio
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from controller.play.planner import ENDED
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
+from drivers.protocol.sets import LayerSet
 from model.answer import answer
 from model.arrays import Complex64Array
 from model.errors import InputError
@@ -41,6 +43,16 @@ def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.
     """Let every answer of the thread take a time [s]; returns the running loop."""
     answers_take(monkeypatch, seconds)
     return asyncio.get_running_loop()
+
+
+def begun(committed: Sequence[tuple[float, int, tuple[LayerSet, ...]]]) -> list[Sequence[LayerSet]]:
+    """The sets that change what plays: neither renewals nor endings."""
+    sets = list[Sequence[LayerSet]]()
+    for _, _, layers in committed:
+        endings = [command.ending for one in layers for command in one.commands]
+        if not (layers[0].renew or any(endings)):
+            sets.append(layers)
+    return sets
 
 
 @in_virtual_time
@@ -66,7 +78,7 @@ async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() ->
         count = len(fingers.committed)
         fingers.at[3] = ABOVE
         await fingers.hold(0.5)
-        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        (sent,) = begun(fingers.committed[count:])
         assert sorted(one.layer for one in sent) == [0, 1, 2]
         after = {number: one.content for number, one in fingers.applied[-1].contents.items()}
         for number, content in before.items():
@@ -86,7 +98,7 @@ async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> 
         count = len(fingers.committed)
         del fingers.at[1]
         await fingers.hold(0.5)
-        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        (sent,) = begun(fingers.committed[count:])
         (one,) = sent
         assert one.layer != other
         assert not any(command.level for command in one.commands)
@@ -255,7 +267,7 @@ async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
         count = len(fingers.committed)
         fingers.play("tick")
         await fingers.hold(0.4)
-        changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
+        changed = begun(fingers.committed[count:])
         assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2
         after = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
         assert after == contents

@@ -95,7 +95,7 @@ def levels_of(envelope: object) -> list[float]:
 async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
     """Knots of the driven ERA in strokes; the last one is the level of the command.
 
-    By hand: lines from 0 to level 0.2 at 90 degrees, 105 ms long, and down in 40 ms.
+    By hand: lines from 0 to level 0.2 at 90 degrees, 105 ms long. No touch waits for an ending.
     """
     async with set_running(knots=32, timing=shapes) as chain:
         begin = asyncio.get_running_loop().time()
@@ -108,16 +108,38 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
             [FULL * number / 21 for number in range(1, 21)],
             abs=0.5e-4,  # the wire has steps of 1e-4
         )
-        assert levels_of(driven.ending) == pytest.approx(
-            [FULL * (1 - number / 8) for number in range(1, 8)]
-        )
+        assert driven.ending is None
         assert isinstance(driven.onset, Envelope)
         assert (driven.onset.step, {phase for _, phase in driven.onset.knots}) == (50, {9000})
         assert level(chain) == pytest.approx(FULL / 2, abs=1e-4)
         (applied,) = chain.applied
         assert applied.layer.onset is not None
-        assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
+        assert (applied.time, applied.from_rest) == (pytest.approx(begin, abs=0.003), True)
         assert applied.transient_contrast_db == 30.0
+
+
+@in_virtual_time
+async def test_ending_follows_and_changes_nothing_that_plays(shapes: Shapes) -> None:
+    """Once the onset is over, within 10 ms: the level stays at 0.2 to its step meanwhile.
+
+    By hand: a line down in 40 ms, of eight steps of which the last is silence.
+    """
+    async with set_running(knots=32, timing=shapes) as chain:
+        begin = asyncio.get_running_loop().time()
+        chain.put(FINGER, OTHER)
+        await chain.leave(ONSET + 0.002, FINGER, OTHER)
+        assert len(sets(chain)) == 1
+        for _ in range(12):
+            assert level(chain) == pytest.approx(FULL, abs=1e-4)
+            await asyncio.sleep(0.001)
+        _, follows = sets(chain)
+        assert ONSET < follows.time - begin < ONSET + 0.012
+        driven, *silent = follows.layer.commands
+        assert (driven.level, driven.keep_phase, driven.onset) == (2000, True, None)
+        assert levels_of(driven.ending) == pytest.approx(
+            [FULL * (1 - number / 8) for number in range(1, 8)]
+        )
+        assert not any(each.ending or each.level for each in silent)
 
 
 @in_virtual_time
@@ -163,10 +185,10 @@ async def test_continued_tone_has_no_onset(shapes: Shapes) -> None:
     async with set_running(knots=32, timing=shapes) as chain:
         await chain.hold(0.2, down=[FINGER, OTHER])
         await chain.hold(0.2, down=[(1, 0.18, 0.1), OTHER])
-        first, moved = (each.layer.commands[0] for each in sets(chain))
+        first, _, moved, follows = (each.layer.commands[0] for each in sets(chain))
         assert (first.keep_phase, moved.keep_phase) == (False, True)
         assert moved.onset is None
-        assert len(levels_of(moved.ending)) == 7
+        assert len(levels_of(follows.ending)) == 7
         _, reported = chain.applied
         assert reported.layer.onset is None
         assert reported.transient_contrast_db is None

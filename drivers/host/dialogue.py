@@ -31,7 +31,7 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_of, word_passed
+from drivers.protocol.clock import HIGH_TIME, moment_of, word_passed
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -42,6 +42,7 @@ from drivers.protocol.sets import (
     parts,
 )
 from drivers.protocol.table import (
+    AHEAD_MAX,
     COMMAND,
     ENABLED,
     ENVELOPE,
@@ -65,6 +66,7 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
+_KEEPS = 0.01  # s; largest error of a clock by which a set starts when its commit says
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
 _UNCHECKED: tuple[Sequence[Layer] | None, float, float, _Checked] = (None, -math.inf, 0.0, ((), []))
@@ -108,6 +110,7 @@ class Dialogue:
         """When [s] a status had a report last."""
         self.played_at = -math.inf
         """When [s] a set or silence was sent last."""
+        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -239,13 +242,20 @@ class Dialogue:
     def commit(self, token: int, at: int | None = None) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
 
-        at: high word of the clock when it starts, None for at once. Or raises Preempted where a
-        stop or disarm came first, CommandRefused where it is too late for what the ledger has
-        admitted.
+        at: high word of the clock when it starts, None for at once, as where its clock is not held.
+        Or raises Preempted where a stop or disarm came first, CommandRefused where it is too late
+        for what the ledger has admitted.
         """
-        at = word_passed(self._time()) if at is None else at  # which has passed when it arrives
+        if at is None or not self.keeps_moments:
+            now = self._time()
+            at = word_passed(now + self.clock.lead(now))  # on its own clock
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
+
+    @property
+    def keeps_moments(self) -> bool:
+        """Whether its clock is held, so that a set starts at the moment that its commit names."""
+        return self.clock.error(self._time()) <= _KEEPS
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -320,7 +330,8 @@ class Dialogue:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
                 self.played_at = arrives if is_now else now  # behind the other parts
-                starts = None if is_now else moment_of(values["at"], now)
+                starts = moment_of(values["at"], now) if not is_now and self.keeps_moments else None
+                self._may_wait_until = -math.inf if is_now else now + AHEAD_MAX * HIGH_TIME
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
@@ -369,7 +380,10 @@ class Dialogue:
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
-        problem = problem or ledger.problem_of(reply, sent_at, now)
+        plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
+        # By a clock that is not held a set may wait, whatever its commit says.
+        if plays_wrong and (sent_at >= self._may_wait_until or self.keeps_moments):
+            problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:
                 self._contradictions, self._contradicted_at = 0, -math.inf

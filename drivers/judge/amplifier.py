@@ -10,16 +10,15 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TypeAlias
 
+from drivers.judge.clock import ExpectedClock
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import TONE, Problem, achieved_problem
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from drivers.protocol.table import (
-    AHEAD_MAX,
     ENABLED,
     FAULTS,
     LATCHED,
@@ -50,7 +49,6 @@ _ONLY_IN = {
 _NEVER: Interval = (-math.inf, math.inf)
 _NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
 """Refusals of a part by what it does not hold."""
-_MAX_AHEAD = AHEAD_MAX * HIGH_TIME  # s
 _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
 """A committed set: its moment, token and layers, and whether it plays to the word."""
 
@@ -95,9 +93,9 @@ class ExpectedAmplifier:
         self.watchdog, self.fed, self.silent = math.inf, _NEVER, _NEVER
         self.is_shown = True
         self.sets = ExpectedSet()
+        self.clock = ExpectedClock(self.report, self.slack)
         self._waiting: _Waiting | None = None
-        self._clock: tuple[int, Interval] | None = None  # that was read last, and when
-        self._marked: Interval | None = None  # when a Mark came that no status has shown
+        self._started = -math.inf  # by when a set that has waited has surely started
         self._faults: deque[tuple[int, Interval]] = deque(maxlen=2)  # the newest first, and when
         self._settle(cause)
         self.outputs.forget()
@@ -129,11 +127,6 @@ class ExpectedAmplifier:
         playback = self.outputs.playback.copied()
         playback.commit(layers, token, sum(when) / 2)
         return playback
-
-    @property
-    def present(self) -> int:
-        """The high word of the clock that was read last, which names no moment ahead."""
-        return high_word(self._clock[0]) if self._clock is not None else 0
 
     @property
     def is_enabled(self) -> bool:
@@ -177,6 +170,8 @@ class ExpectedAmplifier:
     ) -> None:
         self.state = state
         self.sets.drop()
+        if self.may_start(when):  # so that what falls silent is unknown
+            self.outputs.forget()
         self._waiting = None
         self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
 
@@ -243,7 +238,7 @@ class ExpectedAmplifier:
                 self._start_waiting(values["token"], when)
                 self._play(values["token"], when)
             case "Mark":
-                self._marked = when
+                self.clock.mark(when)
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
         """Leave a stop or a fault, once all is silent, where its cause is gone."""
@@ -302,27 +297,13 @@ class ExpectedAmplifier:
             what = f"set {token} that is committed"
             self.report("token", when[1], what, must="staged", seen=seen)
         self._start_waiting(token, when)
-        moment = self._moment(commit["at"], when)
+        moment = self.clock.moment(commit["at"], when)
         layers = self.sets.whole(token)
-        if layers is None or moment == when:
+        if layers is None or moment is None:
             self._play(token, when)
             return
         self._waiting, self.token = (moment, token, layers, self.sets.is_exact), token
         self.sets.drop()
-
-    def _moment(self, at: int, when: Interval) -> Interval:
-        """Return between which times a set starts whose commit is carried out between two."""
-        if self._clock is None:
-            return when[0], when[1] + _MAX_AHEAD
-        clock, read = self._clock
-        left = ahead(at * HIGH_STEPS, clock)
-        drift = DRIFT * (when[1] - read[0] + _MAX_AHEAD)
-        early, late = read[0] + left - drift, read[1] + left + drift
-        if early > when[1] and late <= when[0] + _MAX_AHEAD:
-            return early, late
-        if late <= when[0] or early > when[1] + _MAX_AHEAD:
-            return when
-        return when[0], max(when[1], late)
 
     def _start_waiting(self, token: int, when: Interval) -> None:
         """Play the set that waits, before another that is played between two times."""
@@ -335,7 +316,7 @@ class ExpectedAmplifier:
         self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
     ) -> None:
         """Have the set that waited play from some time between two on."""
-        self._waiting = None
+        self._waiting, self._started = None, when[1]
         self.outputs.play(layers, token, when, is_exact=is_exact)
 
     def _play(self, token: int, when: Interval) -> None:
@@ -370,29 +351,17 @@ class ExpectedAmplifier:
         if not (low <= left <= max(high, 0.0) or is_unknown):
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
-        self._note_clock(shown["clock"], when)
+        self.clock.check(shown["clock"], when)
         if not self.may_start(when):
             self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
 
     def may_start(self, when: Interval) -> bool:
-        """Whether a set that waits may have started by the end of an interval."""
-        return self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
-
-    def _note_clock(self, clock: int, when: Interval) -> None:
-        """Note the clock that a status shows, or compare it with that of a Mark before it."""
-        marked, self._marked = self._marked, None
-        if marked is None:
-            self._clock = clock, when
-        elif self._clock is not None:
-            known, read = self._clock
-            slack = self.slack + DRIFT * (marked[1] - read[0])
-            low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
-            passed = ahead(clock, known)
-            if not low <= passed <= high:
-                what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
-                self.report("clock", when[1], what, must=must, seen=passed)
+        """Whether a set that waits, or has waited, may start within an interval."""
+        if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
+            return True
+        return when[0] <= self._started + self.slack
 
     def note_state(self, shown: Values, when: Interval) -> bool:
         """Compare state, fault and latch, and go on with them; returns whether the state fits."""

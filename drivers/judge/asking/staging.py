@@ -92,7 +92,7 @@ async def starts_at_its_moment(subject: Subject) -> None:
     ahead, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
     for duration in (ahead, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
-    present = subject.shown.present
+    present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
     await subject.in_time(partial(_starts, subject, ahead, shift=over_the_end))
 

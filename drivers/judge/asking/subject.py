@@ -162,11 +162,11 @@ class Subject(Material):
 
     def moment(self, duration: float) -> int:
         """Return the high word of its clock that comes a time [s] after its last status."""
-        return round(self.shown.present + duration / HIGH_TIME) % HIGH_WORDS
+        return round(self.shown.clock.present + duration / HIGH_TIME) % HIGH_WORDS
 
     def filled(self, values: Values) -> Values:
         """Return values with those that a request has unless others are given."""
-        present = self.expected.present if self.expected is not None else 0
+        present = self.expected.clock.present if self.expected is not None else 0
         return {"session": self.session, "rate": 0, "shift": 0, "at": present, **values}
 
     def _parts_came(self, latest: float) -> float:

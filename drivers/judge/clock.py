@@ -1,4 +1,4 @@
-"""The clock of an amplifier as its statuses and Marks show it, and the moments that commits name."""
+"""The clock of an amplifier as statuses and Marks show it, and the moments that commits name."""
 
 from drivers.judge.outputs import DRIFT, Report
 from drivers.playing.uncertain import Interval

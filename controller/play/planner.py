@@ -201,13 +201,13 @@ class Planner:
     def confirm(self, sets: Sets, played: Played, *, now: float) -> None:
         """Note what the amplifiers play of sets by now [s].
 
-        Pulses start when the last commit was sent.
+        Pulses start where the last amplifier does.
         """
         for pulse in self._pulses(sets.started):
             if pulse.started_at is None:
-                if played.sent_at > pulse.end:
+                if played.starts_at > pulse.end:
                     self._too_late(1)
-                pulse.started_at = played.sent_at
+                pulse.started_at = played.starts_at
                 self._intent_due = min(self._intent_due, pulse.end)
         self.layers.confirm(sets, played, now)
 

@@ -12,9 +12,9 @@ from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.errors import CommandRefused, DriverError, Preempted
+from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged
+from drivers.host.dialogue import IsPreempted, Staged
 from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
@@ -38,12 +38,12 @@ _COMMIT_WORDS = MESSAGES["Commit"].request.words
 class Played:
     """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
 
-    sent_at [s]: when the last commit went out.
+    starts_at [s]: at the soonest, the last of them.
     """
 
     token: int
     layers: Mapping[str, tuple[LayerSet, ...]]
-    sent_at: float
+    starts_at: float
 
 
 class JointSets:
@@ -69,10 +69,13 @@ class JointSets:
                 refusals[name] = refusal
         return _merged(refusals) if refusals else None
 
-    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
+    async def play(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
+    ) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
+        Overtaken where it is preempted before that.
         """
         before = self._members.epoch
         if self.token % INTERVAL == 0:
@@ -86,7 +89,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                staging.append(each.stage(token, layers[each.name], now=is_now))
+                requested = layers[each.name]
+                staging.append(each.stage(token, requested, now=is_now, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -101,7 +105,12 @@ class JointSets:
         if refusals and not has_failed:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
-        staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        try:
+            staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        except Overtaken as overtaken:
+            return overtaken
+        if is_preempted is not None and not is_now and is_preempted():
+            return Overtaken(f"set {token} is preempted")
         if not is_now:
             self._members.check_none_since(before)
             self.is_incomplete = True
@@ -114,15 +123,15 @@ class JointSets:
         self.is_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
-        sent_at = -math.inf
+        starts_at = -math.inf
         for each, one in staged.items():
-            played[each.name], sent_at = one.layers, max(sent_at, each.played_at)
+            played[each.name], starts_at = one.layers, max(starts_at, each.played_at)
             if not one.is_exact:
                 reading[each.name] = _achieved(each, one)
         if reading:
             achieved = await self._members.all([*reading.values()])
             played.update(zip(reading, achieved, strict=True))
-        return Played(token, played, sent_at)
+        return Played(token, played, starts_at)
 
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float

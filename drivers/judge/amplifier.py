@@ -15,7 +15,7 @@ from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_o
 from drivers.judge.sets import ExpectedSet
 from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import TONE, Problem, achieved_problem
+from drivers.protocol.achieved import FLAGS, TONE, Problem, achieved_problem
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from drivers.protocol.table import (
@@ -493,6 +493,10 @@ class ExpectedAmplifier:
                 can_scale=outputs.may_derate or not outputs.is_exact,
             )
             lasting = outputs.lasting.get(number, {0}) if reply["commands"] else {0}
+            rows = reply, *reply["commands"]
+            flags = [name for row in rows for name in FLAGS if row.get(name)]
+            if problem is None and flags:
+                problem = "plays", "flags", [], flags
             if problem is None and reply["valid_for"] not in lasting:
                 problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
             if problem is None and reply["ramp"] and not reply["commands"]:

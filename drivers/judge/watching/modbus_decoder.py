@@ -56,7 +56,7 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _Transaction:
-    """One whose response is missing; request: None for no request; tag: of what it reads."""
+    """One whose response is missing; request: None where it is none; tag: of what it reads."""
 
     adu: Adu
     key: Hashable

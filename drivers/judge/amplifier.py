@@ -154,7 +154,7 @@ class ExpectedAmplifier:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._play_waiting(*self._waiting)
+            self._start_waiting()
 
     def _trip(self, fault: int, since: Interval, cause: str) -> None:
         self.fault = fault
@@ -235,7 +235,6 @@ class ExpectedAmplifier:
             case "Commit":
                 self._commit(values, when)
             case "Set" if values["now"]:
-                self._start_waiting(values["token"], when)
                 self._play(values["token"], when)
             case "Mark":
                 self.clock.mark(when)
@@ -271,7 +270,6 @@ class ExpectedAmplifier:
             seen = reply["missing"], reply["staged"], reply["played"]
             self._expect("commit", end, what, known, seen)
         if reply["played"]:
-            self._start_waiting(token, when)
             self._play(token, when)
 
     def part_came(self, part: Values, when: Interval) -> None:
@@ -296,38 +294,29 @@ class ExpectedAmplifier:
             seen = f"until {until:.4f} s" if until > -math.inf else "not staged"
             what = f"set {token} that is committed"
             self.report("token", when[1], what, must="staged", seen=seen)
-        self._start_waiting(token, when)
-        moment = self.clock.moment(commit["at"], when)
-        layers = self.sets.whole(token)
-        if layers is None or moment is None:
-            self._play(token, when)
-            return
-        self._waiting, self.token = (moment, token, layers, self.sets.is_exact), token
-        self.sets.drop()
+        self._play(token, when, self.clock.moment(commit["at"], when))
 
-    def _start_waiting(self, token: int, when: Interval) -> None:
-        """Play the set that waits, before another that is played between two times."""
-        if self._waiting is not None and token != self.token:
-            (early, late), waiting, layers, is_exact = self._waiting
-            sooner = min(early, when[0]), min(late, when[1])
-            self._play_waiting(sooner, waiting, layers, is_exact)
+    def _start_waiting(self, sooner: Interval = (math.inf, math.inf)) -> None:
+        """Start the set that waits at its moment, or sooner before another one."""
+        if self._waiting is not None:
+            (early, late), token, layers, is_exact = self._waiting
+            when = min(early, sooner[0]), min(late, sooner[1])
+            self._waiting, self._started = None, when[1]
+            self.outputs.play(layers, token, when, is_exact=is_exact)
 
-    def _play_waiting(
-        self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
-    ) -> None:
-        """Have the set that waited play from some time between two on."""
-        self._waiting, self._started = None, when[1]
-        self.outputs.play(layers, token, when, is_exact=is_exact)
-
-    def _play(self, token: int, when: Interval) -> None:
-        """Play a set between two times, unless it is the one that plays."""
+    def _play(self, token: int, when: Interval, moment: Interval | None = None) -> None:
+        """Play a set between two times or from a moment on, unless it is the one that plays."""
         if token == self.token:
             return
+        self._start_waiting(when)
         layers, self.token = self.sets.whole(token), token
         if layers is None:
             self.outputs.forget()
             return
-        self.outputs.play(layers, token, when, is_exact=self.sets.is_exact)
+        if moment is None:
+            self.outputs.play(layers, token, when, is_exact=self.sets.is_exact)
+        else:
+            self._waiting = moment, token, layers, self.sets.is_exact
         self.sets.drop()
 
     # What it shows

@@ -26,7 +26,7 @@ WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
 _PARTS, _SHORTEST, _LONGEST = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
-_RECENT = 8  # readings, all far above: what delayed those before has ended, or it was moved
+_RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _FEW = 2  # below which the time of an exchange bounds the error
 _ERRORS = 2.0  # the lowest of some readings depend on each other: by simulation
 _LIKELY_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
@@ -35,8 +35,8 @@ _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.1, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
-_UNKNOWN = 200e-6  # s; an error above which nothing is led to zero
-_UNSETTLED = 20e-6, 2.0  # s, and errors: what must be led to zero
+_UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
+_NEAR = 20e-6  # s; or its error: what is led to zero
 _COMMON = 0.1  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -66,7 +66,7 @@ class HeldClock:
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self.marked_from = math.inf
-        """Since when [s] only readings of a Mark count, whose delay all on a line have in common."""
+        """Since when [s] only readings of a Mark count, whose delay all on a line share."""
         self._rate = 0
         self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
         self._mark: tuple[float, float] | None = None
@@ -105,7 +105,7 @@ class HeldClock:
         While armed with what is still to be led to zero. common: against those of others whose
         readings have the same errors, the lead [s] that all of them have.
         """
-        if not self.can_be_steered or self.problem(time) == "clock_jumped":
+        if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
         seen = self.scatter(time) * (1.0 if common is None else _COMMON)
@@ -130,11 +130,11 @@ class HeldClock:
         """Return the rate of a Ping that is sent at a time [s]."""
         if not self.can_be_steered or time - self._jumped_at < CLOCK_SETTLING:
             return self._rate
-        lead, (least, errors) = self.lead(time), _UNSETTLED
-        is_near = abs(lead) <= max(least, errors * self._line.error)
-        if is_near and self._line.error <= _UNKNOWN:
+        lead, error = self.lead(time), self._line.error
+        if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
             self._near_at = time
-        within, most = _GENTLE if is_playing or is_near else _FAST
+        is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
+        within, most = _GENTLE if is_gentle else _FAST
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
         return round((min(max(-lead / within, -most), most) - crystal) * _PER_RATE)
 
@@ -211,11 +211,6 @@ class HeldClock:
             while span > WINDOW:
                 del lowest[0]
                 span = time - lowest[0][0]
-            line, recent = self._line, lowest[-_RECENT:]
-            if len(recent) == _RECENT and all(
-                lead > line.lead + line.rate * (at - line.time) + far for at, lead in recent
-            ):
-                del lowest[:-_RECENT]
         lowest.append((time, lead + off))
         self._fit(time)
 
@@ -255,7 +250,12 @@ class HeldClock:
         error = _ERRORS * math.sqrt(scatter * known)
         if count <= _FEW:
             error = max(error, self._least_delay / math.sqrt(12))
-        self._line = _Line(time, lead, rate, bend, error, rate_error)
+        off = math.inf
+        for at, low in lowest[-_RECENT:]:
+            off = min(off, low + (rate - bend * (time - at)) * (time - at) - lead)
+        if off > _FAR + _FAR_ERRORS * error:
+            del lowest[:-_RECENT]
+        self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
 
     def _unsteered(self, time: float) -> float:
         line = self._line

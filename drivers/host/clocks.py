@@ -45,11 +45,12 @@ class Clocks:
         every = self._amplifiers
         if len(every) == 1:
             return dict.fromkeys(every, 0.0)
-        lines, now = {each.line for each in every.values()}, next(iter(every.values())).line.time()
-        common = None
-        if len(lines) == 1 and all(now - each.clock.marked_from > WINDOW for each in every.values()):
-            common = sum([each.clock.lead(now) for each in every.values()]) / len(every)
-        is_alike = len({_kind(each) for each in every.values()}) == 1
+        amplifiers, common = [*every.values()], None
+        now = amplifiers[0].line.time()
+        marked_from = max([each.clock.marked_from for each in amplifiers])
+        if len({each.line for each in amplifiers}) == 1 and now - marked_from > WINDOW:
+            common = sum([each.clock.lead(now) for each in amplifiers]) / len(amplifiers)
+        is_alike = len({_kind(each) for each in amplifiers}) == 1
         errors: dict[str, float] = {}
         for name, each in every.items():
             unknown = 0.0 if is_alike else each.clock.shortest / 2

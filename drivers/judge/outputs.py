@@ -14,7 +14,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, has_flag
 
-_LATE = 0.002  # s; by which a set may begin later
+LATE = 0.002  # s; by which a set may begin later
 DRIFT = 1e-3
 """Of a time; of the amplifier's clock."""
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
@@ -91,7 +91,7 @@ class ExpectedOutputs:
 
         It is unclear where something ends or starts by itself just then.
         """
-        begins = when[0], when[1] + _LATE
+        begins = when[0], when[1] + LATE
         if self._unclear is not None and self._plays.is_ambiguous(begins, layers, ramp):
             self._unclear("a request came as a layer ended by itself, or its onset")
         return begins

@@ -7,6 +7,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 
 TONE = "frequency", "level", "phase"
+FLAGS = "after", "renew", "keep_phase", "skip_ending", "onset", "ending"
+"""Of layers and commands, which a GetAchieved does not have."""
 Problem: TypeAlias = tuple[str, str, object, object]
 """A rule that is broken: what must be what, and what was seen."""
 _TURN = 36_000  # of the wire; phases are modulo this

@@ -22,6 +22,7 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.achieved import FLAGS
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, unpack_layers
 from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
@@ -306,7 +307,6 @@ async def _left(
     return None
 
 
-_FLAGS = "after", "renew", "keep_phase", "skip_ending", "onset", "ending"
 _TONE = ("frequency", "{:g} Hz"), ("level", "{:g}"), ("phase", "at {:g} degrees")
 
 
@@ -327,7 +327,7 @@ def in_words(parts: Sequence[Sequence[int]]) -> str:
 
 def _flags(one: LayerSet | Command) -> str:
     """Return what is set of a layer or a command; an envelope with its step and knots."""
-    found = [(name, value) for name in _FLAGS if (value := getattr(one, name, None))]
+    found = [(name, value) for name in FLAGS if (value := getattr(one, name, None))]
     return "".join(f" {name}" if value is True else f" {name} {value}" for name, value in found)
 
 

@@ -159,7 +159,8 @@ class Client(ABC):
     heard: messages that no request was waiting for, but Events; order: all, as they came.
     reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
     in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
-    request and a reply by their words; transit: of the longest reply. session: that was begun last.
+    request and a reply by their words; transit: of the longest reply; pace: how much of that it
+    really takes, at most, as on a terminal without bits. session: that was begun last.
     loss: why the line was lost. came: bytes of the amplifier since the last request.
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
@@ -190,7 +191,7 @@ class Client(ABC):
         self.order: list[Heard] = []
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
-        self.transit = 0.0
+        self.transit, self.pace = 0.0, 1.0
         self.timeout = REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()

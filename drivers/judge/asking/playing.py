@@ -9,13 +9,16 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require, require_in_time
 from drivers.judge.asking.material import Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.table import SHORTENED_FADE
 from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
+_LONG = 2.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
+_BIT_15 = 1 << 15  # ms
 
 
 @driving(_SETS)
@@ -47,6 +50,7 @@ def valid_for(subject: Subject) -> Rows:
         [subject.one(valid_for=short)],
         [subject.one(ramp=ramp, valid_for=subject.lasting(150))],
         [several, partial(subject.follow, 2 * pause), half, subject.one(level=0.5), pause],
+        [subject.one(valid_for=_BIT_15 + short), 2 * pause],
     ]
 
 
@@ -85,6 +89,48 @@ def after(subject: Subject) -> Rows:
     ]
 
 
+@driving(_SETS)
+def after_the_last_onset(subject: Subject) -> Rows:
+    """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
+    long, short = subject.long_onset, subject.envelope(0.02, 0.5)
+    last = len(subject.channels) - 1
+    both = [subject.tone(0, 0.5, onset=long), subject.tone(last, 0.5, onset=short)]
+    waiting = layer(0, subject.tone(last, 0.25), after=True, ramp=20)
+    rising = subject.one(level=0.5, ramp=subject.ramp)
+    unshaped = subject.one(subject.tone(0, 0.5, onset=replace(subject.envelope(0.1), knots=())))
+    other = layer(1, subject.beside(1, 0.5))
+    shaped = replace(other, commands=(replace(other.commands[0], onset=long),))
+    return [
+        # A channel that is not named falls silent with what waited.
+        (layer(0, *both[: last + 1]), waiting),
+        (layer(0, *reversed(both[: last + 1])), waiting),
+        (play(subject.one(level=0.5), shaped), waiting),
+        (rising, waiting),
+        (unshaped, waiting),
+    ]
+
+
+@driving(_SETS)
+def what_waits_for_an_onset(subject: Subject) -> Rows:
+    """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
+    long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(120)
+    half = subject.one(subject.tone(0, 0.5, onset=long))
+    other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
+    kept = layer(0, subject.tone(0, 0.25, keep=True, onset=short), after=True)
+    timed = layer(0, subject.tone(0, 0.25), after=True, ramp=20, valid_for=lasts)
+    beside = layer(1, subject.beside(1, 0.25), after=True)
+    ends = replace(half, valid_for=subject.lasting(60), ramp=20)
+    renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
+    return [
+        (half, timed),
+        *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
+        (half, other, timed, beside),
+        (play(half, other), play(timed, beside)),
+        (ends, timed, 0.25 * subject.slowness),
+        (replace(half, valid_for=subject.lasting(900)), timed, renewed),
+    ]
+
+
 @driving(_PLACE)
 def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
@@ -117,7 +163,18 @@ def kept_phase(subject: Subject) -> Rows:
             (1, 180, subject.other),
         )
     ]
-    return [(subject.one(), layer(0, tone, ramp=subject.ramp)) for tone in tones]
+    ramp, amid = subject.ramp, 0.4 * subject.ramp / 1000
+    knots = min(1, subject.can["knots"])
+    ending = subject.envelope(0.1, *[0.75] * knots)
+    again = layer(0, subject.tone(0, 0.5, keep=True), ramp=ramp)
+    shaped = subject.tone(0, 0.5, keep=True, onset=subject.envelope(0.1, *[0.25] * knots))
+    return [
+        *((subject.one(), layer(0, tone, ramp=ramp)) for tone in tones),
+        # Nothing goes on that is of another layer, or has been released.
+        (subject.one(level=0.5), layer(1, shaped)),
+        (subject.one(level=0.5), layer(0, ramp=ramp), amid, again),
+        (subject.one(subject.tone(0, 0.5, ending=ending)), layer(0), 0.02, again),
+    ]
 
 
 @driving(_PLACE)
@@ -161,10 +218,13 @@ def endings_amid(subject: Subject) -> Rows:
     knots = math.ceil(subject.slowness)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
+    over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]
     towards_0 = subject.tone(0, 0.0, onset=onset)  # a voice counts until its onset has ended
     long = min(500, subject.can["ramp_max"])
     return [
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
+        (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
+        (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
         (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, layer(0, ramp=long)),
     ]
@@ -196,6 +256,20 @@ async def phases(subject: Subject) -> None:
     for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 1.75), (180.0, 0.5)):
         time = periods * 20 / max(subject.lowest, _SLOW)
         await subject.in_time(partial(_expect_alike, subject, phase, time))
+    await subject.in_time(partial(_expect_cancelled, subject))
+
+
+async def _expect_cancelled(subject: Subject) -> None:
+    """Play the opposite of a tone of seconds before, amid which the clock has gone round."""
+    await subject.status()
+    left = HIGH_WORDS - subject.shown.clock.present - round(_LONG / 2 / HIGH_TIME)
+    await subject.arm(shift=left % HIGH_WORDS)
+    subject.shown.outputs.interferes = True
+    halves = (subject.tone(0, 0.5, each, frequency=subject.near(1) | 1) for each in (0.0, 180.0))
+    for number, tone in enumerate(halves):
+        await subject.play(layer(number, tone))
+        await subject.pause(_LONG * (number == 0))
+    await subject.run([subject.status])
 
 
 async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
@@ -228,6 +302,7 @@ async def voices(subject: Subject) -> None:
     began = clock.now()
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
+        await subject.status()  # amid the 2 ms of what is cut, on a quick line
         await asyncio.sleep(pause)
     require_in_time(
         last.when.latest - began <= 0.8 * ramp / 1000,
@@ -264,6 +339,28 @@ def voices_of_layers(subject: Subject) -> Rows:
 
 
 @driving(_PLACE)
+def voices_of_channels(subject: Subject) -> Rows:
+    """It counts the voices of each channel by itself: fades of others cut none of it."""
+    require(len(subject.channels) > 1, "it has one channel")
+    ramp, count = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES)
+    onset = subject.envelope(0.0001)  # at its level at once
+    tones = [
+        [
+            subject.tone(channel, 1 / count, frequency=subject.near(at), onset=onset)
+            for channel in (0, 1)
+        ]
+        for at in range(count)
+    ]
+
+    async def fade() -> None:
+        for each in tones:
+            await subject.play(layer(0, *each, ramp=ramp))
+            await asyncio.sleep(_PAUSE + onset.step / 10_000)
+
+    return [(fade, layer(0, ramp=ramp))]
+
+
+@driving(_PLACE)
 async def limited(subject: Subject) -> None:
     """It limits the sum of its layers to full level, and says once that it was limited."""
     require(subject.level * 2 > 1.0, "tried above half of full level only; see --level")
@@ -272,4 +369,6 @@ async def limited(subject: Subject) -> None:
         "it has one frequency, whose tones interfere",
     )
     over = layer(1, subject.tone(frequency=subject.other))
-    await subject.run([subject.arm, subject.one(), over, layer(1), over, layer(1)])
+    near = layer(1, subject.tone(0, 0.995 / subject.level - 1.0, frequency=subject.other))
+    rows = near, over, layer(1), near, layer(1), over, layer(1)
+    await subject.run([subject.arm, subject.one(), *rows])

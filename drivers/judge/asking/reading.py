@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from typing import cast
 
 from drivers.judge.asking.check import driving, greeted, reading
@@ -175,6 +176,7 @@ def _shortest(name: str) -> list[int]:
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _TYPE = 0x7F  # of a frame, without the bit of a reply
 _MARKED = 0.2  # s; from a Mark until it is read
+_UNFED, _TRIPPED = 0.1, 0.05  # s; before what must not feed; until a trip is told
 _MOVED = 0.1  # s; until an amplifier has taken its address
 
 
@@ -190,9 +192,19 @@ async def events(subject: Subject) -> None:
     types = [EVENT, MESSAGES["Arm"].number][not is_stated :]
     seen = [each.type & _TYPE for each in client.order]
     expect_equal(seen, types, "types of the messages after Arm, the Event before the reply")
+
+    async def unasked() -> None:
+        count = len(client.order)
+        await asyncio.sleep(subject.shown.watchdog + _TRIPPED)
+        if is_stated:
+            what = "Events of a watchdog that expires while nothing is asked"
+            expect(len(client.order) > count, what, expected="one at least", seen="none")
+
+    await subject.run([subject.one(), subject.starve])
+    await unasked()
     await subject.run(
         [
-            *(subject.one(), subject.starve, subject.settle, subject.clear),
+            *(subject.settle, subject.clear),
             *(subject.arm, subject.one(), send("Disarm", ramp=50), subject.settle),
             *(send("Stop", ramp=0), send("Stop", ramp=0), subject.clear, 0.02),
         ]
@@ -212,6 +224,9 @@ async def events(subject: Subject) -> None:
     needed = [each for each in required if each[0] not in _MOMENTARY or each in reported]
     shown = [each for each in reported if each[0] not in _MOMENTARY or each in required]
     expect_equal(shown, needed if is_stated else [], "states, faults and latches of Events")
+    if client.kind == "serial":
+        steps = {(b.frame.sequence - a.frame.sequence) % 0x10000 for a, b in pairwise(found)}
+        expect_equal(steps - {1}, set(), "steps of the numbers of Events, beyond 1")
     channels = {each["channel"] for each in reports}
     expect_equal(channels - {NO_CHANNEL}, set(), "channels of Events")
 
@@ -241,12 +256,14 @@ async def broadcasts(subject: Subject) -> None:
         ("Clear", {"latch": subject.latch}),
         ("Commit", {"session": 77, "token": 2, "at": 0}),
     ):
-        await subject.run([subject.one(), subject.ping])
+        await subject.run([subject.one(), subject.ping, _UNFED])
         await send_to_all(name, **values)
     await subject.run([stage(half), 0.1])
     await send_to_all("Commit", is_obeyed=True, token=subject.token)
     await subject.starve()
     await send_to_all("Stop", is_obeyed=True, ramp=0)
+    await subject.settle()
+    await send_to_all("Clear", latch=subject.latch)
 
 
 @driving("protocol.md#the-clock")

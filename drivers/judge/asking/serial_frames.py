@@ -20,10 +20,10 @@ from drivers.judge.asking.client import (
     message_name,
     read_as,
 )
-from drivers.judge.asking.material import layer
+from drivers.judge.asking.material import layer, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
-from drivers.protocol.table import EVENT, HELLO, MAX_WORDS, MESSAGES, NAK, VERSION
+from drivers.protocol.table import EVENT, EVENT_RECORD, HELLO, MAX_WORDS, MESSAGES, NAK, VERSION
 from drivers.wires.serial_line.frames import (
     NEUTRAL,
     REPLY,
@@ -182,6 +182,24 @@ async def doubled_frames(subject: Subject) -> None:
     for at, pause in ((0, 0.0), (1, 0.5), (1, 0.0)):
         await subject.client.send(frames[at])
         await subject.run([subject.ping, pause])
+
+
+@driving("serial.md#receiving", "serial")
+async def discarded_frames(subject: Subject) -> None:
+    """It discards Events, and what is for all in another version, without a reply."""
+    client = cast(SerialClient, subject.client)
+    await client.look_around()
+    subject.require_alone()
+    event = pack_words(EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1}))
+    await client.expect_silence(client.frame(EVENT, event), "an Event")
+    await subject.run([subject.arm, subject.one(), stage(subject.one(level=0.5))])
+    for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
+        message = MESSAGES[name]
+        words = pack_words(message.request.pack(subject.filled(values)))
+        for version in (VERSION - 1, 0):
+            data = client.frame(message.number, words, to=0, version=version)
+            await client.expect_silence(data, f"a {name} of version {version} for all")
+            await subject.run([subject.ping])
 
 
 @driving("serial.md#receiving", "serial")

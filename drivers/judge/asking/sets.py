@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require
@@ -96,11 +97,12 @@ def _flawed_tones(subject: Subject) -> Iterator[Command]:
     shapes = [Envelope(step, (knot,)) for step in {low - 1, high + 1} - {0, 1001}]
     shapes += [Envelope(low, (knot,) * (count + 1))] if count < 32 else []
     yield from (subject.tone(onset=shape) for shape in shapes)
+    to_0 = partial(replace, level=0, onset=Envelope(low, ()))  # drives all the same
     for number, limits in enumerate(subject.can["limits"]):
         own, loud = subject.tone(number), limits["level_max"] + 1
         for frequency in (limits["frequency_min"] - 1, limits["frequency_max"] + 1):
             if 0 <= frequency <= 0xFFFF:
-                yield replace(own, frequency=frequency)
+                yield from (replace(own, frequency=frequency), to_0(own, frequency=frequency))
         if loud <= FULL:
             above = Envelope(low, ((loud, 0),))
             yield from (
@@ -145,6 +147,11 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         ),
     ):
         yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
+    if subject.can["knots"]:
+        shaped = pack_layers([layer(0, subject.tone(onset=subject.envelope(0.01, 0.5)))])
+        for phase in (_PHASE.maximum + 1, 0x10000 + _PHASE.minimum - 1):
+            yield _part([*shaped[:-1], phase], "BAD_VALUE", 0)
+        yield _part([*shaped[:-2], _LEVEL + 1, 0], "BAD_VALUE", 0)
     for wrong in (words[:-1], [*words, 0], [words[head["count"]] + 1, *words[1:]]):
         yield _part(wrong, "BAD_LENGTH")
     # Of two flaws it names the first: length, layer, channel, then the channel's words.

@@ -1,16 +1,20 @@
 """Checks of sets by tokens: staged, committed once, in their order, for a second, at a moment."""
 
+import asyncio
 from functools import partial
 
 from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
+from drivers.judge.outputs import LATE
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
 from drivers.protocol.table import AHEAD_MAX, COMMAND, LAYER
 from registry import clock
 
 _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
+_AROUND, _NEAR = 0.015, 0.001  # s; of a moment, in which statuses are dense; that may be either
 
 
 @driving(_PLACE)
@@ -89,12 +93,12 @@ def committed_together(subject: Subject) -> Rows:
 @driving(_PLACE)
 async def starts_at_its_moment(subject: Subject) -> None:
     """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
-    ahead, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
-    for duration in (ahead, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
+    soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
+    for duration in (soon, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
-    present = subject.shown.present
+    present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
-    await subject.in_time(partial(_starts, subject, ahead, shift=over_the_end))
+    await subject.in_time(partial(_starts, subject, soon, shift=over_the_end))
 
 
 async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
@@ -102,25 +106,34 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.arm(shift=shift)
     one = subject.one()
     await subject.run([stage(one)])
-    await _commit(subject, duration)
-    end = clock.now() + max(duration, 0.0) + 0.05
+    at, began = await _commit(subject, duration), clock.now()
     await subject.run([play(one, token=1), send("Commit", token=1)])
-    while clock.now() < end:
-        await subject.run([0.01])
+    is_ahead = 0 < duration <= AHEAD_MAX * HIGH_TIME
+    await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
+    while clock.now() < began + duration * is_ahead + _AROUND:
+        shown = await subject.status()
+        since = ahead(shown["clock"], at * HIGH_STEPS)
+        if is_ahead and not -_NEAR < since < LATE + _NEAR:
+            what = f"whether it plays {1e3 * since:.1f} ms behind its moment, by its clock"
+            expect_equal(shown["levels"][0] > 0, since > 0, what)
+        await asyncio.sleep(_NEAR)
     await subject.run([subject.follow])
 
 
-async def _commit(subject: Subject, duration: float) -> None:
+async def _commit(subject: Subject, duration: float) -> int:
     """Commit the staged set for a moment that is a time [s] ahead of its last status."""
     await subject.status()
-    await subject.request("Commit", token=subject.token, at=subject.moment(duration))
+    at = subject.moment(duration)
+    await subject.request("Commit", token=subject.token, at=at)
+    return at
 
 
 @driving(_PLACE)
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
-    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, 0.4)]
+    left = min(0.2 * subject.slowness, 0.4)
+    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     ends: list[Rows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
@@ -128,7 +141,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [arm],
         [play(half)],
         [stage(half), send("Commit", token=2)],
-        [stage(half), partial(_commit, subject, 0.2)],
+        [stage(half), partial(_commit, subject, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
-    return [[*waits, *each, 0.5] for each in ends]
+    return [[*waits, *each, 1.25 * left] for each in ends]

@@ -1,19 +1,25 @@
 """Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
 
 import asyncio
+import math
 from functools import partial
 from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_within, require, require_in_time
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
+from drivers.judge.states import FADE
+from drivers.protocol.clock import ahead
 from drivers.protocol.sets import LayerSet, token_after
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import ENABLED, QUANTITIES
 from registry import clock
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
 _WRONG = "WRONG_STATE"
+_DENSE, _NEAR = 0.003, 0.0003  # s; between statuses at most; from samples to the clock
+_ROUGH = 20  # steps of level
 
 
 @driving(_STATES)
@@ -90,6 +96,8 @@ def sessions(subject: Subject) -> Rows:
         *(send("Disarm", ramp=0), subject.settle),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
         *(subject.arm, play(quarter, session=own, code="WRONG_SESSION")),
+        *(send("Stop", ramp=0), subject.settle, subject.clear),
+        send("Arm", watchdog=maximum, code="WRONG_SESSION"),
     ]
 
 
@@ -194,6 +202,7 @@ async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
             send("Disarm", ramp=0),
             subject.clear,
+            send("Arm", watchdog=round(1000 * time), code="WRONG_SESSION"),
         ]
     )
 
@@ -201,8 +210,41 @@ async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
 @driving(_SESSIONS)
 async def watchdog(subject: Subject) -> None:
     """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
-    for time in (subject.shortest_watchdog, min(350, subject.can["watchdog_max"])):
+    for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
         await subject.in_time(partial(_trips, subject, time / 1000, subject.whole()))
+
+
+@driving(_SESSIONS)
+async def watchdog_fade(subject: Subject) -> None:
+    """It fades as its watchdog expires along 5 ms of its clock, neither at once nor slower."""
+    require(subject.exchange_time < _DENSE, "its exchanges are too long to see a fade of 5 ms")
+    await subject.in_time(partial(_fades, subject))
+
+
+async def _fades(subject: Subject) -> None:
+    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
+    due = subject.shown.fed[0] + 0.95 * subject.shown.watchdog
+    await asyncio.sleep(due - clock.now())
+    armed = seen = await subject.status()
+    while seen["state"] == ENABLED:
+        armed, seen = seen, await subject.status()
+    began, full = seen["clock"], armed["levels"][0]
+    require_in_time(ahead(began, armed["clock"]) <= _DENSE, "statuses were too far apart")
+    while True:
+        since = (ahead(seen["clock"], each) for each in (armed["clock"], began))
+        low, high = (
+            _faded(time + by) * full for time, by in zip(since, (_NEAR, -_NEAR), strict=True)
+        )
+        what = "level amid the fade of the watchdog"
+        expect_within(seen["levels"][0], low - _ROUGH, high + _ROUGH, what)
+        if not seen["levels"][0]:
+            break
+        seen = await subject.status()
+
+
+def _faded(time: float) -> float:
+    """The share of a level that is left a time [s] after a fade of 5 ms has begun."""
+    return (1 + math.cos(math.pi * min(max(time / FADE, 0.0), 1.0))) / 2
 
 
 @driving(_SESSIONS)
@@ -254,9 +296,12 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
         send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
         partial(subject.client.exchange, 63, ()),
+        send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
+        send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
+    collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
-    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows)]
+    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected]
 
 
 @driving(_SESSIONS)

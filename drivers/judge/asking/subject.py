@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from drivers.judge.amplifier import OFF
 from drivers.judge.asking.client import (
     QUIET,
     REPLY_TIMEOUT,
@@ -22,6 +21,7 @@ from drivers.judge.asking.client import (
     require,
     require_in_time,
 )
+from drivers.judge.asking.dating import Dating
 from drivers.judge.asking.judge import Judge
 from drivers.judge.asking.material import (
     FULL,
@@ -34,6 +34,7 @@ from drivers.judge.asking.material import (
     play,
     send,
 )
+from drivers.judge.states import OFF
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
@@ -52,6 +53,8 @@ _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
+RATE = 1 / QUANTITIES["rate"].per_unit
+"""Of a clock, of one step of the rate of a Ping."""
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
 
@@ -59,7 +62,7 @@ class Subject(Material):
     """An identified amplifier at the far end of a client; level: of driven channels, at most.
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
-    sent_set: the parts of the last set that was sent.
+    sent_set: the parts of the last set that was sent. dating: of its statuses, by its clock.
     """
 
     def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
@@ -69,6 +72,7 @@ class Subject(Material):
         self.expected: Judge | None = None
         self.is_starving = True
         self.sent_set: list[Sequence[int]] = []
+        self.dating = Dating()
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
@@ -153,7 +157,9 @@ class Subject(Material):
         if "index" in values and answer.code and self.expected is not None:
             self.expected.part_refused(values, answer.code)
         if not answer.code:  # a refusal may come sooner
-            beyond = max(took - before - client.wire_time(len(raw), len(answer.words)), 0.0)
+            bits = client.wire_time(len(raw), len(answer.words))
+            client.pace = min(client.pace, took / bits if bits else 0.0)
+            beyond = max(took - client.pace * (before + bits), 0.0)
             count = 1 if name in _READ_ALONE else client.transactions
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
             client.reactions[name].append(beyond / count)
@@ -162,11 +168,11 @@ class Subject(Material):
 
     def moment(self, duration: float) -> int:
         """Return the high word of its clock that comes a time [s] after its last status."""
-        return round(self.shown.present + duration / HIGH_TIME) % HIGH_WORDS
+        return round(self.shown.clock.present + duration / HIGH_TIME) % HIGH_WORDS
 
     def filled(self, values: Values) -> Values:
         """Return values with those that a request has unless others are given."""
-        present = self.expected.present if self.expected is not None else 0
+        present = self.expected.clock.present if self.expected is not None else 0
         return {"session": self.session, "rate": 0, "shift": 0, "at": present, **values}
 
     def _parts_came(self, latest: float) -> float:
@@ -191,6 +197,8 @@ class Subject(Material):
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
+        if "clock" in shown:
+            answer = replace(answer, when=self._dated(name, values, shown, answer.when))
         if self.expected is not None:
             if name == "Set":
                 self.token = values["token"]
@@ -202,6 +210,25 @@ class Subject(Material):
             self.expected.granted(name, values, shown, answer.when)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(answer, values=shown)
+
+    def _dated(self, name: str, values: Values, shown: Values, when: When) -> When:
+        """Return between which times a status was true, and its request carried out, by its clock.
+
+        That may have been read later than the request was carried out, but for a GetStatus.
+        """
+        dating, judge = self.dating, self.expected
+        if name == "Mark" or (judge is not None and judge.clock.is_marked):
+            return when
+        if name == "Arm" and not (
+            judge and judge.is_enabled and judge.session == values["session"]
+        ):
+            dating.shift(values["shift"])
+        dated = dating.dated(shown["clock"], when, self.can["clock_error"])
+        if shown["state"] != ENABLED:
+            dating.pace = 1.0
+        elif name == "Ping":
+            dating.pace = 1 + values["rate"] * RATE
+        return dated if name == "GetStatus" else When(when.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
         """Read what is played of a set that is not played to the word."""

@@ -1,0 +1,78 @@
+"""Checks of its clock: as it is read, moved on by Arm, and steered by Ping."""
+
+import asyncio
+from functools import partial
+
+from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_equal, require
+from drivers.judge.asking.material import Rows, send
+from drivers.judge.asking.subject import RATE, Subject
+from drivers.judge.outputs import DRIFT
+from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
+from registry import clock
+
+_PLACE = "protocol.md#the-clock"
+_LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
+_READINGS, _APART = 30, 0.03  # of one state; s between two at most
+_LONGEST = 3.0  # s; in which a rate must show
+_SHIFTS = 1, 0x4000, 0xC001
+
+
+def _require_known(subject: Subject) -> None:
+    require(subject.can["clock_error"] != CLOCK_UNKNOWN, "it states no clock_error")
+
+
+async def _expect_steady(subject: Subject) -> None:
+    """Require that its clock was where it must be by all that was read of it."""
+    await subject.request("GetStatus")
+    wrong = f"{1e3 * subject.dating.error:.3g} ms"
+    expect_equal(wrong, "0 ms", "by how much readings of its clock contradict each other")
+
+
+@driving(_PLACE)
+async def clock_readings(subject: Subject) -> None:
+    """It shows its clock as it is between request and reply, armed or not, for ever on."""
+    _require_known(subject)
+
+    async def read() -> None:
+        for at in range(_READINGS):
+            await subject.status()
+            await asyncio.sleep(_APART * (at % 7) / 7)
+        await _expect_steady(subject)
+
+    await subject.run([read, subject.arm, subject.one(), read])
+
+
+@driving(_PLACE)
+def clock_shifts(subject: Subject) -> Rows:
+    """It moves its clock on by the shift of an Arm, not with the session that it holds."""
+    _require_known(subject)
+    again = send("Arm", watchdog=subject.can["watchdog_max"], shift=_SHIFTS[1])
+
+    async def shift() -> None:
+        for steps in _SHIFTS:
+            await subject.arm(shift=steps)
+            await subject.run([again, send("Disarm", ramp=0), subject.settle])
+            await _expect_steady(subject)
+
+    return [shift]
+
+
+@driving(_PLACE)
+async def clock_rate(subject: Subject) -> None:
+    """It runs faster by the rate of a Ping until the next, and by none once it is disarmed."""
+    _require_known(subject)
+    width = max(subject.exchange_time, subject.client.transit)
+    duration = max(0.5, 1.5 * width / (_HIGHEST * RATE - DRIFT))
+    require(duration <= _LONGEST, "its exchanges are too long to see a rate")
+
+    async def steer(rate: int) -> None:
+        end = clock.now() + duration
+        while clock.now() < end:
+            await subject.request("Ping", rate=rate)
+            await asyncio.sleep(_APART / 2)
+        await _expect_steady(subject)
+
+    disarm: Rows = (send("Disarm", ramp=0), subject.settle)
+    rates = (partial(steer, each) for each in (_HIGHEST, _LOWEST))
+    await subject.run([subject.arm, *rates, *disarm, partial(steer, _LOWEST)])

@@ -40,6 +40,15 @@ class CountedClocks:
         eras = [era.name for era in table.eras]
         return table.with_clocks(ClockErrors.of(eras, self._rig.wiring, self.errors))
 
+    @property
+    def is_one_lost(self) -> bool:
+        """Whether a clock is held no longer to those with which its amplifier shares contents."""
+        known = self._now() if self.errors else {}
+        return any(
+            error > counted and MARGIN * error > MAX_HELD >= counted
+            for counted, error in ((self.errors[name], known[name]) for name in self.errors)
+        )
+
     def _is_other(self, known: Mapping[str, float]) -> bool:
         """Whether a clock is worse than counted, or one far better."""
         return not self.errors or any(

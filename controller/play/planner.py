@@ -125,7 +125,12 @@ class Planner:
         self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
 
     def _count_clocks(self) -> None:
-        """Answer by the clocks as they are now; what plays stays until it changes."""
+        """Answer by the clocks as they are now.
+
+        What plays stays until it changes, but for what one that is lost may be part of.
+        """
+        if self.clocks.is_one_lost:
+            self._selector.choose_anew()
         chooser = self._selector.chooser
         counted = self.clocks.counted_by(chooser.table)
         if counted is not chooser.table:
@@ -238,11 +243,12 @@ class Planner:
                 if pulse.started_at is None:
                     self._too_late(1)
         before, contacts = self._plan, self._tracker.contacts
-        if not self._tracker.changed and before is not None and now < self.due:
-            return self._go_on(before, now)
-        self._seen = contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
+            is_due = self._tracker.changed or now >= self.due or self.clocks.is_one_lost
+            if before is not None and not is_due:
+                return self._go_on(before, now)
+            self._seen = contacts
             self._count_clocks()
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)

@@ -174,7 +174,7 @@ _LOST_DB = 0.1  # contrast that is worth a warning
 def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
     """What the clocks of several amplifiers leave: to the line of a good rig, warnings, and data.
 
-    urls: by the amplifier's name. Nothing of amplifiers that are simulated, and of one alone.
+    urls: by the amplifier's name. Nothing of one alone.
     """
     arrangement = resolve_name(_ARRANGEMENT)(
         urls, channels=rig.channel_counts, stated=rig.clock_errors

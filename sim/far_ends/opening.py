@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import CommandError
+from drivers.line_kinds import KIND_OF_PORT
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD, Place
 from drivers.wires.can_bus.canopen import BITRATE
 from drivers.wires.known import address_of
@@ -103,7 +104,7 @@ def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
 def _usual_line(wire: Wire) -> str:
     """The kind of line that is usual for a wire; of a serial line by the port of its URL."""
     port = Path(wire.line).name.rstrip("0123456789")
-    return _LINE_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
+    return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
 
 def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
@@ -222,13 +223,6 @@ _LINE_OF_WIRE = {
     "socketcand": "can",
     "slcan": "can-usb",
 }
-_LINE_OF_PORT = {
-    "ttyUSB": "ftdi-low-latency",
-    "ttyACM": "usb-full-speed",
-    "ttyS": "native",
-    "ttyAMA": "native",
-}
-"""By the name of a port without its number."""
 
 
 def assign_wires(

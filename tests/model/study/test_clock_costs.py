@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from drivers.line_kinds import CLOCK_ERRORS
 from model.cli import app
 from model.rig.rig import Channel
 from model.rig.uncertainty import Uncertainty
@@ -30,6 +31,7 @@ amplifiers:
 limits: {frequency: [40 Hz, 250 Hz]}
 uncertainty: {gain: 0.5 %%, phase_deg: 0.5, thickness: 0.1 %%, stiffness: 0.5 %%, damping: 1.02}
 """
+USB_US = round(1e6 * math.hypot(CLOCK_ERRORS["ftdi-low-latency"], 5e-6 / math.sqrt(3)), 1)
 
 
 def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
@@ -47,18 +49,18 @@ def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "error_us", "warnings"), [("", 17.2, 1), (", clock_error: unknown", None, 2)]
+    ("more", "error_us", "warnings"), [("", USB_US, 1), (", clock_error: unknown", None, 2)]
 )
 def test_config_check_tells_what_clocks_cost(
     tmp_path: Path, more: str, error_us: float | None, warnings: int
 ) -> None:
-    """Over USB: 17 us of the line and 5 us / sqrt(3) of the amplifier; and which plays alone."""
+    """Over USB: that of the line, and 5 us / sqrt(3) of the amplifier; and which plays alone."""
     file = tmp_path / "rig.yaml"
     file.write_text(RIG % more)
     run = partial(CliRunner().invoke, app)
     found = json.loads(run(["config", "check", str(file), "--json"]).output)
     assert found["ok"]
     clocks = found["clocks"]
-    assert clocks["error_us"] == {"a": 17.2, "b": error_us}
+    assert clocks["error_us"] == {"a": USB_US, "b": error_us}
     assert clocks["kept_contrast_db"] < clocks["exact_contrast_db"]
     assert len([each for each in found["warnings"] if "contents" in each]) == warnings

@@ -92,6 +92,7 @@ class Clocks:
         for each in amplifiers:
             reading = self._readings.get(each)
             is_free = reading is None or reading.done()
+            is_free = is_free and not each.line.has_set
             if is_free and each.silence_cause is None and each.line.loss is None:
                 self._readings[each] = each.read_status(Priority.READING)
 

@@ -32,7 +32,7 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_of, word_passed
+from drivers.protocol.clock import HIGH_TIME
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -66,6 +66,7 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
+_SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether what waits preempts a set, as long as no amplifier is to play it."""
@@ -111,6 +112,8 @@ class Dialogue:
         """When [s] a status had a report last."""
         self.played_at = -math.inf
         """When [s] a set that was sent last starts at the soonest, or silence was sent."""
+        self.starts = -math.inf
+        """When [s] the set that it has staged starts by its next commit; before now: at once."""
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -236,14 +239,12 @@ class Dialogue:
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         return delay, (admitted, stream)
 
-    def commit(self, token: int, at: int | None = None) -> asyncio.Future[Values]:
+    def commit(self, token: int, at: int) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
 
-        at: high word of the clock when it starts, None for at once. Or raises Preempted where a
-        stop or disarm came first, CommandRefused where it is too late for what the ledger has
-        admitted.
+        at: high word of its clock when it starts. Or raises Preempted where a stop or disarm came
+        first, CommandRefused where it is too late for what the ledger has admitted.
         """
-        at = word_passed(self._time()) if at is None else at  # which has passed when it arrives
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
@@ -319,9 +320,12 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                starts = None if is_now else moment_of(values["at"], now)
+                error, starts = 0.0, None if is_now or self.starts <= now else self.starts
+                if starts is not None:
+                    error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))
+                    error = min(error, _MAX_START_ERROR)
                 self.played_at = arrives if starts is None else starts
-                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
+                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].

@@ -19,8 +19,8 @@ from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
+from drivers.host.moments import word_passed_by_all
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_passed
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.timing import HEARTBEAT
@@ -165,7 +165,11 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            values = {"session": session, "token": token, "at": word_passed(line.time())}
+            values = {
+                "session": session,
+                "token": token,
+                "at": word_passed_by_all(line.time(), of_line),
+            }
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
                 each.next_request(request, values, Priority.SET)

@@ -19,8 +19,9 @@ from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
+from drivers.host.moments import word_passed_by_all, words_of
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_behind, word_passed
+from drivers.protocol.clock import moment_behind
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
@@ -77,6 +78,18 @@ class JointSets:
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
         Overtaken where it is preempted before that.
         """
+        lines = {self._members.amplifiers[name].line for name in layers}
+        try:
+            for line in lines:
+                line.has_set = len(lines) > 1
+            return await self._play(layers, is_preempted)
+        finally:
+            for line in lines:
+                line.has_set = False
+
+    async def _play(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
+    ) -> Played | DriverError:
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
@@ -159,17 +172,25 @@ class JointSets:
         by_line: dict[Line, list[Amplifier]] = {}
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
-        token, at = self.token, word_passed(clock.now())  # at once
+        token = self.token
+        moment: float | None = None  # at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
-            at = word_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+            moment = moment_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+        for each in staged:
+            each.starts = -math.inf if moment is None else moment
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
-            if len(sharing) == 1:
-                requests[sharing[0]] = sharing[0].commit(token, at)
+            if moment is None:
+                words = [word_passed_by_all(clock.now(), sharing)] * len(sharing)
+            else:
+                words = words_of(moment, sharing)
+            if len(sharing) == 1 or len({*words}) > 1:  # that of a clock which is not steered
+                for each, at in zip(sharing, words, strict=True):
+                    requests[each] = each.commit(token, at)
                 continue
-            make = partial(_commit_of, sharing, token, at)
+            make = partial(_commit_of, sharing, token, words[0])
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
@@ -225,7 +246,8 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
     What its layers play is compared with every status.
     """
     if status["token"] != token and status["state"] not in LATCHED:
-        status = await amplifier.commit(token)
+        amplifier.starts = -math.inf
+        status = await amplifier.commit(token, word_passed_by_all(clock.now(), [amplifier]))
     if status["token"] != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "

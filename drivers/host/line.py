@@ -77,6 +77,8 @@ class Line:
         self._transits: dict[int, float] = {}  # of requests, by their words
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
+        self.has_set = False
+        """Whether it has a set that several lines are to play: no clock is read meanwhile."""
         self.late = 0.0
         """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
 

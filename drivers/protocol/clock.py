@@ -33,9 +33,9 @@ def word_passed(seconds: float) -> int:
     return high_word(clock_at(seconds - _PASSED))
 
 
-def word_behind(seconds: float) -> int:
-    """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
-    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
+def moment_behind(seconds: float) -> float:
+    """Return when [s] a clock of `clock_at` next begins a high word, from a time [s] on."""
+    return seconds + (-clock_at(seconds) % HIGH_STEPS) / _PER_SECOND
 
 
 def moment_of(at: int, seconds: float) -> float | None:

@@ -123,10 +123,10 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
     return [
         (half, timed),
-        (half, kept),
+        *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
         (play(half, other), play(timed, beside)),
-        (ends, kept, 0.25 * subject.slowness),
+        (ends, timed, 0.25 * subject.slowness),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
     ]
 

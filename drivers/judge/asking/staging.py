@@ -109,8 +109,8 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     at, began = await _commit(subject, duration), clock.now()
     await subject.run([play(one, token=1), send("Commit", token=1)])
     is_ahead = 0 < duration <= AHEAD_MAX * HIGH_TIME
-    await subject.pause(max(duration, 0.0) * is_ahead - _AROUND - clock.now() + began)
-    while clock.now() < began + max(duration, 0.0) * is_ahead + _AROUND:
+    await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
+    while clock.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
         since = ahead(shown["clock"], at * HIGH_STEPS)
         if is_ahead and not -_NEAR < since < LATE + _NEAR:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from drivers.judge.amplifier import OFF
 from drivers.judge.asking.client import (
     QUIET,
     REPLY_TIMEOUT,
@@ -35,6 +34,7 @@ from drivers.judge.asking.material import (
     play,
     send,
 )
+from drivers.judge.states import OFF
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts

@@ -6,7 +6,8 @@ A request without a reply may have been carried out: the next status says so.
 import math
 from functools import partial
 
-from drivers.judge.amplifier import OFF, ExpectedAmplifier
+from drivers.judge.amplifier import ExpectedAmplifier
+from drivers.judge.states import OFF
 from drivers.judge.watching.capture import ReportViolation
 from drivers.judge.watching.decoded import (
     CHANGING,

@@ -1,6 +1,7 @@
 """Commits of several lines: at one moment, or none of them; and tokens that fall far behind."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
@@ -9,7 +10,7 @@ import pytest
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Overtaken, Preempted
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
 from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire
@@ -37,6 +38,7 @@ LINES: dict[str, tuple[str, Callable[[], Wire], Callable[[bytes], float]]] = {
         lambda d: 135 * len(unpack_frames(d)) / 20_000,
     ),
 }
+STATUS, COMMIT = (f"1:{MESSAGES[name].number}" for name in ("GetStatus", "Commit"))
 SLACK = 0.0002  # s; what is under way for longer than its bits
 
 
@@ -68,7 +70,8 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
 ) -> None:
     """Just armed: within a step of the shift. 3 s later: within 1 us, as their amplifiers state.
 
-    With crystals of +40 and -40 ppm, and a status under way whose reply takes 9 ms.
+    With crystals of +40 and -40 ppm, and a status under way whose reply takes 9 ms. No clock is
+    read before the commit, which would wait for it.
     """
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
     now = ends[0].loop.time
@@ -88,9 +91,12 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
             [(0.009, data)] if name == "GetStatus" else outward(name, data)
         )
         busy = asyncio.ensure_future(keep_busy())
+        ends[0].sent.clear()
         await group.apply({name: [LAYER] for name in group.amplifiers})
         await busy
         ends[1].outward = outward
+        sent = [each for _, each in ends[0].sent]
+        assert sent.index(COMMIT) < (sent.index(STATUS) if STATUS in sent else math.inf)
         ((first,), (second,)) = await started(*ends)
         await group.silence(0.0)
         return abs(first - second)
@@ -101,6 +107,42 @@ async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
         await asyncio.sleep(0.05)
         await group.beat()
     assert await apart() < 1e-6
+
+
+@pytest.mark.parametrize("lines", [("a", "b"), ("ab",)], ids=len)
+@in_virtual_time
+async def test_sets_start_together_by_clocks_that_cannot_be_steered(lines: tuple[str, ...]) -> None:
+    """Each its own way around: b's is 0.35 s behind, where the word of 0.25 s ago is ahead.
+
+    On two lines within a step of the word that names the moment; on one all play at once.
+    """
+    ends = [MemoryLine("serial", *names) for names in lines]
+    for end in ends:
+        for name, far in end.far.items():
+            far.capabilities["clock_error"] = CLOCK_UNKNOWN
+            crystal = Crystal(ahead={"a": 7.3, "b": -0.35}[name])
+            far.clock = AmplifierClock(crystal, since=end.loop.time())
+    group = await group_of(*ends)
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    began = [each for starts in await started(*ends) for each in starts]
+    assert len(began) == 2
+    if len(lines) == 2:
+        assert max(abs(each - applied.starts_at) for each in began) < 305e-6
+
+
+@in_virtual_time
+async def test_amplifier_that_does_not_start_at_its_moment_is_found() -> None:
+    """By two statuses, 1 and 12 ms after the moment, that show nothing of the set."""
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    group = await group_of(*ends)
+    ends[1].far["b"].playback.commit = lambda *_: None  # type: ignore[method-assign]
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    read_status = group.amplifiers["b"].read_status
+    await asyncio.sleep(applied.starts_at + 0.001 - ends[0].loop.time())
+    await read_status()
+    await asyncio.sleep(0.011)
+    with pytest.raises(CommandRefused):
+        await read_status()
 
 
 @pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])
@@ -204,12 +246,14 @@ async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> Non
     assert await started(*ends) == [[], []]
 
 
-@pytest.mark.parametrize(("names", "staged"), [("a", [0]), ("ab", [0, 1])])
+@pytest.mark.parametrize(
+    ("names", "is_busy", "staged"), [("a", True, [0]), ("ab", True, [0, 1]), ("ab", False, [1, 1])]
+)
 @in_virtual_time
 async def test_set_gives_way_until_an_amplifier_is_to_play_it(
-    names: str, staged: list[int]
+    names: str, is_busy: bool, staged: list[int]
 ) -> None:
-    """The line of one is busy for 3 ms; another one stages it, which no commit follows.
+    """The line of one is busy for 3 ms, or its reply takes that; another one has staged it.
 
     What plays goes on, and the next set plays at once.
     """
@@ -220,8 +264,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     for end in ends:
         end.sent.clear()
     ends[0].outward = lambda _, data: [(0.003, data)]
-    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
-    await asyncio.sleep(0)
+    readings = [group.amplifiers["a"].read_status()] if is_busy else []
     has_come = False
     ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
     giving_way = asyncio.ensure_future(ending)
@@ -229,7 +272,7 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     has_come = True
     with pytest.raises(Overtaken):
         await giving_way
-    await reading
+    await asyncio.gather(*readings)
     sent = [[each for _, each in end.sent] for end in ends]
     assert [each.count(f"1:{MESSAGES['Set'].number}") for each in sent] == staged
     assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)

@@ -10,6 +10,7 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from drivers.host.amplifier import Amplifier
@@ -49,7 +50,8 @@ class Clocks:
         now = amplifiers[0].line.time()
         marked_from = max([each.clock.marked_from for each in amplifiers])
         if len({each.line for each in amplifiers}) == 1 and now - marked_from > WINDOW:
-            common = sum([each.clock.lead(now) for each in amplifiers]) / len(amplifiers)
+            held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
+            common = median([each.lead(now) for each in held] or [0.0])
         is_alike = len({_kind(each) for each in amplifiers}) == 1
         errors: dict[str, float] = {}
         for name, each in every.items():

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.host.group import Group
-from drivers.protocol.table import FEATURES
+from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.transport.line_kinds import LINE_KINDS, LineDelays
 from virtual_loop import run_virtual
@@ -124,5 +124,21 @@ def test_half_of_an_exchange_is_unknown_where_lines_differ() -> None:
         assert min(group.clock_errors.values()) >= unknown
         alone = await group_of(MemoryLine("serial", "c"))
         assert alone.clock_errors == {"c": 0.0}
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("ahead", [-10.0, -0.01])
+def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> None:
+    """One that states no error, beside two that are held by Marks."""
+
+    async def run() -> None:
+        end = MemoryLine("serial", *"abc")
+        end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
+        end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
+        group = await group_of(end)
+        await skew(group, [end.far["b"].clock, end.far["c"].clock], 9.0)
+        assert group.clock_errors["a"] == math.inf
+        assert max(group.clock_errors[each] for each in "bc") < 20e-6
 
     run_virtual(run())

@@ -68,9 +68,9 @@ class HeldClock:
         self.marked_from = math.inf
         """Since when [s] only readings of a Mark count, whose delay all on a line share."""
         self._rate = 0
-        self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
-        self._mark: tuple[float, float] | None = None
-        self._pinged: float | None = None  # when the first Ping without reply arrives
+        self._asked = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
+        self._marks = 0  # since a Status, which may show any of them
+        self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
         self._arming = 0  # the shift of an Arm without a reply
         self._is_armed = False
         self._jumped_at = -math.inf
@@ -143,13 +143,14 @@ class HeldClock:
         if self.is_alone:
             return
         if name == "Mark":
-            self._mark = now, arrives
-            return
-        self._request = now, arrives
+            self._marks += 1
+        if name == "Mark" or not self._marks:
+            self._asked = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
-        elif name == "Ping" and self._pinged is None:
-            self._pinged = arrives
+        elif name == "Ping":
+            first, _ = self._pinged or (arrives, arrives)
+            self._pinged = first, arrives
 
     def replied(
         self, name: str, values: Values, status: Values, received: float, *, bits: float
@@ -157,8 +158,8 @@ class HeldClock:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
         if self.is_alone:
             return
-        sent, arrives = self._mark or self._request
-        is_kept, self._mark = self._mark is not None or received < self.marked_from, None
+        (sent, arrives), marks, self._marks = self._asked, self._marks, 0
+        is_kept = marks == 1 or received < self.marked_from
         time = min(arrives, received)
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
@@ -172,13 +173,13 @@ class HeldClock:
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
         is_kept = is_kept and (self._pinged is None or name == "Ping")
-        if is_kept or not self._lowest:
+        if marks <= 1 and (is_kept or not self._lowest):
             is_told = was_armed and self._is_armed
             self._read(status["clock"], time, time - sent, received - time, is_told=is_told)
         if name == "Ping" or not self._is_armed:
             rate = values["rate"] if self._is_armed else 0
             if rate != self._rate:  # of several attempts any may have been the first heard
-                since = ((self._pinged or arrives) + arrives) / 2
+                since = sum(self._pinged or (time, time)) / 2
                 self._added, self._added_at = self._added_until(since), since
                 self._rate = rate
             self._pinged = None

@@ -12,7 +12,7 @@ from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.transport.line_kinds import LINE_KINDS, LineDelays
 from virtual_loop import run_virtual
-from words_line import MemoryLine, group_of
+from words_line import MemoryLine, group_of, unaltered
 
 MARK = 1 << FEATURES["mark"]
 
@@ -140,5 +140,33 @@ def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> N
         await skew(group, [end.far["b"].clock, end.far["c"].clock], 9.0)
         assert group.clock_errors["a"] == math.inf
         assert max(group.clock_errors[each] for each in "bc") < 20e-6
+
+    run_virtual(run())
+
+
+def test_status_that_shows_an_older_mark_accuses_no_clock() -> None:
+    """The request that would show a Mark is lost, and the next Mark: the first is shown then."""
+
+    async def run() -> None:
+        end = MemoryLine("serial", "a", "b")
+        group = await group_of(end)
+        for _ in range(40):  # until Marks are read
+            await asyncio.sleep(0.05)
+            await group.beat()
+        lost = ["0:19", "1:12", "0:19"]  # the first is heard
+
+        def inward(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            if not lost or end.sent[-1][1] != lost[0]:
+                return unaltered(name, data)
+            lost.pop(0)
+            return [] if len(lost) < 2 else unaltered(name, data)
+
+        end.inward = inward
+        for _ in range(10):
+            await asyncio.sleep(0.05)
+            await group.beat()
+        assert not lost
+        assert "clock_jumped" not in group.amplifiers["a"].reported_at
+        assert max(group.clock_errors.values()) < 1e-4
 
     run_virtual(run())

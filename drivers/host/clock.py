@@ -66,7 +66,7 @@ class HeldClock:
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self.marked_from = math.inf
-        """Since when [s] only readings of a Mark count, whose delay all on a line share."""
+        """Since when [s] only Marks are read, see `read_marks`."""
         self._rate = 0
         self._asked = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
         self._marks = 0  # since a Status, which may show any of them
@@ -138,6 +138,11 @@ class HeldClock:
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
         return round((min(max(-lead / within, -most), most) - crystal) * _PER_RATE)
 
+    def read_marks(self, since: float) -> None:
+        """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
+        self.marked_from = since
+        self._lowest.clear()
+
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
         if self.is_alone:
@@ -176,6 +181,8 @@ class HeldClock:
         if marks <= 1 and (is_kept or not self._lowest):
             is_told = was_armed and self._is_armed
             self._read(status["clock"], time, time - sent, received - time, is_told=is_told)
+            if not is_kept:  # until the first that counts
+                self._lowest.clear()
         if name == "Ping" or not self._is_armed:
             rate = values["rate"] if self._is_armed else 0
             if rate != self._rate:  # of several attempts any may have been the first heard
@@ -201,7 +208,7 @@ class HeldClock:
             lead, off = 0.0, ahead(clock, clock_at(time))
         lowest = self._lowest
         self._least_delay = min(self._least_delay, later)
-        if time < self._part_ends:
+        if lowest and time < self._part_ends:
             before, low = lowest[-1]
             if lead + off >= low + self._line.rate * (time - before):
                 return

@@ -82,7 +82,7 @@ class Clocks:
         for line, of_line in unmarked:
             if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
                 for each in of_line:
-                    each.clock.marked_from = now
+                    each.clock.read_marks(now)
             elif line.late <= GRACE:
                 takes = sum([each.exchange_time("GetStatus") for each in of_line])
                 interval = max(least, takes / _MAX_LOAD)

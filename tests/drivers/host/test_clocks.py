@@ -104,6 +104,7 @@ def test_one_mark_tells_the_clocks_of_a_shared_line() -> None:
         await skew(group, clocks, 12.0)
         assert await skew(group, clocks, 2.0) < 2e-6
         assert max(group.clock_errors.values()) < 12e-6
+        assert not any(each.reported_at for each in group.amplifiers.values())
 
     run_virtual(run())
 

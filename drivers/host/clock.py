@@ -206,20 +206,17 @@ class HeldClock:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, ahead(clock, clock_at(time))
-        lowest = self._lowest
         self._least_delay = min(self._least_delay, later)
-        if lowest and time < self._part_ends:
-            before, low = lowest[-1]
+        if self._lowest and time < self._part_ends:
+            before, low = self._lowest[-1]
             if lead + off >= low + self._line.rate * (time - before):
                 return
-            lowest.pop()
+            self._lowest.pop()
         else:
-            span = time - lowest[0][0] if lowest else 0.0
+            self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+            span = time - self._lowest[0][0] if self._lowest else 0.0
             self._part_ends = time + min(max(span / _PARTS, _SHORTEST), _LONGEST)
-            while span > WINDOW:
-                del lowest[0]
-                span = time - lowest[0][0]
-        lowest.append((time, lead + off))
+        self._lowest.append((time, lead + off))
         self._fit(time)
 
     def _fit(self, time: float) -> None:

@@ -15,6 +15,7 @@ clock that cannot be steered or is not to be trusted has an infinite error, and 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
@@ -154,8 +155,7 @@ class HeldClock:
         if name == "Arm":
             self._arming = values["shift"]
         elif name == "Ping":
-            first, _ = self._pinged or (arrives, arrives)
-            self._pinged = first, arrives
+            self._pinged = (self._pinged[0] if self._pinged else arrives), arrives
 
     def replied(
         self, name: str, values: Values, status: Values, received: float, *, bits: float
@@ -164,7 +164,6 @@ class HeldClock:
         if self.is_alone:
             return
         (sent, arrives), marks, self._marks = self._asked, self._marks, 0
-        is_kept = marks == 1 or received < self.marked_from
         time = min(arrives, received)
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
@@ -177,7 +176,9 @@ class HeldClock:
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
-        is_kept = is_kept and (self._pinged is None or name == "Ping")
+        is_kept = (self._pinged is None or name == "Ping") and (
+            marks == 1 or received < self.marked_from
+        )
         if marks <= 1 and (is_kept or not self._lowest):
             is_told = was_armed and self._is_armed
             self._read(status["clock"], time, time - sent, received - time, is_told=is_told)
@@ -227,19 +228,15 @@ class HeldClock:
         lowest, (_, _, rate, bend, _, _) = self._lowest, self._line
         count = max(len(lowest) // 2, min(len(lowest), 2))
         for _ in range(_ROUNDS):
-            above = []
-            for at, lead in lowest:
-                age = time - at
-                above.append((lead + (rate - bend * age) * age, age))
-            above.sort()
+            above = sorted(_brought(lowest, time, rate, bend))[:count]
             mean = middle = spread = scatter = slope = curve = wide = 0.0
-            for high, age in above[:count]:
+            for high, age in above:
                 mean, middle = mean + high / count, middle + age / count
-            for high, age in above[:count]:
+            for high, age in above:
                 spread += (middle - age) ** 2
                 slope += (middle - age) * (high - mean)
                 scatter += (high - mean) ** 2
-            for high, age in above[:count]:
+            for high, age in above:
                 square = (middle - age) ** 2 - spread / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (spread or 1.0), 0.0)
@@ -255,9 +252,7 @@ class HeldClock:
         error = _ERRORS * math.sqrt(scatter * known)
         if count <= _FEW:
             error = max(error, self._least_delay / math.sqrt(12))
-        off = math.inf
-        for at, low in lowest[-_RECENT:]:
-            off = min(off, low + (rate - bend * (time - at)) * (time - at) - lead)
+        off = min(_brought(lowest[-_RECENT:], time, rate, bend))[0] - lead
         if off > _FAR + _FAR_ERRORS * error:
             del lowest[:-_RECENT]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
@@ -268,3 +263,11 @@ class HeldClock:
 
     def _added_until(self, time: float) -> float:
         return self._added + self._rate / _PER_RATE * (time - self._added_at)
+
+
+def _brought(
+    leads: Sequence[tuple[float, float]], time: float, rate: float, bend: float
+) -> list[tuple[float, float]]:
+    """Return what leads are at a time [s] by a rate and its bend, and how old they are [s]."""
+    ages = [(time - at, lead) for at, lead in leads]
+    return [(lead + (rate - bend * age) * age, age) for age, lead in ages]

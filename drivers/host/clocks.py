@@ -53,11 +53,13 @@ class Clocks:
             held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
             common = median([each.lead(now) for each in held] or [0.0])
         is_alike = len({_kind(each) for each in amplifiers}) == 1
-        errors: dict[str, float] = {}
-        for name, each in every.items():
-            unknown = 0.0 if is_alike else each.clock.shortest / 2
-            errors[name] = math.hypot(each.clock.error(now, common=common), unknown)
-        return errors
+        return {
+            name: math.hypot(
+                each.clock.error(now, common=common),
+                0.0 if is_alike else each.clock.shortest / 2,
+            )
+            for name, each in every.items()
+        }
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
         """Read clocks of lines beside their heartbeats, which go out next: more where needed.

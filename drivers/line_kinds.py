@@ -45,5 +45,9 @@ def line_kind_of(url: str) -> str:
     if scheme == "sim":
         return dict(parse_qsl(rest.partition("?")[2])).get("line", SIMULATED)
     port = re.match(r"/dev/([a-zA-Z]+)\d", rest)
-    usual = _KIND_OF_SCHEME.get(scheme, "usb-full-speed")
-    return KIND_OF_PORT.get(port[1], usual) if port and usual == "usb-full-speed" else usual
+    by_scheme = _KIND_OF_SCHEME.get(scheme, "usb-full-speed")
+    return (
+        KIND_OF_PORT.get(port[1], by_scheme)
+        if port and by_scheme == "usb-full-speed"
+        else by_scheme
+    )

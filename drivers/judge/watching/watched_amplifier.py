@@ -47,7 +47,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         self.is_answered = True
         self.reported_at = -math.inf
         self._answered = 0  # number of the newest request of which a reply was seen
-        self._asked = 0  # statuses since the last that was heard
+        self._requested = 0  # statuses since the last that was heard
         self._fed_before = math.inf
         # Silence where there must be none, which an unreported fault would explain.
         self._suspicions: list[tuple[str, float, str, object, object]] = []
@@ -109,7 +109,7 @@ class WatchedAmplifier(ExpectedAmplifier):
             self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
         if request.name == "Mark" and request.key is None:
             self.clock.mark((request.started_at, request.since + REACTION))
-        self._asked += REPLIES.get(request.name) is STATUS and request.key is not None
+        self._requested += REPLIES.get(request.name) is STATUS and request.key is not None
         if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 
@@ -124,9 +124,9 @@ class WatchedAmplifier(ExpectedAmplifier):
         name = request.name
         self.advance(request.earliest)
         if REPLIES.get(name) is STATUS:
-            if self._asked > 1:
+            if self._requested > 1:
                 self.clock.unheard()
-            self._asked = 0
+            self._requested = 0
             self._resolve(request.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return

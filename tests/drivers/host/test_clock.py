@@ -269,7 +269,8 @@ def test_only_marks_count_once_they_are_used() -> None:
     rng, other, talks = random.Random(5), random.Random(6), list[Exchanges]()
     for crystal in (40e-6, -30e-6):
         talk = Exchanges(Counter(crystal), lambda: other.uniform(0.0, 0.5e-3))
-        talk.held.read_marks(START)
+        talk.run(1.0)
+        talk.held.read_marks(talk.now)
         talks.append(talk)
     for _ in range(120):
         late = 0.2e-3 + rng.uniform(0.0, 0.5e-3)

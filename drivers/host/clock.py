@@ -25,13 +25,13 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
-_PARTS, _SHORTEST, _LONGEST = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
+_PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _FEW = 2  # below which the time of an exchange bounds the error
 _ERRORS = 2.0  # the lowest of some readings depend on each other: by simulation
-_LIKELY_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
-_LIKELY_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
+_EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
+_EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
@@ -51,7 +51,7 @@ class _Line(NamedTuple):
     rate: float = 0.0
     bend: float = 0.0
     error: float = math.inf
-    rate_error: float = _LIKELY_RATE
+    rate_error: float = _EXPECTED_RATE
 
 
 class HeldClock:
@@ -69,7 +69,7 @@ class HeldClock:
         self.marked_from = math.inf
         """Since when [s] only Marks are read, see `read_marks`."""
         self._rate = 0
-        self._asked = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
+        self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
         self._marks = 0  # since a Status, which may show any of them
         self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
         self._arming = 0  # the shift of an Arm without a reply
@@ -135,9 +135,9 @@ class HeldClock:
         if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
             self._near_at = time
         is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
-        within, most = _GENTLE if is_gentle else _FAST
+        within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        return round((min(max(-lead / within, -most), most) - crystal) * _PER_RATE)
+        return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
 
     def read_marks(self, since: float) -> None:
         """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
@@ -151,7 +151,7 @@ class HeldClock:
         if name == "Mark":
             self._marks += 1
         if name == "Mark" or not self._marks:
-            self._asked = now, arrives
+            self._requested = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
         elif name == "Ping":
@@ -163,7 +163,7 @@ class HeldClock:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
         if self.is_alone:
             return
-        (sent, arrives), marks, self._marks = self._asked, self._marks, 0
+        (sent, arrives), marks, self._marks = self._requested, self._marks, 0
         time = min(arrives, received)
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
@@ -180,8 +180,8 @@ class HeldClock:
             marks == 1 or received < self.marked_from
         )
         if marks <= 1 and (is_kept or not self._lowest):
-            is_told = was_armed and self._is_armed
-            self._read(status["clock"], time, time - sent, received - time, is_told=is_told)
+            is_reported = was_armed and self._is_armed
+            self._read(status["clock"], time, time - sent, received - time, is_reported=is_reported)
             if not is_kept:  # until the first that counts
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:
@@ -193,17 +193,17 @@ class HeldClock:
             self._pinged = None
 
     def _read(
-        self, clock: int, time: float, earlier: float, later: float, *, is_told: bool
+        self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
     ) -> None:
         """Take a reading of a time, so much earlier [s] at the most, or so much later.
 
-        is_told: whether a jump is said, since no restart explains it.
+        is_reported: whether a jump is said, since no restart explains it.
         """
         lead = self._unsteered(time)
         off = ahead(clock, clock_at(time + lead + self._added_until(time)))
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
         if not -far <= off <= later + far:  # else what delayed all that was read has ended
-            if is_told and not -far - earlier <= off <= later + far:
+            if is_reported and not -far - earlier <= off <= later + far:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, ahead(clock, clock_at(time))
@@ -216,7 +216,7 @@ class HeldClock:
         else:
             self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
             span = time - self._lowest[0][0] if self._lowest else 0.0
-            self._part_ends = time + min(max(span / _PARTS, _SHORTEST), _LONGEST)
+            self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
         self._lowest.append((time, lead + off))
         self._fit(time)
 
@@ -229,26 +229,26 @@ class HeldClock:
         count = max(len(lowest) // 2, min(len(lowest), 2))
         for _ in range(_ROUNDS):
             above = sorted(_brought(lowest, time, rate, bend))[:count]
-            mean = middle = spread = scatter = slope = curve = wide = 0.0
+            mean = middle = breadth = scatter = slope = curve = wide = 0.0
             for high, age in above:
                 mean, middle = mean + high / count, middle + age / count
             for high, age in above:
-                spread += (middle - age) ** 2
+                breadth += (middle - age) ** 2
                 slope += (middle - age) * (high - mean)
                 scatter += (high - mean) ** 2
             for high, age in above:
-                square = (middle - age) ** 2 - spread / count
+                square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
-            off_line = max(scatter - slope**2 / (spread or 1.0), 0.0)
-            square, error = middle**2 - spread / count, off_line / count + _LEAST**2
-            spread, wide = spread + error / _LIKELY_RATE**2, wide + error / _LIKELY_BEND**2
-            turn = (slope - (rate - 2 * bend * middle) * error / _LIKELY_RATE**2) / spread
-            warp = (curve - bend * error / _LIKELY_BEND**2) / wide
-            rate, bend = rate + turn + 2 * warp * middle, bend + warp
-            lead = mean + turn * middle + warp * square
-        scatter = max(scatter - turn * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
-        rate_error = _ERRORS * math.sqrt(scatter * (1 / spread + (2 * middle) ** 2 / wide))
-        known = 1 / count + middle**2 / spread + square**2 / wide
+            off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
+            square, error = middle**2 - breadth / count, off_line / count + _LEAST**2
+            breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
+            tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
+            warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
+            rate, bend = rate + tilt + 2 * warp * middle, bend + warp
+            lead = mean + tilt * middle + warp * square
+        scatter = max(scatter - tilt * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
+        rate_error = _ERRORS * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
+        known = 1 / count + middle**2 / breadth + square**2 / wide
         error = _ERRORS * math.sqrt(scatter * known)
         if count <= _FEW:
             error = max(error, self._least_delay / math.sqrt(12))

@@ -86,7 +86,7 @@ class Clocks:
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
-                takes = sum([each.exchange_time("GetStatus") for each in of_line])
+                takes = sum([_takes(each) for each in of_line])
                 interval = max(least, takes / _MAX_LOAD)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(self._later(number * interval), self._read, of_line)
@@ -108,6 +108,11 @@ class Clocks:
             is_free = is_free and not each.line.has_set
             if is_free and each.silence_cause is None and each.line.loss is None:
                 self._readings[each] = each.read_status(Priority.READING)
+
+
+def _takes(amplifier: Amplifier) -> float:
+    """Return how long a reading of an amplifier keeps its line [s], as its last exchange shows."""
+    return max(amplifier.exchange_time("GetStatus"), amplifier.counts.last_round_trip or 0.0)
 
 
 def _mark(line: Line) -> None:

@@ -15,6 +15,7 @@ clock that cannot be steered or is not to be trusted has an infinite error, and 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
@@ -24,13 +25,13 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
-_PARTS, _SHORTEST, _LONGEST = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
+_PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _FEW = 2  # below which the time of an exchange bounds the error
 _ERRORS = 2.0  # the lowest of some readings depend on each other: by simulation
-_LIKELY_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
-_LIKELY_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
+_EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
+_EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
@@ -50,7 +51,7 @@ class _Line(NamedTuple):
     rate: float = 0.0
     bend: float = 0.0
     error: float = math.inf
-    rate_error: float = _LIKELY_RATE
+    rate_error: float = _EXPECTED_RATE
 
 
 class HeldClock:
@@ -66,11 +67,11 @@ class HeldClock:
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self.marked_from = math.inf
-        """Since when [s] only readings of a Mark count, whose delay all on a line share."""
+        """Since when [s] only Marks are read, see `read_marks`."""
         self._rate = 0
-        self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
-        self._mark: tuple[float, float] | None = None
-        self._pinged: float | None = None  # when the first Ping without reply arrives
+        self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
+        self._marks = 0  # since a Status, which may show any of them
+        self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
         self._arming = 0  # the shift of an Arm without a reply
         self._is_armed = False
         self._jumped_at = -math.inf
@@ -120,7 +121,7 @@ class HeldClock:
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
         is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off else None
+        return "clock_rate" if is_off and len(self._lowest) > _PARTS else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -134,22 +135,27 @@ class HeldClock:
         if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
             self._near_at = time
         is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
-        within, most = _GENTLE if is_gentle else _FAST
+        within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        return round((min(max(-lead / within, -most), most) - crystal) * _PER_RATE)
+        return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
+
+    def read_marks(self, since: float) -> None:
+        """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
+        self.marked_from = since
+        self._lowest.clear()
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
         if self.is_alone:
             return
         if name == "Mark":
-            self._mark = now, arrives
-            return
-        self._request = now, arrives
+            self._marks += 1
+        if name == "Mark" or not self._marks:
+            self._requested = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
-        elif name == "Ping" and self._pinged is None:
-            self._pinged = arrives
+        elif name == "Ping":
+            self._pinged = (self._pinged[0] if self._pinged else arrives), arrives
 
     def replied(
         self, name: str, values: Values, status: Values, received: float, *, bits: float
@@ -157,8 +163,7 @@ class HeldClock:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
         if self.is_alone:
             return
-        sent, arrives = self._mark or self._request
-        is_kept, self._mark = self._mark is not None or received < self.marked_from, None
+        (sent, arrives), marks, self._marks = self._requested, self._marks, 0
         time = min(arrives, received)
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
@@ -171,47 +176,48 @@ class HeldClock:
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
-        is_kept = is_kept and (self._pinged is None or name == "Ping")
-        if is_kept or not self._lowest:
-            is_told = was_armed and self._is_armed
-            self._read(status["clock"], time, time - sent, received - time, is_told=is_told)
+        is_kept = (self._pinged is None or name == "Ping") and (
+            marks == 1 or received < self.marked_from
+        )
+        if marks <= 1 and (is_kept or not self._lowest):
+            is_reported = was_armed and self._is_armed
+            self._read(status["clock"], time, time - sent, received - time, is_reported=is_reported)
+            if not is_kept:  # until the first that counts
+                self._lowest.clear()
         if name == "Ping" or not self._is_armed:
             rate = values["rate"] if self._is_armed else 0
             if rate != self._rate:  # of several attempts any may have been the first heard
-                since = ((self._pinged or arrives) + arrives) / 2
+                since = sum(self._pinged or (time, time)) / 2
                 self._added, self._added_at = self._added_until(since), since
                 self._rate = rate
             self._pinged = None
 
     def _read(
-        self, clock: int, time: float, earlier: float, later: float, *, is_told: bool
+        self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
     ) -> None:
         """Take a reading of a time, so much earlier [s] at the most, or so much later.
 
-        is_told: whether a jump is said, since no restart explains it.
+        is_reported: whether a jump is said, since no restart explains it.
         """
         lead = self._unsteered(time)
         off = ahead(clock, clock_at(time + lead + self._added_until(time)))
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
         if not -far <= off <= later + far:  # else what delayed all that was read has ended
-            if is_told and not -far - earlier <= off <= later + far:
+            if is_reported and not -far - earlier <= off <= later + far:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, ahead(clock, clock_at(time))
-        lowest = self._lowest
         self._least_delay = min(self._least_delay, later)
-        if time < self._part_ends:
-            before, low = lowest[-1]
+        if self._lowest and time < self._part_ends:
+            before, low = self._lowest[-1]
             if lead + off >= low + self._line.rate * (time - before):
                 return
-            lowest.pop()
+            self._lowest.pop()
         else:
-            span = time - lowest[0][0] if lowest else 0.0
-            self._part_ends = time + min(max(span / _PARTS, _SHORTEST), _LONGEST)
-            while span > WINDOW:
-                del lowest[0]
-                span = time - lowest[0][0]
-        lowest.append((time, lead + off))
+            self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+            span = time - self._lowest[0][0] if self._lowest else 0.0
+            self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
+        self._lowest.append((time, lead + off))
         self._fit(time)
 
     def _fit(self, time: float) -> None:
@@ -222,37 +228,31 @@ class HeldClock:
         lowest, (_, _, rate, bend, _, _) = self._lowest, self._line
         count = max(len(lowest) // 2, min(len(lowest), 2))
         for _ in range(_ROUNDS):
-            above = []
-            for at, lead in lowest:
-                age = time - at
-                above.append((lead + (rate - bend * age) * age, age))
-            above.sort()
-            mean = middle = spread = scatter = slope = curve = wide = 0.0
-            for high, age in above[:count]:
+            above = sorted(_brought(lowest, time, rate, bend))[:count]
+            mean = middle = breadth = scatter = slope = curve = wide = 0.0
+            for high, age in above:
                 mean, middle = mean + high / count, middle + age / count
-            for high, age in above[:count]:
-                spread += (middle - age) ** 2
+            for high, age in above:
+                breadth += (middle - age) ** 2
                 slope += (middle - age) * (high - mean)
                 scatter += (high - mean) ** 2
-            for high, age in above[:count]:
-                square = (middle - age) ** 2 - spread / count
+            for high, age in above:
+                square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
-            off_line = max(scatter - slope**2 / (spread or 1.0), 0.0)
-            square, error = middle**2 - spread / count, off_line / count + _LEAST**2
-            spread, wide = spread + error / _LIKELY_RATE**2, wide + error / _LIKELY_BEND**2
-            turn = (slope - (rate - 2 * bend * middle) * error / _LIKELY_RATE**2) / spread
-            warp = (curve - bend * error / _LIKELY_BEND**2) / wide
-            rate, bend = rate + turn + 2 * warp * middle, bend + warp
-            lead = mean + turn * middle + warp * square
-        scatter = max(scatter - turn * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
-        rate_error = _ERRORS * math.sqrt(scatter * (1 / spread + (2 * middle) ** 2 / wide))
-        known = 1 / count + middle**2 / spread + square**2 / wide
+            off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
+            square, error = middle**2 - breadth / count, off_line / count + _LEAST**2
+            breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
+            tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
+            warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
+            rate, bend = rate + tilt + 2 * warp * middle, bend + warp
+            lead = mean + tilt * middle + warp * square
+        scatter = max(scatter - tilt * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
+        rate_error = _ERRORS * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
+        known = 1 / count + middle**2 / breadth + square**2 / wide
         error = _ERRORS * math.sqrt(scatter * known)
         if count <= _FEW:
             error = max(error, self._least_delay / math.sqrt(12))
-        off = math.inf
-        for at, low in lowest[-_RECENT:]:
-            off = min(off, low + (rate - bend * (time - at)) * (time - at) - lead)
+        off = min(_brought(lowest[-_RECENT:], time, rate, bend))[0] - lead
         if off > _FAR + _FAR_ERRORS * error:
             del lowest[:-_RECENT]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
@@ -263,3 +263,11 @@ class HeldClock:
 
     def _added_until(self, time: float) -> float:
         return self._added + self._rate / _PER_RATE * (time - self._added_at)
+
+
+def _brought(
+    leads: Sequence[tuple[float, float]], time: float, rate: float, bend: float
+) -> list[tuple[float, float]]:
+    """Return what leads are at a time [s] by a rate and its bend, and how old they are [s]."""
+    ages = [(time - at, lead) for at, lead in leads]
+    return [(lead + (rate - bend * age) * age, age) for age, lead in ages]

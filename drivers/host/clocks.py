@@ -10,6 +10,7 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from drivers.host.amplifier import Amplifier
@@ -49,13 +50,16 @@ class Clocks:
         now = amplifiers[0].line.time()
         marked_from = max([each.clock.marked_from for each in amplifiers])
         if len({each.line for each in amplifiers}) == 1 and now - marked_from > WINDOW:
-            common = sum([each.clock.lead(now) for each in amplifiers]) / len(amplifiers)
+            held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
+            common = median([each.lead(now) for each in held] or [0.0])
         is_alike = len({_kind(each) for each in amplifiers}) == 1
-        errors: dict[str, float] = {}
-        for name, each in every.items():
-            unknown = 0.0 if is_alike else each.clock.shortest / 2
-            errors[name] = math.hypot(each.clock.error(now, common=common), unknown)
-        return errors
+        return {
+            name: math.hypot(
+                each.clock.error(now, common=common),
+                0.0 if is_alike else each.clock.shortest / 2,
+            )
+            for name, each in every.items()
+        }
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
         """Read clocks of lines beside their heartbeats, which go out next: more where needed.
@@ -80,7 +84,7 @@ class Clocks:
         for line, of_line in unmarked:
             if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
                 for each in of_line:
-                    each.clock.marked_from = now
+                    each.clock.read_marks(now)
             elif line.late <= GRACE:
                 takes = sum([_takes(each) for each in of_line])
                 interval = max(least, takes / _MAX_LOAD)

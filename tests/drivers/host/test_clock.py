@@ -168,6 +168,16 @@ def test_clock_goes_round_unnoticed() -> None:
     assert talk.held.problem(talk.now) is None
 
 
+def test_readings_begin_anew_after_a_pause() -> None:
+    """10 s without a reply, longer than readings count: its crystal has not changed meanwhile."""
+    talk = Exchanges(Counter(30e-6))
+    talk.run(2.0)
+    talk.now += 10.0
+    talk.run(1.0)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
+
+
 def jumps(counter: Counter) -> None:
     """Move it on by 10 ms."""
     counter.shown += 0.01
@@ -259,7 +269,8 @@ def test_only_marks_count_once_they_are_used() -> None:
     rng, other, talks = random.Random(5), random.Random(6), list[Exchanges]()
     for crystal in (40e-6, -30e-6):
         talk = Exchanges(Counter(crystal), lambda: other.uniform(0.0, 0.5e-3))
-        talk.held.marked_from = START
+        talk.run(1.0)
+        talk.held.read_marks(talk.now)
         talks.append(talk)
     for _ in range(120):
         late = 0.2e-3 + rng.uniform(0.0, 0.5e-3)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.host.group import Group
-from drivers.protocol.table import FEATURES
+from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.transport.line_kinds import LINE_KINDS, LineDelays
 from virtual_loop import run_virtual
-from words_line import MemoryLine, group_of
+from words_line import MemoryLine, group_of, unaltered
 
 MARK = 1 << FEATURES["mark"]
 
@@ -104,6 +104,7 @@ def test_one_mark_tells_the_clocks_of_a_shared_line() -> None:
         await skew(group, clocks, 12.0)
         assert await skew(group, clocks, 2.0) < 2e-6
         assert max(group.clock_errors.values()) < 12e-6
+        assert not any(each.reported_at for each in group.amplifiers.values())
 
     run_virtual(run())
 
@@ -124,5 +125,49 @@ def test_half_of_an_exchange_is_unknown_where_lines_differ() -> None:
         assert min(group.clock_errors.values()) >= unknown
         alone = await group_of(MemoryLine("serial", "c"))
         assert alone.clock_errors == {"c": 0.0}
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("ahead", [-10.0, -0.01])
+def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> None:
+    """One that states no error, beside two that are held by Marks."""
+
+    async def run() -> None:
+        end = MemoryLine("serial", *"abc")
+        end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
+        end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
+        group = await group_of(end)
+        await skew(group, [end.far["b"].clock, end.far["c"].clock], 9.0)
+        assert group.clock_errors["a"] == math.inf
+        assert max(group.clock_errors[each] for each in "bc") < 20e-6
+
+    run_virtual(run())
+
+
+def test_status_that_shows_an_older_mark_accuses_no_clock() -> None:
+    """The request that would show a Mark is lost, and the next Mark: the first is shown then."""
+
+    async def run() -> None:
+        end = MemoryLine("serial", "a", "b")
+        group = await group_of(end)
+        for _ in range(40):  # until Marks are read
+            await asyncio.sleep(0.05)
+            await group.beat()
+        lost = ["0:19", "1:12", "0:19"]  # the first is heard
+
+        def inward(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            if not lost or end.sent[-1][1] != lost[0]:
+                return unaltered(name, data)
+            lost.pop(0)
+            return [] if len(lost) < 2 else unaltered(name, data)
+
+        end.inward = inward
+        for _ in range(10):
+            await asyncio.sleep(0.05)
+            await group.beat()
+        assert not lost
+        assert not group.amplifiers["a"].reported_at
+        assert max(group.clock_errors.values()) < 1e-4
 
     run_virtual(run())

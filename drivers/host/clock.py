@@ -120,7 +120,7 @@ class HeldClock:
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
         is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off else None
+        return "clock_rate" if is_off and len(self._lowest) > _PARTS else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""

@@ -43,6 +43,7 @@ from drivers.protocol.sets import (
     parts,
 )
 from drivers.protocol.table import (
+    AHEAD_MAX,
     COMMAND,
     ENABLED,
     ENVELOPE,
@@ -66,6 +67,7 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
+_UNDERSTOOD = None, "clock_not_steered"  # problems of a clock by which a moment can be named
 _SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
@@ -112,6 +114,7 @@ class Dialogue:
         """When [s] a status had a report last."""
         self.played_at = -math.inf
         """When [s] a set that was sent last starts at the soonest, or silence was sent."""
+        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not understood
         self.starts = -math.inf
         """When [s] the set that it has staged starts by its next commit; before now: at once."""
         self.committed = 0
@@ -321,6 +324,7 @@ class Dialogue:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
                 error, starts = 0.0, None if is_now or self.starts <= now else self.starts
+                self._may_wait_until = -math.inf if is_now else now + AHEAD_MAX * HIGH_TIME
                 if starts is not None:
                     error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))
                     error = min(error, _MAX_START_ERROR)
@@ -373,7 +377,10 @@ class Dialogue:
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
-        problem = problem or ledger.problem_of(reply, sent_at, now)
+        plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
+        # By a clock that is not understood a set may wait, whatever its commit says.
+        if sent_at >= self._may_wait_until or self.clock.problem(now) in _UNDERSTOOD:
+            problem = problem or plays_wrong
         if problem is None:
             if tells or not self._was_unfed:
                 self._contradictions, self._contradicted_at = 0, -math.inf

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,7 +221,7 @@ def _switched_candidates(
 ) -> Candidates:
     """The best patterns of the mode `switched` for an only content.
 
-    Near the highest level where none reaches it.
+    Near the highest level where none reaches it; each of ERAs that may play one content together.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
@@ -230,10 +231,23 @@ def _switched_candidates(
     forms = _forms_over(forms, formed, stream.targets, quiet, over)
     if by_point:
         forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
-    found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))
-    if not found:
-        highest = NEARLY_HIGHEST * max_sensation_switched(forms)
-        found = find_switched(replace(forms, level_margin=0.0, wanted=highest))
+    groups = _groups(fingers.table)
+    among = [forms.among(each) for each in groups]
+    searches = [find_switched(each) for each in among]
+    among = [replace(each, level_margin=0.0) for each in among]
+    if not any(searches):
+        searches = [find_switched(each) for each in among]
+    if not any(searches):
+        highest = [NEARLY_HIGHEST * max_sensation_switched(each) for each in among]
+        levels = zip(among, highest, strict=True)
+        searches = [find_switched(replace(each, wanted=wanted)) for each, wanted in levels]
+    found = [
+        (score, drive)
+        for group, search in zip(groups, searches, strict=True)
+        for score, drive in search
+        if not any(weights[~group].any() for _, weights in drive)
+    ]
+    found.sort(key=itemgetter(0), reverse=True)
     drives = [[(int(rows[row]), weights) for row, weights in drive] for _, drive in found]
     none = np.zeros(len(found), dtype=int)
     return Candidates(none, none, np.array([score for score, _ in found]), drives)

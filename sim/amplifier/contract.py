@@ -296,8 +296,8 @@ class Amplifier:
             case "Ping" if self.state == _ENABLED:
                 self.clock.steer(values["rate"], now)
                 if self._waiting is not None:
-                    _, commit, layers = self._waiting
-                    self._play_when(layers, commit, now)
+                    _, commit, waiting = self._waiting
+                    self._play_when(waiting, commit, now)
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":

@@ -88,7 +88,7 @@ async def open_wires(wires: Mapping[str, Wire], devices: Devices) -> Urls:
     for device in devices:
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
-            wire = replace(wire, line_kind=_usual_line(wire))
+            wire = replace(wire, line_kind=_default_line(wire))
         lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
@@ -101,8 +101,8 @@ def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
     return {device.address: device for device in devices}
 
 
-def _usual_line(wire: Wire) -> str:
-    """The kind of line that is usual for a wire; of a serial line by the port of its URL."""
+def _default_line(wire: Wire) -> str:
+    """The default kind of line of a wire; of a serial line by the port of its URL."""
     port = Path(wire.line).name.rstrip("0123456789")
     return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
@@ -114,9 +114,9 @@ def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
     return LINE_KINDS[wire.line_kind].delays((wire.seed, devices[0].name))
 
 
-def _speed(wire: Wire, usual: int) -> int | None:
-    """Bits per second of a line: as given, the usual ones where it is not prompt, or None."""
-    return wire.speed or (None if wire.line_kind in (None, PROMPT) else usual)
+def _speed(wire: Wire, default: int) -> int | None:
+    """Bits per second of a line: as given, the default where it is not prompt, or None."""
+    return wire.speed or (None if wire.line_kind in (None, PROMPT) else default)
 
 
 @asynccontextmanager

@@ -321,8 +321,9 @@ TURNS = Stream(
 """Commits on two wires are apart by what the lines make of them: each pattern is of one of them."""
 
 # In 10 ms Modbus RTU at 115 200 baud carries some 47 words and CAN at 500 kbit/s some 109. Four
-# channels with an onset and room for an ending need 38 words, and 8 more for each knot.
-KNOTS = {"modbus-rtu": 1, "slcan": 8, "socketcand": 8}
+# channels with an onset need 30 words (3 of the head, 3 of the layer, 6 of each), and 8 more for
+# each knot: an ending follows in a set of its own.
+KNOTS = {"modbus-rtu": 2, "slcan": 9, "socketcand": 9}
 WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand")
 SHORTLY = ("serial", "modbus-rtu", "socketcand")
 

@@ -20,6 +20,7 @@ from model.answer.answer import Layer
 from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
+from model.ensemble.delays import ClockErrors
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
@@ -57,10 +58,13 @@ class Truth:
             tuple(self.stream.places[place] for place in situation.quiet),
         )
 
-    def layer(self, situation: Situation) -> Layer:
-        """What is to play in a situation."""
-        placed, mode = self.placed(situation), self.drive_mode
-        layer, _ = only(self.table, placed, LEVEL_DB_SL, drive_mode=mode, band_hz=(40.0, 500.0))
+    def layer(self, heard: Heard) -> Layer:
+        """What is to play in a situation, by clocks as far off as they were known to be."""
+        placed, mode, table = self.placed(heard.situation), self.drive_mode, self.table
+        if heard.clocks:
+            eras = [era.name for era in table.eras]
+            table = table.with_clocks(ClockErrors.of(eras, self.rig.wiring, heard.clocks))
+        layer, _ = only(table, placed, LEVEL_DB_SL, drive_mode=mode, band_hz=(40.0, 500.0))
         return layer
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
@@ -105,7 +109,7 @@ def patterns_match_table(played: Played, truth: Truth) -> None:
     for heard in _touched(played):
         assert len(heard.patterns) == 1, heard.situation
         (reported,) = heard.patterns
-        wanted = truth.layer(heard.situation).excitation
+        wanted = truth.layer(heard).excitation
         assert reported["drive"].keys() == wanted.keys()
         for name, tone in wanted.items():
             got = reported["drive"][name]
@@ -175,7 +179,7 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
     """
     timing = Timing(truth.table)
     first, *_ = _touched(played)
-    layer = truth.layer(first.situation)
+    layer = truth.layer(first)
     pattern = timing.with_envelopes(layer, truth.placed(first.situation), ending=False)
     assert pattern.onset is not None
     if truth.onset_knots is not None:

@@ -100,15 +100,17 @@ ONSET = 0.1  # s; over which an onset is judged
 class Heard:
     """A situation as it was on the plate, from start to end [s].
 
-    patterns: as a daemon would report them; steady, onset: what fingertips felt in the end and in
-    the first 100 ms, by place; phasors (f, s) [m/s²]: at the sensors in the end, at the frequencies
-    that were played; fading: what sensors read where nobody touched.
+    patterns: as a daemon would report them; clocks: errors of the amplifiers' clocks, rms [s] by
+    name, as the last of them counts them, empty for one amplifier; steady, onset: what fingertips
+    felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]: at the sensors in the
+    end, at the frequencies that were played; fading: what sensors read where nobody touched.
     """
 
     situation: Situation
     begin: float
     end: float
     patterns: tuple[Mapping[str, Any], ...] = ()
+    clocks: Mapping[str, float] = field(default_factory=dict)
     steady: Mapping[str, Felt] = field(default_factory=dict)
     onset: Mapping[str, Felt] = field(default_factory=dict)
     phasors: ComplexArray | None = None
@@ -172,6 +174,8 @@ class Streamed(Chain):
         """Place the sensors."""
         super().__post_init__()
         self.is_felt = False
+        self._counted: list[tuple[float, Mapping[str, float]]] = []
+        self.controller.cycle.observers.pattern_applied.append(self._note_clocks)
         self._sensors = Accelerometers(self.far.bench)
         self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
 
@@ -196,6 +200,7 @@ class Streamed(Chain):
         heard = replace(
             heard,
             patterns=tuple(map(_pattern, applied)),
+            clocks=next((each for time, each in reversed(self._counted) if time < end), {}),
             steady=steady,
             phasors=_phasors(
                 self._sensors.read(end - STEADY, end),
@@ -208,6 +213,12 @@ class Streamed(Chain):
         motion = np.abs(first.samples).max(axis=1)
         onset = float(first.times[np.argmax(motion > 1e-3 * motion.max())])
         return replace(heard, onset=bench.felt(onset, onset + ONSET))
+
+    def _note_clocks(self, applied: PlayReport) -> None:
+        """Keep how far off clocks are counted in what has just begun to play."""
+        planner = self.controller.cycle.planner
+        assert planner is not None
+        self._counted.append((applied.time, planner.clocks.errors))
 
     def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
         """Rest fingers on places; at the others they only feel."""

@@ -210,7 +210,7 @@ def check(path: Path, text: str | None = None) -> tuple[int, list[dict[str, str]
 
 
 def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
-    """The example has none, nor have two links, whose figure `clocks` has; an exact thickness has one."""
+    """The example has none, nor have two links, of which `clocks` tells; an exact thickness has."""
     assert check(example_rig_path()) == (0, [], [])
     links = EXAMPLE.replace(
         'main: {url: "sim://"}',

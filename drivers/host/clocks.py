@@ -44,7 +44,7 @@ class Clocks:
         how it is shared by its two ways. 0 for one alone.
         """
         every = self._amplifiers
-        if len(every) == 1:
+        if len(every) < 2:
             return dict.fromkeys(every, 0.0)
         amplifiers, common = [*every.values()], None
         now = amplifiers[0].line.time()

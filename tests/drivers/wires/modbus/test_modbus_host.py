@@ -133,7 +133,7 @@ def test_request_of_all_units_has_no_reply() -> None:
     for unit in (1, 2):
         wire.request(unit, "GetStatus", {})
     frames = wire.request(0, *commit)
-    assert [frames[6], frames[13:15], frames[25], len(frames)] == [1, b"\0\x03", 2, 38]
+    assert [frames[6], frames[13:15], frames[27], len(frames)] == [1, b"\0\x03", 2, 42]
     for number in (3, 4):
         echo = bytes([0, number, 0, 0, 0, 6, number - 2, 16, 6, 0, 0, 3])
         assert wire.received(echo) == []

@@ -331,9 +331,11 @@ TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "
 def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After 9 ms, where 10 are allowed: every check has its verdict."""
+    """After 9 ms, where 10 are allowed: every check has its verdict, or says what is not seen."""
     monkeypatch.setattr("judged_line.DELAY", 0.0045)
-    expect_passed(judged(kind, names), set() if names else SKIPPED[kind], within=1.5 * MINUTE)
+    unseen = {"watchdog_fade", "clock_rate"}  # of exchanges that are too long
+    skipped = set() if names else SKIPPED[kind] | unseen
+    expect_passed(judged(kind, names), skipped, within=1.6 * MINUTE)
 
 
 def test_request_that_comes_after_an_onset_is_no_violation(

@@ -75,6 +75,10 @@ class Preempted(CommandRefused):
     """A request that was preempted or superseded by another one."""
 
 
+class Overtaken(Preempted):
+    """A set that was preempted before any amplifier was to play it: what plays goes on."""
+
+
 class CommandError(DriverError, ValueError):
     """An invalid request: bad URL, unknown channel, value out of range."""
 

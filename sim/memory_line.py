@@ -16,6 +16,7 @@ from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 from drivers.errors import CommandError, LinkError
+from drivers.line_kinds import SIMULATED
 from drivers.urls import AmplifierUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.serial_line.host import SerialWire
@@ -36,7 +37,6 @@ _FORM = (
     "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, &line=KIND, and &seed=N or "
     "&exact"
 )
-_USUAL_LINE = "usb-high-speed"
 
 
 class SimulationUrl:
@@ -70,7 +70,7 @@ class SimulationUrl:
 
     def delays(self, rig: Rig, amplifier: str) -> LineDelays | None:
         """Those of an amplifier's line; as is usual where the rig has several amplifiers."""
-        kind = self.line_kind or (_USUAL_LINE if len(rig.amplifiers) > 1 else PROMPT)
+        kind = self.line_kind or (SIMULATED if len(rig.amplifiers) > 1 else PROMPT)
         return None if kind == PROMPT else LINE_KINDS[kind].delays((self.seed, amplifier))
 
     def select(self, names: tuple[str, ...]) -> str:

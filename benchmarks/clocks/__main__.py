@@ -10,27 +10,28 @@ import asyncio
 import statistics
 from collections.abc import Sequence
 
-from benchmarks.clocks.session import NAMES, Lines3, Session, armed, run_virtual
+from benchmarks.clocks.firmware import firmware_skew
+from benchmarks.clocks.session import NAMES, Arrangement, Session, armed, run_virtual
 from registry import clock
 
 ARRANGEMENTS = {
-    "native UART, each its own": Lines3("serial", "native"),
-    "USB high speed, each its own": Lines3("serial", "usb-high-speed"),
-    "USB full speed, each its own": Lines3("serial", "usb-full-speed"),
-    "FTDI, 1 ms, each its own": Lines3("serial", "ftdi-low-latency"),
-    "FTDI, 16 ms, each its own": Lines3("serial", "ftdi"),
-    "Modbus TCP, each its own": Lines3("modbus-tcp", "ethernet"),
-    "CAN of the board, one bus": Lines3("socketcand", "can", is_bus=True),
-    "CAN by USB, one bus": Lines3("slcan", "can-usb", is_bus=True),
-    "USB high speed, one bus": Lines3("serial", "usb-high-speed", is_bus=True),
-    "USB full speed, one bus": Lines3("serial", "usb-full-speed", is_bus=True),
-    "Modbus RTU, USB high speed": Lines3("modbus-rtu", "usb-high-speed", is_bus=True),
+    "native UART, each its own": Arrangement("serial", "native"),
+    "USB high speed, each its own": Arrangement("serial", "usb-high-speed"),
+    "USB full speed, each its own": Arrangement("serial", "usb-full-speed"),
+    "FTDI, 1 ms, each its own": Arrangement("serial", "ftdi-low-latency"),
+    "FTDI, 16 ms, each its own": Arrangement("serial", "ftdi"),
+    "Modbus TCP, each its own": Arrangement("modbus-tcp", "ethernet"),
+    "CAN of the board, one bus": Arrangement("socketcand", "can", is_bus=True),
+    "CAN by USB, one bus": Arrangement("slcan", "can-usb", is_bus=True),
+    "USB high speed, one bus": Arrangement("serial", "usb-high-speed", is_bus=True),
+    "USB full speed, one bus": Arrangement("serial", "usb-full-speed", is_bus=True),
+    "Modbus RTU, USB high speed": Arrangement("modbus-rtu", "usb-high-speed", is_bus=True),
 }
 _WINDOW, _STEP = 1.0, 0.05  # s
 _TAPS, _HELD, _APART = 40, 0.05, 0.25  # s
 
 
-async def skews(lines: Lines3, seed: int, moments: Sequence[float]) -> list[list[float]]:
+async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list[list[float]]:
     """Return the differences of clocks [s] in a second from each moment after arming on."""
     found = []
     async with armed(lines, seed) as session:
@@ -48,7 +49,7 @@ async def skews(lines: Lines3, seed: int, moments: Sequence[float]) -> list[list
     return found
 
 
-async def taps(lines: Lines3, seed: int, names: tuple[str, ...]) -> list[tuple[float, float]]:
+async def taps(lines: Arrangement, seed: int, names: tuple[str, ...]) -> list[tuple[float, float]]:
     """Return for each tap how long after the first the last amplifier starts, and after the touch.
 
     In seconds.
@@ -68,6 +69,7 @@ async def taps(lines: Lines3, seed: int, names: tuple[str, ...]) -> list[tuple[f
 
 def _starts(session: Session, since: float) -> list[float]:
     """When each amplifier began to play what it plays [s]; none before a time."""
+    session.far.bench.advance(clock.now())
     return [
         min(begun)
         for each in session.far.bench.amplifiers.values()
@@ -88,7 +90,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4, help="runs of each arrangement")
     parser.add_argument("--moments", type=float, nargs="*", default=[1.0, 30.0, 600.0])
     parser.add_argument("--only", default="", help="arrangements with this in their name")
+    parser.add_argument(
+        "--firmware", type=float, metavar="SECONDS", help="instead three processes of the firmware"
+    )
     options = parser.parse_args()
+    if options.firmware:
+        rms, uncertain = asyncio.run(firmware_skew(options.firmware))
+        print(f"firmware: rms of one clock {1e6 * rms:.1f} us, known to {1e6 * uncertain:.0f} us")
+        return
     heads = "".join(f"{moment:>7g} s" for moment in options.moments)
     print(f"{'rms of one clock [us]':<30}{heads}{'click [us]':>12}{'set [ms]':>10}{'of one':>10}")
     for name, lines in ARRANGEMENTS.items():

@@ -1,4 +1,4 @@
-"""A host with three amplifiers on lines as they are, in virtual time: the daemon's own control loop.
+"""A host with three amplifiers on lines as they are, in virtual time, with the daemon's own loop.
 
 Crystals are 50 ppm off and warm up, as `draw_imperfections` has them.
 """
@@ -19,6 +19,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.table import CLOCK_TURN
 from model.answer.timing import Timing
+from model.rig.rig import Rig
 from registry import clock
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
@@ -27,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 _rig_on_wire: Any = import_module("rig_on_wire")
 _small_table: Any = import_module("small_table").small_table
 _intents: Any = import_module("newest_contact").BuzzNewestContact
-_rig: Any = import_module("paper_plate").make_paper_rig
+_paper_rig: Any = import_module("paper_plate").make_paper_rig
 run_virtual: Any = import_module("virtual_loop").run_virtual
 
 NAMES = ("west", "middle", "east")
@@ -35,7 +36,7 @@ SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcan
 
 
 @dataclass(frozen=True)
-class Lines3:
+class Arrangement:
     """How three amplifiers are connected: wire and kind of line; is_bus: all on one line."""
 
     wire: str
@@ -78,21 +79,30 @@ class Session:
         return [math.remainder(one - other, CLOCK_TURN) for one, other in combinations(shown, 2)]
 
 
+def make_rig(names: tuple[str, ...]) -> Rig:
+    """The paper's plate, its ERAs on amplifiers of these names in turn."""
+    return _rig_on_wire.on_amplifiers(_paper_rig(12, 9), names)  # type: ignore[no-any-return]
+
+
+def make_controller(rig: Rig, urls: Mapping[str, str], **more: Any) -> Controller:
+    """A control loop in which the newest finger feels a buzz; more: as a `Controller` takes."""
+    table = _small_table()
+    intents, timing = _intents(), Timing(table)
+    return Controller(
+        rig, table, lines=Lines, urls=urls, intent_source=intents, timing=timing, **more
+    )
+
+
 @asynccontextmanager
-async def armed(lines: Lines3, seed: int, names: tuple[str, ...] = NAMES) -> AsyncIterator[Session]:
+async def armed(
+    lines: Arrangement, seed: int, names: tuple[str, ...] = NAMES
+) -> AsyncIterator[Session]:
     """Open and arm a host."""
-    rig = _rig_on_wire.on_amplifiers(_rig(12, 9), names)
+    rig = make_rig(names)
     drawn = draw_imperfections(rig, seed=seed)
     async with _rig_on_wire.far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
-        far.machine.passing = (0.0, 0.0)
-        controller = Controller(
-            rig,
-            _small_table(),
-            lines=Lines,
-            urls=far.urls,
-            intent_source=_intents(),
-            timing=Timing(_small_table()),
-        )
+        far.machine.be_prompt()
+        controller = make_controller(rig, far.urls)
         await controller.open()
         running = asyncio.create_task(controller.cycle.run())
         await controller.arm()

@@ -31,7 +31,9 @@ class Case:
 
     goal_db: of the promise at the worst finger, median. bands [Hz]: of the contents in order, any
     without; may_swap: in any order. modulation_hz: of the last content. events: what the last
-    finger with a content does, one after the other, once all have been felt together.
+    finger with a content does, one after the other, once all have been felt together. line: kind of
+    the line, prompt without; is_one_bus: or a line for each amplifier; resting [s]: while the
+    fingers rest, before it is measured.
     """
 
     name: str
@@ -44,6 +46,9 @@ class Case:
     may_swap: bool = False
     modulation_hz: float | None = None
     events: tuple[str, ...] = ()
+    line: str | None = None
+    is_one_bus: bool = True
+    resting: float = 0.0
 
     @property
     def title(self) -> str:
@@ -89,6 +94,22 @@ def _table(rig_name: str, is_identified: bool) -> LocalizationTable:
     return build_table(rig, drive_mode="phased", frequencies=grid)
 
 
+def _resting(name: str, line: str, *, is_one_bus: bool = False) -> Case:
+    """Two contents on three amplifiers whose clocks drift, while fingers rest."""
+    return Case(
+        f"two contents at rest, {name}",
+        None,
+        "car_display",
+        is_identified=True,
+        line=line,
+        is_one_bus=is_one_bus,
+        resting=RESTING,
+    )
+
+
+HELD, RESTING = 3.0, 5.0  # s
+"""While clocks are read before any finger comes, and while fingers rest after."""
+
 _EVENTS = (LEAVES, JOINS, CHANGES)
 _TWO, _THREE = ((40.0, 110.0), (140.0, 190.0)), ((40.0, 110.0), (140.0, 190.0), (230.0, 320.0))
 CASES = (
@@ -105,4 +126,8 @@ CASES = (
     Case("two contents, bands given", 21.2, "car_display", bands=_TWO),
     Case("three contents, bands given", 11.5, "car_display", contents=3, bands=_THREE),
     Case("texture of 20 Hz beside a steady content", 22.0, is_identified=True, modulation_hz=20.0),
+    _resting("one bus, USB of high speed", "usb-high-speed", is_one_bus=True),
+    _resting("one bus, USB of full speed", "usb-full-speed", is_one_bus=True),
+    _resting("lines of USB, high speed", "usb-high-speed"),
+    _resting("lines of USB, full speed", "usb-full-speed"),
 )

@@ -9,7 +9,7 @@ import math
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -18,7 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.promise.cases import CASES, CHANGES, JOINS, LEAVES, LEVEL_DB_SL, MOVES, Case, Point
+from benchmarks.promise.cases import (
+    CASES,
+    CHANGES,
+    HELD,
+    JOINS,
+    LEAVES,
+    LEVEL_DB_SL,
+    MOVES,
+    Case,
+    Point,
+)
 from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
@@ -29,6 +39,7 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from registry import clock
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
+from sim.transport.line_kinds import PROMPT
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the chain
 _chain: Any = import_module("chain").Chain
@@ -131,12 +142,21 @@ class _Session:
         self._wanted = _Wanted()
         self._last = case.contents - 1
 
+    @property
+    def _wires(self) -> Wire | dict[str, Wire]:
+        """One line of all amplifiers, or one of each."""
+        case = self._case
+        kind = case.line or PROMPT
+        one = Wire("serial", speed=921_600, shared=True, line_kind=kind, seed=self._drawn.seed)
+        if case.is_one_bus:
+            return one
+        return {name: replace(one, shared=False, line=name) for name in self._rig.amplifiers}
+
     async def run(self) -> Outcome:
         """All fingers at once, then each event."""
-        wire = Wire("serial", speed=921_600, shared=True)
         on: Any
         async with _chain.armed(
-            wire,
+            self._wires,
             self._rig,
             self._case.table,
             intent_source=self._wanted,
@@ -151,7 +171,10 @@ class _Session:
             for id, band in enumerate(case.bands_for(contents)):
                 self._wanted.targets[id] = {"band": band}
             self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
+            await asyncio.sleep(HELD if case.resting else 0)
             on.at = dict(enumerate(self._places))
+            if case.resting:
+                await on.hold(case.resting)
             before = first = await self._settled(on)
             events = []
             for name in case.events:

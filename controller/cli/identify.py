@@ -153,6 +153,7 @@ def identify(
         measured_line(rig, measured),
         *measured.notes,
         *identification_report.parameter_rows(found),
+        *identification_report.clock_rows(found),
         *identification_report.fit_rows(found),
         *identification_report.contrast_rows(expected),
     ]

@@ -30,7 +30,7 @@ from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.identification.learned_file import was_learned
 from model.rig.file import rig_of
-from model.rig.kind import gain_notes, whole_url
+from model.rig.kind import clock_costs, gain_notes, whole_url
 from model.rig.rig import Rig
 from model.structure.support import check_supported
 
@@ -327,8 +327,9 @@ def _checked(document: Document) -> CheckedFile:
         f"socket {config.socket}{hint}"
     )
     note = rig.uncertainty.note
-    notes = [*gain_notes(rig), *([note] if note else [])]
-    return CheckedFile(line, [*warnings, *notes])
+    held, lost, more = clock_costs(rig, config.urls)
+    notes = [*lost, *gain_notes(rig), *([note] if note else [])]
+    return CheckedFile(line + held, [*warnings, *notes], more)
 
 
 DAEMON = ConfigKind(

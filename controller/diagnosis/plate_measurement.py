@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from controller.diagnosis.interleaved_tones import Step, ToneSchedule, interleaved
-from controller.diagnosis.plate_sensors import PlateSensor, have_one_time, plate_sensors
+from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
 from controller.play.routing import Drive
 from drivers.errors import CommandError, CommandRefused
@@ -19,6 +19,7 @@ from drivers.protocol.timing import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.choice import best_first, best_of
+from model.ensemble.delays import MAX_HELD
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.progress import Progress, unseen
@@ -196,8 +197,8 @@ class PlateSelfMeasurement:
         readings: Mapping[str, Reading],
         sensors: Sequence[PlateSensor],
     ) -> _StepResponses:
-        """Responses to the tones that ERAs play, of sensors whose phases are of their time."""
-        rig = self._rig
+        """Responses to the tones that ERAs play, of sensors whose clocks are held to theirs."""
+        rig, held = self._rig, self._clock_errors
         number = {era.name: n for n, era in enumerate(rig.eras)}
         played = np.full(len(rig.eras), np.nan)
         responses = np.full((len(sensors), len(rig.eras)), np.nan, dtype=complex)
@@ -205,13 +206,19 @@ class PlateSelfMeasurement:
             heard = sensor.accelerations(readings[sensor.amplifier], frequencies)
             for era, frequency, acceleration in zip(eras, frequencies, heard, strict=True):
                 played[number[era]] = frequency
-                plays_it = self._player.amplifiers[rig.wiring[era].amplifier]
-                if have_one_time(self._player.amplifiers[sensor.amplifier], plays_it):
+                both = sensor.amplifier, rig.wiring[era].amplifier
+                if both[0] == both[1] or max(held[name] for name in both) <= MAX_HELD:
                     command = plays[era]
                     base = command.level * rig.era(era).stroke
                     turned = np.exp(-1j * math.radians(command.phase))
                     responses[row, number[era]] = acceleration * turned / base
         return _StepResponses(played, responses)
+
+    @property
+    def _clock_errors(self) -> dict[str, float]:
+        """Errors of the clocks of several amplifiers with ERAs, by name, rms [s]."""
+        used, errors = self._rig.channel_counts, self._player.group.clock_errors
+        return {name: errors[name] for name in used} if len(used) > 1 else {}
 
     async def _wait(self, seconds: float) -> None:
         """Wait [s], feeding the watchdogs."""
@@ -239,6 +246,7 @@ class PlateSelfMeasurement:
         loudest, at_half = half
         return replace(
             measurement,
+            clock_errors=self._clock_errors,
             half_level=self._repeats(heard[loudest], at_half),
             at_end=self._repeats(heard[0], last),
         )

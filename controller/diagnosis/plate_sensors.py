@@ -72,19 +72,15 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
     return PlateSensors(tuple(used), tuple(unused))
 
 
-def have_one_time(one: Amplifier, other: Amplifier) -> bool:
-    """Whether phases of two amplifiers are of one time: their own, or both follow the host's."""
-    return one is other or (one.clock.can_be_steered and other.clock.can_be_steered)
-
-
 def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
     """Raise CommandError unless all open amplifiers, by name, have one time."""
-    first, *others = amplifiers.items()
-    for name, other in others:
-        if not have_one_time(first[1], other):
+    if len(amplifiers) < 2:
+        return
+    for name, each in amplifiers.items():
+        if not each.clock.can_be_steered:
             raise CommandError(
-                f"amplifiers {first[0]} and {name} must have clocks that can be steered to be "
-                "measured while they play, got one that has none; see its clock_error"
+                f"amplifier {name} must have a clock that can be steered to be measured beside "
+                "others while they play, got none; see its clock_error"
             )
 
 
@@ -101,15 +97,15 @@ def _of_amplifier(
         if derivatives is None:
             unused.append(f"sensor {name} measures {sensor.unit.lower()}")
         elif era:
-            place = Sensor(era, era)
+            place = Sensor(era, era, amplifier=amplifier)
             if any(each.place == place for each in used):
-                place = Sensor(name, era)
+                place = Sensor(name, era, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
         elif sensor.channel is not None:
             unused.append(f"sensor {name} is at channel {sensor.channel}, which has no ERA")
         elif sensor.x is None or sensor.y is None:
             unused.append(f"sensor {name} states no place")
         else:
-            place = Sensor(name, x=sensor.x, y=sensor.y)
+            place = Sensor(name, x=sensor.x, y=sensor.y, amplifier=amplifier)
             used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
     return used, unused

@@ -19,6 +19,7 @@ from drivers.errors import (
     DriverError,
     LinkDegraded,
     LinkError,
+    Overtaken,
     Preempted,
 )
 from drivers.host.group import Group
@@ -145,7 +146,7 @@ class Cycle:
     async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
         """Play the sets of a plan on all amplifiers, from one moment on.
 
-        Returns when [s] the last byte was sent, None where nothing is to be sent, or why they were
+        Returns when [s] they start, None where nothing is to be sent, or why they were
         refused. Whatever is raised instead leaves it unknown what plays.
         """
         if not (sets := plan.sets):
@@ -157,7 +158,10 @@ class Cycle:
                 return sent_at
             if self.group.sets.is_incomplete:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            played = await self.group.apply(sets.by_amplifier)
+            is_preempted = self._wake.is_set if sets.endings else None
+            played = await self.group.apply(sets.by_amplifier, is_preempted)
+        except Overtaken:  # endings, by what has come since: they follow it
+            return None
         except BaseException as error:
             is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
@@ -165,7 +169,7 @@ class Cycle:
             planner.not_played(plan)
             raise
         planner.confirm(sets, played, now=clock.now())
-        return played.sent_at
+        return played.starts_at
 
     def count_too_late(self, clicks: int) -> None:
         """Count clicks that came too late to be felt, while armed."""

@@ -147,6 +147,7 @@ class Controller:
                 check=self.group.sets.refusal_of,
                 arrived=cycle.wake,
                 too_late=cycle.count_too_late,
+                clock_errors=lambda: self.group.clock_errors,
             )
             await asyncio.to_thread(planner.prepare)  # seconds, of a large rig
         except BaseException as error:

@@ -104,7 +104,7 @@ def play_report(
     now: float,
     timing: Timing,
 ) -> PlayReport:
-    """Report what plays after a plan, by layer; sent_at [s]: of the last byte, None for none."""
+    """Report what plays after a plan, by layer; sent_at [s]: when it starts, None if before."""
     selection = plan.selection
     order = sorted(
         (number for number, one in playing.items() if one.content in selection.contents),

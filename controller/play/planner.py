@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.chooser import Chooser
 from controller.play.content import Selection, no_layer_free
+from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import IntentSource, Pulse
 from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
 from controller.play.routing import FADE_RAMP
@@ -74,7 +75,8 @@ class Planner:
 
     A plan never raises: it falls back to silence on any exception. check: by the ledgers; arrived:
     called when several contents have been chosen, which a plan does not wait for; too_late: called
-    with how many clicks came too late to be felt.
+    with how many clicks came too late to be felt; clock_errors: gives those of the amplifiers by
+    name, rms [s].
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Planner:
         check: Check,
         arrived: Callable[[], None] = lambda: None,
         too_late: Callable[[int], None] = lambda clicks: None,
+        clock_errors: Callable[[], Mapping[str, float]],
     ) -> None:
         self.capabilities = capabilities
         """Of the amplifiers together."""
@@ -97,8 +100,11 @@ class Planner:
         """Shapes the patterns of the table."""
         self.layers = Layers(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
         """What they play."""
+        self.clocks = CountedClocks(rig, clock_errors)
+        """Their clocks, as answers count them."""
         self._selector = Selector(
-            Chooser(table, self.layers.builder.shape), arrived=self._note_answer
+            Chooser(self.clocks.counted_by(table), self.layers.builder.shape),
+            arrived=self._note_answer,
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
         self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused
@@ -116,7 +122,19 @@ class Planner:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
         self.timing, layers = timing, self.layers
         layers.builder = replace(layers.builder, timing=timing)
-        self._selector.chooser = Chooser(table, layers.builder.shape)
+        self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
+
+    def _count_clocks(self) -> None:
+        """Answer by the clocks as they are now.
+
+        What plays stays until it changes, but for what one that is lost may be part of.
+        """
+        if self.clocks.is_one_lost:
+            self._selector.choose_anew()
+        chooser = self._selector.chooser
+        counted = self.clocks.counted_by(chooser.table)
+        if counted is not chooser.table:
+            self._selector.chooser = replace(chooser, table=counted)
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; seconds, of a large rig.
@@ -188,13 +206,13 @@ class Planner:
     def confirm(self, sets: Sets, played: Played, *, now: float) -> None:
         """Note what the amplifiers play of sets by now [s].
 
-        Pulses start when the last commit was sent.
+        Pulses start where the last amplifier does.
         """
         for pulse in self._pulses(sets.started):
             if pulse.started_at is None:
-                if played.sent_at > pulse.end:
+                if played.starts_at > pulse.end:
                     self._too_late(1)
-                pulse.started_at = played.sent_at
+                pulse.started_at = played.starts_at
                 self._intent_due = min(self._intent_due, pulse.end)
         self.layers.confirm(sets, played, now)
 
@@ -225,11 +243,13 @@ class Planner:
                 if pulse.started_at is None:
                     self._too_late(1)
         before, contacts = self._plan, self._tracker.contacts
-        if not self._tracker.changed and before is not None and now < self.due:
-            return self._go_on(before, now)
-        self._seen = contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
+            is_due = self._tracker.changed or now >= self.due or self.clocks.is_one_lost
+            if before is not None and not is_due:
+                return self._go_on(before, now)
+            self._seen = contacts
+            self._count_clocks()
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)
             self._intent_due = intent.due(now)

@@ -129,6 +129,7 @@ class Selector:
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
+        self._is_outdated = False  # what the thread computes
         self.requests = 0
         """How often the thread was asked."""
         self.due = math.inf
@@ -172,7 +173,9 @@ class Selector:
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
         arrived = self._thread.take() if self._thread.is_busy else None
         if arrived is not None:
-            self._take(arrived, is_late=not self._is_intended(arrived, intended))
+            is_late = self._is_outdated or not self._is_intended(arrived, intended)
+            self._take(arrived, is_late=is_late)
+            self._is_outdated = False
         pulses, self._short = self._short, {}
         for contact, target in short:
             pulse = pulses.get(contact.key)
@@ -203,6 +206,10 @@ class Selector:
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
         return found
+
+    def choose_anew(self) -> None:
+        """Choose anew what lasts, silent until then; what the thread computes is not taken."""
+        self._lasting, self._is_outdated = _NOTHING, self._thread.is_busy
 
     def _request_again(self) -> None:
         """Ask anew for fingers that were left without an answer, since one has ended."""

@@ -1,4 +1,4 @@
-"""The DBC file of an amplifier of protocol 4 and its host, for bus monitors.
+"""The DBC file of an amplifier and its host, for bus monitors.
 
 Frames are words: what a word means depends on the message. ASCII only, as DBC readers need it.
 """
@@ -6,7 +6,16 @@ Frames are words: what a word means depends on the message. ASCII only, as DBC r
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.protocol.table import EVENT, FAULTS, HELLO, MAX_WORDS, MESSAGES, NAK, STATES
+from drivers.protocol.table import (
+    EVENT,
+    FAULTS,
+    HELLO,
+    MAX_WORDS,
+    MESSAGES,
+    NAK,
+    STATES,
+    VERSION,
+)
 from drivers.wires.can_bus.canopen import CANOPEN, cob_id
 from drivers.wires.can_bus.frames import REPLY, REQUEST, frames_of
 
@@ -58,7 +67,7 @@ def dbc_text(*, node: int = 1) -> str:
         (REPLY + node, "Reply", 8, _AMPLIFIER, words),
         (cob_id("heartbeat", node), "Heartbeat", 1, _AMPLIFIER, (_Signal("nmt_state", 0, 8),)),
     )
-    lines = ['VERSION "3"', "", "NS_ :", "", "BS_:", "", f"BU_: {_HOST} {_AMPLIFIER}", ""]
+    lines = [f'VERSION "{VERSION}"', "", "NS_ :", "", "BS_:", "", f"BU_: {_HOST} {_AMPLIFIER}", ""]
     named = []
     for identifier, name, length, sender, signals in frames:
         receiver = _AMPLIFIER if sender == _HOST else _HOST

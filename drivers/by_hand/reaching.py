@@ -14,6 +14,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.reports import REPORTS, reports_of
 from drivers.opening import Lines
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.protocol.table import (
     FAULTS,
@@ -74,13 +75,14 @@ def status_rows(status: Values) -> dict[str, Any]:
     numbers = {
         key: value
         for key, value in in_units(STATUS, status).items()
-        if key not in ("state", "fault", "flags", "latch")
+        if key not in ("state", "fault", "flags", "latch", "clock")
     }
     return {
         "state": name_of(STATES, status["state"]),
         "fault": name_of(FAULTS, status["fault"]),
         **{name: name in flags for name in STATUS_FLAGS},
         **numbers,
+        "clock_s": status["clock"] * HIGH_TIME / HIGH_STEPS,
         "levels": [QUANTITIES["level"].from_wire(each) for each in status["levels"]],
         "layer_tokens": status["tokens"],
         **({"other_flags": others} if others else {}),

@@ -1,7 +1,6 @@
 """Check of a rig's amplifiers by their URLs alone, for `era config check`; nothing is opened."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
@@ -16,10 +15,6 @@ from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
 from drivers.wires.wire import reply_words, request_words
 from registry.limits import GuardLimits
-
-COMMIT_SKEW = 0.001
-"""Skew of simultaneous commits on two links [s]: USB adapters send in frames of 1 ms, networks and
-operating systems are no better. See docs/reference/several-amplifiers.md."""
 
 _CEILING = QUANTITIES["frequency"].high
 
@@ -53,27 +48,11 @@ def check_links(
             continue
         addresses[name] = address
     used = {name: address for name, address in addresses.items() if channels.get(name)}
-    links = {address.line for name, address in used.items() if not urls[name].startswith("sim://")}
     warnings = [
         *_ceiling_warnings(limits),
-        *_skew_warnings(sorted(links), limits.frequency_max),
         *_late_loss_warnings(used, round_trips),
     ]
     return errors, warnings
-
-
-def phase_error(frequency: float, skew: float) -> float:
-    """Phase [degrees] between ERAs whose amplifiers start with a skew [s]."""
-    return 360.0 * frequency * skew
-
-
-def remaining_contrast(frequency: float, skew: float) -> float:
-    """Contrast [dB] left at a null of two equal halves that start with a skew [s].
-
-    The level of exp(i phase) - 1 relative to one half; 0 dB from 60 degrees on.
-    """
-    phase = min(math.radians(phase_error(frequency, skew)), math.pi)
-    return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
 
 
 def _ceiling_warnings(limits: GuardLimits) -> list[str]:
@@ -108,17 +87,3 @@ def _late_loss_warnings(
                 "regardless: use a faster line, or one line per amplifier, if that is too late"
             )
     return warnings
-
-
-def _skew_warnings(links: Sequence[str], frequency_max: float) -> list[str]:
-    if len(links) < 2:
-        return []
-    low = 100.0
-    return [
-        f"ERAs are on {len(links)} links ({', '.join(links)}), whose amplifiers may start "
-        f"{COMMIT_SKEW * 1e3:g} ms apart: a phase error of {phase_error(low, COMMIT_SKEW):.0f} "
-        f"degrees at {low:g} Hz and {phase_error(frequency_max, COMMIT_SKEW):.0f} at "
-        f"{frequency_max:g} Hz, which leaves {remaining_contrast(low, COMMIT_SKEW):.0f} and "
-        f"{remaining_contrast(frequency_max, COMMIT_SKEW):.0f} dB of contrast where they cancel; "
-        "put ERAs that play one frequency together on one amplifier or bus"
-    ]

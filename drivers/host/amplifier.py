@@ -27,6 +27,7 @@ from drivers.protocol.table import (
     has_feature,
 )
 from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
+from drivers.wires.wire import reply_words
 from registry import clock
 from registry.limits import GuardLimits
 
@@ -136,6 +137,8 @@ class Amplifier(Dialogue):
             self._ledger.adopt(can)
         self.identity, self.capabilities = identity, can
         self._times.clear()
+        status_words = reply_words("GetStatus", can["channels"], can["layers"])
+        self.status_time = self.line.wire.transit(status_words)
         self.clock.stated = can["clock_error"]
         self._serial_number = identity["serial_number"]
         self.latch = None

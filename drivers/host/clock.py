@@ -1,28 +1,57 @@
 """The clock of an amplifier as its host sees it, and how the host holds it to its own.
 
-Each Status is a reading: between the last bit of its request and the first of its reply. Shift and
-rate of the host are taken off before a line is laid below the readings (`clock_fit`), so that
-steering feeds nothing back into what is measured, and no lost or late Ping makes it swing. The
-shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
+Each Status is a reading, of a moment between the last bit of its request and the first of its
+reply. USB frames, other traffic and operating systems add to the time of the bits and never take
+from it, so a reading less the soonest arrival of its request is the lead of the clock or more, and
+the lowest ones are nearly right; the way back, with its latency timers and the waking of this
+process, does not count. Of each quarter of a second the lowest is kept, and a line is laid by least
+squares through the lower half of these: the lowest alone are the nearest where frames add, their
+mean where the operating system does. Shift and rate of the host are taken off before, so that
+steering feeds nothing back into what is measured.
+
+The shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
 crystal's and leads the rest to zero: soon while nothing plays, else within what is not felt. A
 clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
 """
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from drivers.host.clock_fit import ClockFit
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, ahead, clock_at
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
-_RATE, _ERROR = QUANTITIES["rate"], QUANTITIES["clock_error"]
-_PLAYING = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_SILENT = 0.2, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
-_COMMON = 0.2  # of an error, between clocks that were read by the same Marks
+WINDOW = 8.0
+"""Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
+_PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
+_ROUNDS = 3  # of laying the line, and choosing what it goes through
+_RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
+_FEW = 2  # below which the time of an exchange bounds the error
+_ERRORS = 2.0  # the lowest of some readings depend on each other: by simulation
+_EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
+_EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
+_LEAST = 5e-7  # s; of a reading, and of the time of this process
+_FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
+_GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
+_FAST = 0.1, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
+_UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
+_NEAR = 20e-6  # s; or its error: what is led to zero
+_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
-_UNSETTLED = 20e-6, 5.0  # s, or errors of the estimate: what must be led to zero
-_SLACK = 50e-6  # s; what is computed of bits and read of clocks, at the most
+_PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
+
+
+class _Line(NamedTuple):
+    """Lead [s] at a time [s] and rate of a clock that is not steered; their standard errors."""
+
+    time: float
+    lead: float = 0.0
+    rate: float = 0.0
+    bend: float = 0.0
+    error: float = math.inf
+    rate_error: float = _EXPECTED_RATE
 
 
 class HeldClock:
@@ -36,23 +65,26 @@ class HeldClock:
         self.shortest = math.inf
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
         self.is_alone = True
-        """Whether it is held together with no other one."""
-        self.takes_marks = False
-        """Whether only readings of a Mark count, whose delay all on a line have in common."""
+        """Whether it is held together with no other one: then nothing is read of it."""
+        self.marked_from = math.inf
+        """Since when [s] only Marks are read, see `read_marks`."""
         self._rate = 0
-        self._request = 0.0, 0.0  # when the last one was sent, and arrives at the soonest
-        self._mark: tuple[float, float] | None = None
+        self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
+        self._marks = 0  # since a Status, which may show any of them
+        self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
         self._arming = 0  # the shift of an Arm without a reply
         self._is_armed = False
         self._jumped_at = -math.inf
-        self._led_from = math.inf  # since when it is led to zero, and is not near
+        self._near_at = 0.0  # when it was led to zero last
         self._forget(0.0)
 
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
-        self._fit = ClockFit()
+        self._lowest: list[tuple[float, float]] = []  # time, lead
+        self._part_ends = -math.inf
+        self._least_delay = math.inf  # s; by which a request may have come late, of the promptest
+        self._line = _Line(time)
         self._added, self._added_at = 0.0, time  # s; by shifts and rates, until a time
-        self._low, self._high, self._bounded_at = -math.inf, math.inf, time
 
     @property
     def can_be_steered(self) -> bool:
@@ -61,27 +93,24 @@ class HeldClock:
 
     def lead(self, time: float) -> float:
         """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
-        if not self._fit:
-            return 0.0
-        lead = self._fit.lead(time) + self._added_until(time)
-        return math.remainder(lead, CLOCK_TURN)
-
-    def error(self, time: float, *, is_common: bool = False) -> float:
-        """Return its error [s rms] against the host's, with what it states; infinite if unknown.
-
-        While armed with what is still to be led to zero. is_common: against those of others whose
-        readings have the same errors.
-        """
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
-            return math.inf
-        lead = self.lead(time) if self._is_armed else 0.0
-        stated = _ERROR.from_wire(self.stated) / math.sqrt(3)
-        seen = self._fit.error(time) * (_COMMON if is_common else 1.0)
-        return math.hypot(stated, seen, lead)
+        return math.remainder(self._unsteered(time) + self._added_until(time), CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
-        """Return the standard error of its readings [s]; infinite before the first."""
-        return self._fit.error(time) if self._fit else math.inf
+        """Return the standard error of its lead as it is read [s]; infinite before that."""
+        line = self._line
+        return line.error + line.rate_error * max(0.0, time - line.time)
+
+    def error(self, time: float, *, common: float | None = None) -> float:
+        """Return its error [s rms] against the host's, with what it states; infinite if unknown.
+
+        While armed with what is still to be led to zero. common: against those of others whose
+        readings have the same errors, the lead [s] that all of them have.
+        """
+        if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
+            return math.inf
+        lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
+        seen = self.scatter(time) * (1.0 if common is None else _COMMON)
+        return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
         """Return what ails it at a time [s]; None if nothing."""
@@ -89,99 +118,156 @@ class HeldClock:
             return None if self.is_alone else "clock_not_steered"
         if time - self._jumped_at < CLOCK_SETTLING:
             return "clock_jumped"
-        if time - self._led_from > CLOCK_SETTLING:
+        if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
-        is_off = self._fit and abs(self._fit.rate) - _SURELY * self._fit.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off else None
+        is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
+        return "clock_rate" if is_off and len(self._lowest) > _PARTS else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
-        if not self.can_be_steered:
-            return 0
-        return round(-self.lead(time) / HIGH_TIME) % HIGH_WORDS
+        return round(-self.lead(time) / HIGH_TIME) % HIGH_WORDS if self.can_be_steered else 0
 
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
-        if not (self.can_be_steered and self._fit) or self.problem(time) == "clock_jumped":
+        if not self.can_be_steered or time - self._jumped_at < CLOCK_SETTLING:
             return self._rate
-        within, most = _PLAYING if is_playing else _SILENT
-        crystal = min(max(self._fit.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        rate = min(max(-self.lead(time) / within, -most), most) - crystal
-        return round(rate * _RATE.per_unit)
+        lead, error = self.lead(time), self._line.error
+        if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
+            self._near_at = time
+        is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
+        within, max_rate = _GENTLE if is_gentle else _FAST
+        crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
+        return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
+
+    def read_marks(self, since: float) -> None:
+        """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
+        self.marked_from = since
+        self._lowest.clear()
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
-        if name == "Mark":
-            self._mark = now, arrives
+        if self.is_alone:
             return
-        self._request = now, arrives
+        if name == "Mark":
+            self._marks += 1
+        if name == "Mark" or not self._marks:
+            self._requested = now, arrives
         if name == "Arm":
             self._arming = values["shift"]
+        elif name == "Ping":
+            self._pinged = (self._pinged[0] if self._pinged else arrives), arrives
 
     def replied(
         self, name: str, values: Values, status: Values, received: float, *, bits: float
     ) -> None:
         """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
-        is_kept = self._mark is not None or not self.takes_marks
-        sent, arrives = self._mark or self._request
+        if self.is_alone:
+            return
+        (sent, arrives), marks, self._marks = self._requested, self._marks, 0
         time = min(arrives, received)
-        self._mark = None
-        is_armed = status["state"] == ENABLED
-        has_left = self._is_armed and not is_armed and name not in ("Stop", "Disarm")
-        if name == "Arm" and is_armed:
+        was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
+        has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
+        if name == "Arm" and self._is_armed:
             steps = (values["shift"] + HIGH_WORDS // 2) % HIGH_WORDS - HIGH_WORDS // 2
             self._added += steps * HIGH_TIME
+            self._near_at = time
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - bits, 0.0))
-        was_armed, self._is_armed = self._is_armed, is_armed
-        if is_kept or not self._fit:
-            bounds = time - sent, received - time
-            self._read(status["clock"], time, bounds, is_told=is_armed and was_armed)
-        if name == "Ping" and is_armed:
-            self._run(values["rate"])
-        elif not is_armed:
-            self._run(0)
-        self._watch(time)
+        # Whether a Ping without reply was heard is not known before that to the next one.
+        is_kept = (self._pinged is None or name == "Ping") and (
+            marks == 1 or received < self.marked_from
+        )
+        if marks <= 1 and (is_kept or not self._lowest):
+            is_reported = was_armed and self._is_armed
+            self._read(status["clock"], time, time - sent, received - time, is_reported=is_reported)
+            if not is_kept:  # until the first that counts
+                self._lowest.clear()
+        if name == "Ping" or not self._is_armed:
+            rate = values["rate"] if self._is_armed else 0
+            if rate != self._rate:  # of several attempts any may have been the first heard
+                since = sum(self._pinged or (time, time)) / 2
+                self._added, self._added_at = self._added_until(since), since
+                self._rate = rate
+            self._pinged = None
 
-    def _read(self, clock: int, time: float, bounds: tuple[float, float], *, is_told: bool) -> None:
+    def _read(
+        self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
+    ) -> None:
         """Take a reading of a time, so much earlier [s] at the most, or so much later.
 
-        is_told: whether a jump is said, since no restart explains it.
+        is_reported: whether a jump is said, since no restart explains it.
         """
-        earlier, later = bounds
-        added = self._added_until(time)
-        expected = self._fit.lead(time) + added if self._fit else 0.0
-        lead = expected + ahead(clock, clock_at(time + expected)) - added
-        slack = _SLACK + (_ERROR.from_wire(self.stated) if self.can_be_steered else 0.0)
-        drift = 2 * MAX_CLOCK_RATE * (time - self._bounded_at)
-        lowest = max(self._low - drift, lead - later - slack)
-        highest = min(self._high + drift, lead + earlier + slack)
-        has_jumped = lowest > highest
-        if has_jumped and is_told:
-            self._jumped_at = time
-        if has_jumped or self._fit.has_moved(time, lead):
+        lead = self._unsteered(time)
+        off = ahead(clock, clock_at(time + lead + self._added_until(time)))
+        far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
+        if not -far <= off <= later + far:  # else what delayed all that was read has ended
+            if is_reported and not -far - earlier <= off <= later + far:
+                self._jumped_at = time
             self._forget(time)
-            lead = ahead(clock, clock_at(time))
-            lowest, highest = lead - later - slack, lead + earlier + slack
-        self._low, self._high, self._bounded_at = lowest, highest, time
-        self._fit.add(time, lead, later)
+            lead, off = 0.0, ahead(clock, clock_at(time))
+        self._least_delay = min(self._least_delay, later)
+        if self._lowest and time < self._part_ends:
+            before, low = self._lowest[-1]
+            if lead + off >= low + self._line.rate * (time - before):
+                return
+            self._lowest.pop()
+        else:
+            self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+            span = time - self._lowest[0][0] if self._lowest else 0.0
+            self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
+        self._lowest.append((time, lead + off))
+        self._fit(time)
+
+    def _fit(self, time: float) -> None:
+        """Lay a line that may bend through the lower half of what is kept, by least squares.
+
+        What is likely of crystals counts as if it were measured, too.
+        """
+        lowest, (_, _, rate, bend, _, _) = self._lowest, self._line
+        count = max(len(lowest) // 2, min(len(lowest), 2))
+        for _ in range(_ROUNDS):
+            above = sorted(_brought(lowest, time, rate, bend))[:count]
+            mean = middle = breadth = scatter = slope = curve = wide = 0.0
+            for high, age in above:
+                mean, middle = mean + high / count, middle + age / count
+            for high, age in above:
+                breadth += (middle - age) ** 2
+                slope += (middle - age) * (high - mean)
+                scatter += (high - mean) ** 2
+            for high, age in above:
+                square = (middle - age) ** 2 - breadth / count
+                curve, wide = curve + square * high, wide + square**2
+            off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
+            square, error = middle**2 - breadth / count, off_line / count + _LEAST**2
+            breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
+            tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
+            warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
+            rate, bend = rate + tilt + 2 * warp * middle, bend + warp
+            lead = mean + tilt * middle + warp * square
+        scatter = max(scatter - tilt * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
+        rate_error = _ERRORS * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
+        known = 1 / count + middle**2 / breadth + square**2 / wide
+        error = _ERRORS * math.sqrt(scatter * known)
+        if count <= _FEW:
+            error = max(error, self._least_delay / math.sqrt(12))
+        off = min(_brought(lowest[-_RECENT:], time, rate, bend))[0] - lead
+        if off > _FAR + _FAR_ERRORS * error:
+            del lowest[:-_RECENT]
+        self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
+
+    def _unsteered(self, time: float) -> float:
+        line = self._line
+        return line.lead + line.rate * (time - line.time)
 
     def _added_until(self, time: float) -> float:
-        return self._added + self._rate / _RATE.per_unit * (time - self._added_at)
+        return self._added + self._rate / _PER_RATE * (time - self._added_at)
 
-    def _run(self, rate: int) -> None:
-        """Note that it runs by a rate since the last request came."""
-        if rate != self._rate:
-            arrives = self._request[1]
-            self._added, self._added_at = self._added_until(arrives), arrives
-            self._rate = rate
 
-    def _watch(self, time: float) -> None:
-        """Note since when it does not follow."""
-        least, errors = _UNSETTLED
-        if not self._is_armed or abs(self.lead(time)) <= max(least, errors * self.scatter(time)):
-            self._led_from = math.inf
-        else:
-            self._led_from = min(self._led_from, time)
+def _brought(
+    leads: Sequence[tuple[float, float]], time: float, rate: float, bend: float
+) -> list[tuple[float, float]]:
+    """Return what leads are at a time [s] by a rate and its bend, and how old they are [s]."""
+    ages = [(time - at, lead) for at, lead in leads]
+    return [(lead + (rate - bend * age) * age, age) for age, lead in ages]

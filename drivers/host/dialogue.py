@@ -14,6 +14,7 @@ from drivers.errors import (
     FrameError,
     LinkDegraded,
     LinkTimeout,
+    Overtaken,
     Preempted,
 )
 from drivers.host.clock import HeldClock
@@ -31,7 +32,7 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_of, word_at
+from drivers.protocol.clock import HIGH_TIME
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -42,6 +43,7 @@ from drivers.protocol.sets import (
     parts,
 )
 from drivers.protocol.table import (
+    AHEAD_MAX,
     COMMAND,
     ENABLED,
     ENVELOPE,
@@ -65,7 +67,11 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
+_SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
+_KEEPS = 0.01  # s; largest error of a clock by which a set starts when its commit says
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
+IsPreempted: TypeAlias = Callable[[], bool]
+"""Whether what waits preempts a set, as long as no amplifier is to play it."""
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
 _UNCHECKED: tuple[Sequence[Layer] | None, float, float, _Checked] = (None, -math.inf, 0.0, ((), []))
 _logger = logging.getLogger(__name__)
@@ -107,7 +113,10 @@ class Dialogue:
         self.reported_at: dict[ReportKind, float] = {}
         """When [s] a status had a report last."""
         self.played_at = -math.inf
-        """When [s] a set or silence was sent last."""
+        """When [s] a set that was sent last starts at the soonest, or silence was sent."""
+        self.starts = -math.inf
+        """When [s] the set that it has staged starts by its next commit; before now: at once."""
+        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -115,6 +124,8 @@ class Dialogue:
         """What it may play by what is known beside its statuses and what fed it."""
         self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
+        self.status_time = 0.0
+        """How long its Status takes on the wire [s], known once it is identified."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -150,15 +161,6 @@ class Dialogue:
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
 
-    @property
-    def status_time(self) -> float:
-        """How long a Status takes on the wire [s]."""
-        if "Status" not in self._times:
-            can = self.capabilities
-            size = (can["channels"], can["layers"]) if can else WIDEST
-            self._times["Status"] = self.line.wire.transit(reply_words("GetStatus", *size))
-        return self._times["Status"]
-
     async def stage(
         self,
         token: int,
@@ -166,12 +168,14 @@ class Dialogue:
         *,
         now: bool = False,
         priority: Priority | None = None,
+        is_preempted: IsPreempted | None = None,
     ) -> Staged:
         """Stage a set under a token, or play it at once.
 
         priority: None for that of a set, or of what silences. It is admitted by the ledger when
-        its turn on the line has come. Raises CommandRefused with the reason; Preempted where a stop
-        came first; FrameError for two replies in a row with another token.
+        its turn on the line has come, unless it is preempted then. Raises CommandRefused with the
+        reason; Preempted where a stop came first; FrameError for two replies in a row with another
+        token.
         """
         if priority is None:
             priority = Priority.SILENCE if is_silence(layers) else Priority.SET
@@ -179,6 +183,8 @@ class Dialogue:
 
         def make() -> list[Values]:
             nonlocal staged
+            if is_preempted is not None and is_preempted():
+                raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
             staged, messages = self._admit(token, layers, now=now)
             return messages
 
@@ -226,29 +232,27 @@ class Dialogue:
 
         With the longest time [s] until they are committed; longer [s]: until they are staged.
         """
-        attempts = ATTEMPTS * len(self.line.members)
-        delay = max(COMMIT_DELAY, attempts * self.exchange_time("Set"))
+        takes = len(self.line.members) * self.exchange_time("Set")
+        delay = max(COMMIT_DELAY, ATTEMPTS * takes)
         if (words := _words_of(layers)) > PART_WORDS:  # parts of all of the line, and those again
-            delay += 2 * len(self.line.members) * self.line.wire.transit(words)
+            delay += 2 * words / PART_WORDS * takes
         admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         return delay, (admitted, stream)
 
-    def commit(self, token: int, at: int | None = None) -> asyncio.Future[Values]:
+    def commit(self, token: int, at: int) -> asyncio.Future[Values]:
         """Play the staged set; the future has the status, which shows its tokens.
 
-        at: high word of the clock when it starts, None for at once. Or raises Preempted where a
-        stop or disarm came first, CommandRefused where it is too late for what the ledger has
-        admitted.
+        at: high word of its clock when it starts. Or raises Preempted where a stop or disarm came
+        first, CommandRefused where it is too late for what the ledger has admitted.
         """
-        at = word_at(self._time()) if at is None else at  # which has passed when it arrives
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
-        """Return how much later than on a fast wire the reply to a request may come [s].
+        """Return how long a request and its reply take on the wire [s].
 
         Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
         another host, CommandRefused once a status has shown that it is not armed any more; of a set
@@ -259,9 +263,8 @@ class Dialogue:
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, reply_words("Set"))
-        longer = takes - FAST if takes > FAST else 0.0
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
-            return longer
+            return takes
         if name in ("Set", "Commit"):
             admitted, token, now = self._admitted, values["token"], self._time()
             if admitted is None or admitted.token != token:
@@ -287,12 +290,14 @@ class Dialogue:
             )
         if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
             raise disarmed(self.name, self.status)
-        return longer
+        return takes
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         self._checked = _UNCHECKED
-        self.clock.sent(name, values, now, arrives)
+        if name != "Set":  # whose reply shows no clock
+            # What was sent before may be lost: it may arrive as soon as its own bits have passed.
+            self.clock.sent(name, values, now, now + self.line.wire.takes)
         if name == "Hello":
             return
         feeding = self.feeding
@@ -318,9 +323,13 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                self.played_at = arrives if is_now else now  # behind the other parts
-                starts = None if is_now else moment_of(values["at"], now)
-                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts)
+                self._may_wait_until = -math.inf if is_now else now + AHEAD_MAX * HIGH_TIME
+                error, starts = 0.0, None if is_now or self.starts <= now else self.starts
+                if starts is not None:
+                    error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))
+                    error = min(error, _MAX_START_ERROR)
+                self.played_at = arrives if starts is None else starts
+                self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].
@@ -368,7 +377,10 @@ class Dialogue:
         if problem is None and not fed:
             left = reply["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
-        problem = problem or ledger.problem_of(reply, sent_at, now)
+        plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
+        # By a clock that is not held a set may wait, whatever its commit says.
+        if plays_wrong and (sent_at >= self._may_wait_until or self.clock.error(now) <= _KEEPS):
+            problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:
                 self._contradictions, self._contradicted_at = 0, -math.inf

@@ -20,6 +20,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.clocks import Clocks
+from drivers.host.dialogue import IsPreempted
 from drivers.host.feeding import Stopped
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
@@ -180,7 +181,9 @@ class Group:
         """
         return self._exchange(self._heartbeats.beat)
 
-    def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Coroutine[Any, Any, Played]:
+    def apply(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
+    ) -> Coroutine[Any, Any, Played]:
         """Play layers on the amplifiers of these names, all from one moment on.
 
         Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
@@ -188,8 +191,10 @@ class Group:
         Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
         one does not reply: then it is unknown whether the set plays. What else fails stops all
         amplifiers before it is raised.
+        is_preempted: asked before one is sent the set, and before they are to play it; if so,
+        Overtaken, and what plays goes on.
         """
-        return self._exchange(partial(self.sets.play, layers))
+        return self._exchange(partial(self.sets.play, layers, is_preempted))
 
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.

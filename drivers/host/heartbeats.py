@@ -19,8 +19,8 @@ from drivers.host.jobs import Make, Priority
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
+from drivers.host.moments import word_passed_by_all
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_at
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.timing import HEARTBEAT
@@ -45,8 +45,10 @@ class Heartbeats:
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
 
     def follow(self) -> None:
-        """Feed all of a line that several share ahead of what is sent to one, from now on."""
+        """Know all from now on: one alone, and those of a line, who are fed ahead of one's sets."""
         every = self._members.amplifiers.values()
+        for each in every:
+            each.clock.is_alone = len(every) == 1
         for line in {each.line for each in every}:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
@@ -66,10 +68,9 @@ class Heartbeats:
             by_line.setdefault(each.line, []).append(each)
             if each.silence_cause is not None:
                 mute.add(each.line)
+        self._clocks.look({line: by_line[line] for line in by_line if line not in mute})
         feeds: list[tuple[float, Feed]] = []
         for line, of_line in by_line.items():
-            if line not in mute:
-                self._clocks.look(line, of_line)
             feeds += self._feeds(line, of_line, may_read=line not in mute)
         feeds.sort(key=itemgetter(0))
         return self._members.all([feed() for _, feed in feeds])
@@ -102,7 +103,7 @@ class Heartbeats:
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
                 feed = partial(self._read_and_feed, each, self._members.epoch, reading)
-            elif later := self._clocks.dither(line):
+            elif is_late and (later := self._clocks.dither()):
                 feed = partial(self._feed_later, each.ping, self._members.epoch, later)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))
@@ -165,7 +166,11 @@ class Heartbeats:
             return None
 
         def make() -> list[Values]:
-            values = {"session": session, "token": token, "at": word_at(line.time())}
+            values = {
+                "session": session,
+                "token": token,
+                "at": word_passed_by_all(line.time(), of_line),
+            }
             for each in of_line:
                 request = "Ping" if each.committed == token else "Commit"
                 each.next_request(request, values, Priority.SET)

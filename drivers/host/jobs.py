@@ -55,11 +55,8 @@ class Member(Protocol):
     silence_cause: str | None
     """Why it counts as mute: it did not reply to a request."""
 
-    def exchange_time(self, name: str) -> float:
-        """Return how long the longest request of a name and its reply take on the wire [s]."""
-
     def next_request(self, name: str, values: Values, priority: Priority) -> float:
-        """Return how much later its reply may come [s]; raises where it must not go out."""
+        """Return how long it and its reply take on the wire [s]; raises if it must not go out."""
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s]."""
@@ -78,9 +75,8 @@ class Job:
     values: of the message on the line, or next. make: until its turn has come; parts: the messages
     that it made, the last of which is replied to; part: number of the one on the line, or next.
     reached: the first part that was missing when the last reply came. attempts: left. started_at
-    [s]: when it went out behind what was sent before. longer: than on a fast wire its reply may
-    take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
-    attempt.
+    [s]: when it went out behind what was sent before. takes: on the wire with its reply [s].
+    delays: of this process, while its reply is awaited. had_no_reply: to an earlier attempt.
     """
 
     member: Member | None
@@ -99,7 +95,7 @@ class Job:
     sent_at: float = 0.0
     started_at: float = 0.0
     due: float = 0.0
-    longer: float = 0.0
+    takes: float = 0.0
     delays: int = 0
     is_last_look: bool = False
     had_no_reply: bool = False

@@ -12,15 +12,16 @@ from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.errors import CommandRefused, DriverError, Preempted
+from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Staged
+from drivers.host.dialogue import IsPreempted, Staged
 from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, outcomes
+from drivers.host.moments import word_passed_by_all, words_of
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import word_at, word_behind
+from drivers.protocol.clock import moment_behind
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
@@ -38,12 +39,12 @@ _COMMIT_WORDS = MESSAGES["Commit"].request.words
 class Played:
     """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
 
-    sent_at [s]: when the last commit went out.
+    starts_at [s]: at the soonest, the last of them.
     """
 
     token: int
     layers: Mapping[str, tuple[LayerSet, ...]]
-    sent_at: float
+    starts_at: float
 
 
 class JointSets:
@@ -69,11 +70,26 @@ class JointSets:
                 refusals[name] = refusal
         return _merged(refusals) if refusals else None
 
-    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | DriverError:
+    async def play(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
+    ) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
+        Overtaken where it is preempted before that.
         """
+        lines = {self._members.amplifiers[name].line for name in layers}
+        try:
+            for line in lines:
+                line.has_set = len(lines) > 1
+            return await self._play(layers, is_preempted)
+        finally:
+            for line in lines:
+                line.has_set = False
+
+    async def _play(
+        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
+    ) -> Played | DriverError:
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
@@ -86,7 +102,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                staging.append(each.stage(token, layers[each.name], now=is_now))
+                requested = layers[each.name]
+                staging.append(each.stage(token, requested, now=is_now, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -101,7 +118,12 @@ class JointSets:
         if refusals and not has_failed:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
-        staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        try:
+            staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
+        except Overtaken as overtaken:
+            return overtaken
+        if is_preempted is not None and not is_now and is_preempted():
+            return Overtaken(f"set {token} is preempted")
         if not is_now:
             self._members.check_none_since(before)
             self.is_incomplete = True
@@ -114,15 +136,15 @@ class JointSets:
         self.is_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         reading: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
-        sent_at = -math.inf
+        starts_at = -math.inf
         for each, one in staged.items():
-            played[each.name], sent_at = one.layers, max(sent_at, each.played_at)
+            played[each.name], starts_at = one.layers, max(starts_at, each.played_at)
             if not one.is_exact:
                 reading[each.name] = _achieved(each, one)
         if reading:
             achieved = await self._members.all([*reading.values()])
             played.update(zip(reading, achieved, strict=True))
-        return Played(token, played, sent_at)
+        return Played(token, played, starts_at)
 
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
@@ -150,17 +172,25 @@ class JointSets:
         by_line: dict[Line, list[Amplifier]] = {}
         for each in staged:
             by_line.setdefault(each.line, []).append(each)
-        token, at = self.token, word_at(clock.now())  # at once
+        token = self.token
+        moment: float | None = None  # at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
-            at = word_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+            moment = moment_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+        for each in staged:
+            each.starts = -math.inf if moment is None else moment
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
-            if len(sharing) == 1:
-                requests[sharing[0]] = sharing[0].commit(token, at)
+            if moment is None:
+                words = [word_passed_by_all(clock.now(), sharing)] * len(sharing)
+            else:
+                words = words_of(moment, sharing)
+            if len(sharing) == 1 or len({*words}) > 1:  # that of a clock which is not steered
+                for each, at in zip(sharing, words, strict=True):
+                    requests[each] = each.commit(token, at)
                 continue
-            make = partial(_commit_of, sharing, token, at)
+            make = partial(_commit_of, sharing, token, words[0])
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()
@@ -216,7 +246,8 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
     What its layers play is compared with every status.
     """
     if status["token"] != token and status["state"] not in LATCHED:
-        status = await amplifier.commit(token)
+        amplifier.starts = -math.inf
+        status = await amplifier.commit(token, word_passed_by_all(clock.now(), [amplifier]))
     if status["token"] != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "

@@ -32,7 +32,6 @@ from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_START_ERROR = 0.001  # s; of a moment at which a set starts
 _STEPS = 2  # of levels, by which a status may differ
 _MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, relative to a weak level
@@ -72,7 +71,7 @@ class Ledger:
         # Which fades the amplifier cuts short depends on when it plays: for upper bounds, none.
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
-        self._starts = -math.inf  # s; the moment that the last commit named
+        self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""
         self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
@@ -109,11 +108,18 @@ class Ledger:
             raise CommandRefused(f"a set could not be checked: {error!r}; silence it") from error
 
     def sent(
-        self, token: int, layers: tuple[LayerSet, ...], now: float, *, starts: float | None = None
+        self,
+        token: int,
+        layers: tuple[LayerSet, ...],
+        now: float,
+        *,
+        starts: float | None = None,
+        error: float = 0.0,
     ) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt.
 
-        starts: the moment [s] that its commit names, None for at once. Again, where its commit is
+        starts: the moment [s] that its commit names, None for at once; error [s]: of that by the
+        clock of the amplifier, at the most. Again, where its commit is
         repeated: it may have played since the first time, also where a status said that it did
         not, which may have overtaken the commit.
         """
@@ -121,7 +127,7 @@ class Ledger:
             return
         if self._first_sent[0] != token:
             self._first_sent = token, now if starts is None else starts
-            self._starts = -math.inf if starts is None else starts
+            self._starts, self._start_error = -math.inf if starts is None else starts, error
         before: Vibration | None = None
         if is_vibrating(*layers):
             lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
@@ -143,7 +149,7 @@ class Ledger:
         playback = self.playback
         if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
-        self.lag = playback.uncertainty = max(self.lag, abs(now - sent_at))
+        self.lag = playback.uncertainty = max(self.lag, now - sent_at, self._start_error)
         if playback.next_due - 2 * self.lag <= now:
             for one in layers:
                 ends = playback.end_of(one.layer)
@@ -179,7 +185,7 @@ class Ledger:
         from above alone: their commit is known as an interval.
         """
         playback = self.playback
-        if sent_at < self._starts + _START_ERROR:  # it may show what played before
+        if sent_at < self._starts + self._start_error:  # it may show what played before
             return None
         if now - self.lag >= playback.changes_at:
             playback.advance(now - self.lag)

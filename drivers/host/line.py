@@ -17,8 +17,8 @@ from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
-from drivers.protocol.table import BROADCAST
-from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT
+from drivers.protocol.table import BROADCAST, REACTION
+from drivers.protocol.timing import ATTEMPTS, FAST, REPLY_TIMEOUT
 from drivers.trace import Direction
 from drivers.wires.wire import (
     Broken,
@@ -74,8 +74,11 @@ class Line:
         """The clock of the line [s]."""
         self._boot_time, self._boots_until = boot_time, -math.inf
         self._is_pumping = False
+        self._transits: dict[int, float] = {}  # of requests, by their words
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
+        self.has_set = False
+        """Whether it has a set that several lines are to play: no clock is read meanwhile."""
         self.late = 0.0
         """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
 
@@ -122,8 +125,7 @@ class Line:
     @property
     def awaited(self) -> "asyncio.Future[Values] | None":
         """The result of the request on the line, which a set waits for; None if it is free."""
-        job = self._current
-        return None if job is None or job.priority is Priority.READING else job.result
+        return None if self._current is None else self._current.result
 
     def arrival(self, words: int) -> float:
         """Return by when [s] a request of so many words arrives that is sent next.
@@ -131,8 +133,11 @@ class Line:
         As late as replies have come, by three frames of USB at the most. One that is lost is not
         waited for: it is repeated 30 ms later.
         """
+        takes = self._transits.get(words)
+        if takes is None:
+            takes = self._transits[words] = self.wire.transit(words)
         free = max(self.time(), self._free_at, self._sent_until)
-        return free + self.wire.transit(words) + min(self.late, _MAX_COMMIT_LATE) + _SENDING
+        return free + takes + min(self.late, _MAX_COMMIT_LATE) + _SENDING
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
@@ -155,13 +160,13 @@ class Line:
                 if self._queue.jobs and self._must_yield(job):
                     self._not_answered(job)
                 else:
-                    self._start(job, arrival.data)
+                    self._start(job, arrival.data, is_present=arrival.is_present)
                 continue
             self._current = member.silence_cause = None
             if isinstance(arrival, Written):
                 self._go_on(job)
                 continue
-            late = self.time() - job.started_at - member.exchange_time(job.name)
+            late = self.time() - job.started_at - job.takes
             self.late = min(max(late, self.late * _LATE_DECAY), MAX_LATE)
             if self.seen is not None:
                 self.seen("in", member.address, type(arrival).__name__, arrival)
@@ -217,10 +222,10 @@ class Line:
         finally:
             self._is_pumping = False
 
-    def _start(self, job: Job, rest: bytes = b"") -> None:
+    def _start(self, job: Job, rest: bytes = b"", *, is_present: bool = False) -> None:
         """Make a request in its turn and send it, noted for all that it reaches: no other way.
 
-        rest: of the request that is on the line already.
+        rest: of the request that is on the line already. is_present: its reply is made by that.
         """
         member, data = job.member, rest
         address = BROADCAST if member is None else member.address
@@ -238,7 +243,7 @@ class Line:
                     job.parts, job.make = job.make(), None
                     job.values = job.parts[0]
                 if member is not None:
-                    job.longer = member.next_request(job.name, job.values, job.priority)
+                    job.takes = member.next_request(job.name, job.values, job.priority)
                 if self.seen is not None:
                     self.seen("out", address, job.name, job.values)
                 data = self.wire.request(address, job.name, job.values)
@@ -249,6 +254,8 @@ class Line:
                 for each in self.members.values():
                     if address in (BROADCAST, each.address):
                         each.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            elif is_present and member is not None:
+                member.note_sent(job.name, job.values, now, begins + self.wire.takes)
             if trace.is_active():
                 what = job.name if member is None else f"{job.name} to {address}"
                 trace.frame(Direction.OUT, data, self.name, lambda: what)
@@ -270,11 +277,14 @@ class Line:
             job.result.set_result({})
             return
         if not rest:
-            # A slow wire: as long as on others until it counts as degraded.
-            job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
+            # A slow wire: as long as on others until it counts as degraded. But each of several
+            # parts is lost as easily: heartbeats, which go between them, find one that is mute.
+            is_cut = job.takes > FAST and job.attempts == ATTEMPTS and len(job.parts) < 2
+            job.attempts -= 2 if is_cut else 1
         # Each of the two responses on Modbus may begin late.
         late = self.late if self.late > GRACE else 0.0
-        job.due = max(job.due, begins + job.longer + job.timeout + late)
+        longer = job.takes - FAST if job.takes > FAST else 0.0
+        job.due = max(job.due, begins + longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
         self._current = job
         if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:  # often: without a call
@@ -286,7 +296,7 @@ class Line:
         """Send the next part of a set once what is under way has nearly arrived, or give way."""
         now = self.time()
         due = max(self._sent_until - _AHEAD, now + _FULL_PAUSE * self._port.is_blocked)
-        if due <= now or self._queue.has_before(job, now):
+        if due <= now or (self._queue.jobs and self._queue.has_before(job, now)):
             self._go_on(job)
         else:
             self._look_by(due)
@@ -298,7 +308,7 @@ class Line:
         job.go_to(job.part + 1)
         if self.wire.confirms_parts:
             job.reach(job.part)
-        if self._queue.has_before(job, self.time()):
+        if self._queue.jobs and self._queue.has_before(job, self.time()):
             self._queue_again(job)
         else:
             self._start(job)
@@ -357,14 +367,18 @@ class Line:
             self._send_further(current)
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
+        first, is_reading = min(waiting, default=8), current.priority is Priority.READING
         free_at = max(self.time(), self._free_at)
+        if first <= Priority.SILENCE:
+            current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
         # Where replies come late one that is cut short would never end.
-        yields_to = Priority.SET if self.late <= GRACE else Priority.SILENCE
-        if current.priority is Priority.READING and min(waiting, default=8) <= yields_to:
-            current.due = min(current.due, free_at)
-        elif min(waiting, default=8) <= Priority.SILENCE:
-            current.due = min(current.due, free_at + GRACE)
+        elif is_reading and first <= Priority.SET and self.late <= GRACE:
+            current.due = min(current.due, max(self.time(), self._begins_by(current)))
         self._look_by(current.due)
+
+    def _begins_by(self, job: Job) -> float:
+        """Return by when [s] the reply to the request on the line is due: none is from then on."""
+        return max(job.started_at + job.takes, self._free_at) + REACTION
 
     def _look_by(self, due: float) -> None:
         """Look at the request on the line at a time [s], or before."""

@@ -1,4 +1,4 @@
-"""An amplifier as it must be after what it was sent: state, latch, token, watchdog, faults.
+"""An amplifier as it must be after what it was sent: sessions, tokens, sets and what plays.
 
 What it was sent was carried out at some time between the request and its reply, and what it shows
 was true at some time between, so both are compared with all of that interval. Nothing is known at
@@ -6,119 +6,55 @@ first: the first status says how it is.
 """
 
 import math
-from collections import deque
-from collections.abc import Sequence
 from typing import TypeAlias
 
-from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
+from drivers.judge.clock import ExpectedClock
+from drivers.judge.outputs import one_of
 from drivers.judge.sets import ExpectedSet
+from drivers.judge.states import (
+    DISARMED,
+    FADE,
+    FAULT,
+    REACTING,
+    ROUNDED,
+    STOPPED,
+    SWITCHED_ON,
+    ExpectedStates,
+)
 from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
 from drivers.protocol.achieved import FLAGS, TONE, Problem, achieved_problem
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token, token_after
-from drivers.protocol.table import (
-    AHEAD_MAX,
-    ENABLED,
-    FAULTS,
-    LATCHED,
-    MESSAGES,
-    QUANTITIES,
-    STATES,
-    has_flag,
-    name_of,
-)
+from drivers.protocol.sets import LayerSet, is_newer_token
+from drivers.protocol.table import ENABLED, FAULTS, LATCHED, MESSAGES, QUANTITIES
 
-ROUNDED = 0.002  # s; of times in milliseconds
-_TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
-OFF, STOPPED = STATES["SWITCH_ON_DISABLED"], STATES["QUICK_STOP_ACTIVE"]
-REACTING, FAULT = STATES["FAULT_REACTION_ACTIVE"], STATES["FAULT"]
-_SWITCHED_ON, _READY = STATES["SWITCHED_ON"], STATES["READY_TO_SWITCH_ON"]
-_DISARMED = STATES["NOT_READY"], OFF, _READY
-_FALLING = {_SWITCHED_ON: OFF, REACTING: FAULT}
-"""States until all is silent, and then."""
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
 """Requests that feed the watchdog unless they are refused."""
 _ONLY_IN = {
     **dict.fromkeys(("Set", "Commit", "Silence"), (ENABLED,)),
-    "SetAddress": _DISARMED,
-    "Arm": (*_DISARMED, _SWITCHED_ON, ENABLED),
+    "SetAddress": DISARMED,
+    "Arm": (*DISARMED, SWITCHED_ON, ENABLED),
 }
 """States in which alone a request is accepted."""
-_NEVER: Interval = (-math.inf, math.inf)
 _NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
 """Refusals of a part by what it does not hold."""
-_MAX_AHEAD = AHEAD_MAX * HIGH_TIME  # s
 _Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
 """A committed set: its moment, token and layers, and whether it plays to the word."""
 
 
-class ExpectedAmplifier:
-    """One amplifier; state, latch, token and session are None while unknown; times [s].
-
-    report: takes what is wrong, always: what nothing excuses, unclear: why that is not known.
-    may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
-    of the watchdog. fed: when that was fed last, silent: when all that fades is silent. is_shown:
-    it has shown its state itself. last_status: since when nothing was seen. can: its capabilities.
-    """
-
-    def __init__(
-        self,
-        report: Report,
-        always: Report,
-        *,
-        unclear: Unclear | None = None,
-        may_fail: bool = True,
-        slack: float = 0.0,
-        left_slack: float = ROUNDED,
-    ) -> None:
-        self.can: Values = {}
-        self.report, self._always, self._unclear = report, always, unclear
-        self._may_fail, self.slack, self._left_slack = may_fail, slack, left_slack
-        self.forget()
-        self.last_status = -math.inf
-
-    def _expect(self, rule: str, time: float, what: str, must: object, seen: object) -> None:
-        """Report what is not as it must be."""
-        if must != seen:
-            self.report(rule, time, what, must=must, seen=seen)
+class ExpectedAmplifier(ExpectedStates):
+    """One amplifier; token and session are None while unknown; times [s]."""
 
     def forget(self, cause: str = "what was not heard") -> None:
         """Treat all as unknown until the next status."""
-        self.state: int | None = None
-        self.fault = FAULTS["NONE"]
-        self.latch: int | None = None
         self.token: int | None = None
         self.session: int | None = None
-        self.watchdog, self.fed, self.silent = math.inf, _NEVER, _NEVER
-        self.is_shown = True
         self.sets = ExpectedSet()
+        self.clock = ExpectedClock(self.report, self.slack)
         self._waiting: _Waiting | None = None
-        self._clock: tuple[int, Interval] | None = None  # that was read last, and when
-        self._marked: Interval | None = None  # when a Mark came that no status has shown
-        self._faults: deque[tuple[int, Interval]] = deque(maxlen=2)  # the newest first, and when
-        self._settle(cause)
-        self.outputs.forget()
-
-    def _settle(self, cause: str, when: Interval = _NEVER) -> None:
-        """Treat all channels as silent from some time between two on."""
-        self.outputs = ExpectedOutputs(
-            self.can,
-            report=self.report,
-            unclear=self._unclear,
-            slack=self.slack,
-            cause=cause,
-            began=when,
-        )
-
-    def identified(self, capabilities: Values) -> None:
-        """Note its capabilities."""
-        if capabilities != self.can:
-            self.can = capabilities
-            self._settle("what was not heard")
-            self.outputs.forget()
+        self._started = -math.inf  # by when a set that has waited has surely started
+        super().forget(cause)
 
     @property
     def to_play(self) -> Playback:
@@ -130,34 +66,6 @@ class ExpectedAmplifier:
         playback.commit(layers, token, sum(when) / 2)
         return playback
 
-    @property
-    def present(self) -> int:
-        """The high word of the clock that was read last, which names no moment ahead."""
-        return high_word(self._clock[0]) if self._clock is not None else 0
-
-    @property
-    def is_marked(self) -> bool:
-        """Whether its next status shows the clock of a Mark."""
-        return self._marked is not None
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether it is armed, as far as is known."""
-        return self.state == ENABLED
-
-    @property
-    def is_in_fault(self) -> bool:
-        """Whether it is in a fault, or reacting to one."""
-        return self.state in (REACTING, FAULT)
-
-    @property
-    def expiry(self) -> Interval:
-        """When the watchdog trips if it is not fed, at the earliest and at the latest."""
-        if self.watchdog == math.inf:  # not known
-            return _NEVER
-        early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
-        return self.fed[0] + early - ROUNDED, self.fed[1] + late
-
     # What it does
 
     def advance(self, time: float) -> None:
@@ -166,24 +74,16 @@ class ExpectedAmplifier:
             self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._play_waiting(*self._waiting)
-
-    def _trip(self, fault: int, since: Interval, cause: str) -> None:
-        self.fault = fault
-        self._latch_again()
-        self._faults.appendleft((fault, since))
-        self._fall_silent(REACTING, since, FADE, cause, has_floor=False)
-
-    def _latch_again(self) -> None:
-        self.latch = None if self.latch is None else token_after(self.latch)
+            self._start_waiting()
 
     def _fall_silent(
         self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
     ) -> None:
-        self.state = state
         self.sets.drop()
+        if self.may_start(when):  # so that what falls silent is unknown
+            self.outputs.forget()
         self._waiting = None
-        self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
+        super()._fall_silent(state, when, ramp, cause, has_floor=has_floor)
 
     def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
         """Apply a request that was carried out between two times, and compare its reply."""
@@ -235,7 +135,7 @@ class ExpectedAmplifier:
             case "Silence":
                 self._fall_silent(ENABLED, when, ramp, cause)
             case "Disarm" if self.state is not None:
-                state = _SWITCHED_ON if self.is_enabled else self.state
+                state = SWITCHED_ON if self.is_enabled else self.state
                 self._fall_silent(state, when, ramp, cause)
             case "Stop" if self.state is not None:
                 self._latch_again()
@@ -245,20 +145,9 @@ class ExpectedAmplifier:
             case "Commit":
                 self._commit(values, when)
             case "Set" if values["now"]:
-                self._start_waiting(values["token"], when)
                 self._play(values["token"], when)
             case "Mark":
-                self._marked = when
-
-    def _clear(self, latch: int, state: int, when: Interval) -> None:
-        """Leave a stop or a fault, once all is silent, where its cause is gone."""
-        is_gone = self.fault in (FAULTS["NONE"], FAULTS["WATCHDOG"])
-        is_off = state in _DISARMED and when[1] >= self.silent[0] - ROUNDED
-        if is_off and self.latch is not None:
-            self._expect("latched", when[1], "latch of Clear", self.latch, latch)
-        if is_off or (is_gone and self._is_silent(when)):
-            self.state, self.fault = OFF, FAULTS["NONE"]
-            self.outputs.cause = "Clear"
+                self.clock.mark(when)
 
     # Sets
 
@@ -281,7 +170,6 @@ class ExpectedAmplifier:
             seen = reply["missing"], reply["staged"], reply["played"]
             self._expect("commit", end, what, known, seen)
         if reply["played"]:
-            self._start_waiting(token, when)
             self._play(token, when)
 
     def part_came(self, part: Values, when: Interval) -> None:
@@ -306,52 +194,29 @@ class ExpectedAmplifier:
             seen = f"until {until:.4f} s" if until > -math.inf else "not staged"
             what = f"set {token} that is committed"
             self.report("token", when[1], what, must="staged", seen=seen)
-        self._start_waiting(token, when)
-        moment = self._moment(commit["at"], when)
-        layers = self.sets.whole(token)
-        if layers is None or moment == when:
-            self._play(token, when)
-            return
-        self._waiting, self.token = (moment, token, layers, self.sets.is_exact), token
-        self.sets.drop()
+        self._play(token, when, self.clock.moment(commit["at"], when))
 
-    def _moment(self, at: int, when: Interval) -> Interval:
-        """Return between which times a set starts whose commit is carried out between two."""
-        if self._clock is None:
-            return when[0], when[1] + _MAX_AHEAD
-        clock, read = self._clock
-        left = ahead(at * HIGH_STEPS, clock)
-        drift = DRIFT * (when[1] - read[0] + _MAX_AHEAD)
-        early, late = read[0] + left - drift, read[1] + left + drift
-        if early > when[1] and late <= when[0] + _MAX_AHEAD:
-            return early, late
-        if late <= when[0] or early > when[1] + _MAX_AHEAD:
-            return when
-        return when[0], max(when[1], late)
+    def _start_waiting(self, sooner: Interval = (math.inf, math.inf)) -> None:
+        """Start the set that waits at its moment, or sooner before another one."""
+        if self._waiting is not None:
+            (early, late), token, layers, is_exact = self._waiting
+            when = min(early, sooner[0]), min(late, sooner[1])
+            self._waiting, self._started = None, when[1]
+            self.outputs.play(layers, token, when, is_exact=is_exact)
 
-    def _start_waiting(self, token: int, when: Interval) -> None:
-        """Play the set that waits, before another that is played between two times."""
-        if self._waiting is not None and token != self.token:
-            (early, late), waiting, layers, is_exact = self._waiting
-            sooner = min(early, when[0]), min(late, when[1])
-            self._play_waiting(sooner, waiting, layers, is_exact)
-
-    def _play_waiting(
-        self, when: Interval, token: int, layers: tuple[LayerSet, ...], is_exact: bool
-    ) -> None:
-        """Have the set that waited play from some time between two on."""
-        self._waiting = None
-        self.outputs.play(layers, token, when, is_exact=is_exact)
-
-    def _play(self, token: int, when: Interval) -> None:
-        """Play a set between two times, unless it is the one that plays."""
+    def _play(self, token: int, when: Interval, moment: Interval | None = None) -> None:
+        """Play a set between two times or from a moment on, unless it is the one that plays."""
         if token == self.token:
             return
+        self._start_waiting(when)
         layers, self.token = self.sets.whole(token), token
         if layers is None:
             self.outputs.forget()
             return
-        self.outputs.play(layers, token, when, is_exact=self.sets.is_exact)
+        if moment is None:
+            self.outputs.play(layers, token, when, is_exact=self.sets.is_exact)
+        else:
+            self._waiting = moment, token, layers, self.sets.is_exact
         self.sets.drop()
 
     # What it shows
@@ -375,141 +240,22 @@ class ExpectedAmplifier:
         if not (low <= left <= max(high, 0.0) or is_unknown):
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
-        self._note_clock(shown["clock"], when)
+        self.clock.check(shown["clock"], when)
         if not self.may_start(when):
             self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = when[0]
 
     def may_start(self, when: Interval) -> bool:
-        """Whether a set that waits may have started by the end of an interval."""
-        return self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack
-
-    def _note_clock(self, clock: int, when: Interval) -> None:
-        """Note the clock that a status shows, or compare it with that of a Mark before it."""
-        marked, self._marked = self._marked, None
-        if marked is None:
-            self._clock = clock, when
-        elif self._clock is not None:
-            known, read = self._clock
-            slack = self.slack + DRIFT * (marked[1] - read[0])
-            low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
-            passed = ahead(clock, known)
-            if not low <= passed <= high:
-                what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
-                self.report("clock", when[1], what, must=must, seen=passed)
-
-    def note_state(self, shown: Values, when: Interval) -> bool:
-        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
-        now, fault, latch, end = shown["state"], shown["fault"], shown["latch"], when[1]
-        if self.state is None:
-            self._adopt(shown, when)
-        before = self.state
-        if now in (REACTING, FAULT) and before in (ENABLED, _SWITCHED_ON, STOPPED):
-            self._tripped(fault, when)
-        known = self._states(when)
-        if now not in known:
-            what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
-            must = one_of(map(self._name_of, known))
-            self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
-            return False
-        if fault and fault != self.fault and self._may_fail and not self.is_shown:
-            self.fault = fault  # which came before the watchdog, of which nothing was seen
-            self._faults[0] = fault, (self.last_status, end)
-        rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
-        self._expect(rule, end, f"fault after {cause}", self.fault, fault)
-        if self.latch is not None:
-            self._expect("latched", end, f"latch after {cause}", self.latch, latch)
-        self.state, self.fault, self.latch, self.is_shown = now, fault, latch, True
-        return True
-
-    def _is_silent(self, when: Interval) -> bool:
-        """Whether it must have been silent, and its state show so, between two times."""
-        return when[0] > self.silent[1] + _SETTLING + ROUNDED + self.slack
-
-    def _states(self, when: Interval) -> list[int]:
-        """Return the states in which it may be between two times."""
-        here = self.state or 0
-        if here not in _FALLING:
-            return [0, OFF] if here == STATES["NOT_READY"] else [here]
-        may_be_silent = when[1] > self.silent[0] - ROUNDED - self.slack
-        return [here] * (not self._is_silent(when)) + [_FALLING[here]] * may_be_silent
-
-    def _rule_against(self, now: int) -> str:
-        """Which rule a state breaks."""
-        if not self.is_shown:
-            return "watchdog" if now == ENABLED else "latched"
-        if now == ENABLED:
-            return "armed"
-        return "latched" if self.state in LATCHED else "state"
-
-    def _tripped(self, fault: int, when: Interval) -> None:
-        """Check a transition into a fault: the watchdog not before its time."""
-        since = min(self.last_status, when[1]), when[1]
-        if fault == FAULTS["WATCHDOG"]:
-            early, late = self.expiry
-            enabled_until = when[1] if self.is_enabled else self.outputs.began[1]
-            if enabled_until < early - self.slack:
-                what = f"time of the watchdog ({self.outputs.cause})"
-                must = f"from {early:.4f} to {late:.4f} s"
-                self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")
-            since = self._expired_by(when[1])
-        elif fault == FAULTS["NONE"] or not self._may_fail:
-            must, seen = "WATCHDOG" if fault else "one", name_of(FAULTS, fault)
-            self.report("state", when[1], "fault of a fault reaction", must=must, seen=seen)
-        self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
-
-    def _expired_by(self, time: float) -> Interval:
-        """Return between which times the watchdog tripped that has tripped by a time."""
-        early, late = self.expiry
-        first = min(max(early, self.last_status), time)
-        return first, max(min(late, time), first)
+        """Whether a set that waits, or has waited, may start within an interval."""
+        if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
+            return True
+        return when[0] <= self._started + self.slack
 
     def _adopt(self, shown: Values, when: Interval) -> None:
         """Go on with a status as it is."""
-        state = shown["state"]
-        if state != self.state:
-            self.state, self.silent = state, (-math.inf, math.inf)
-            if state in (*_DISARMED, FAULT):
-                self._settle(self._name_of(state), when)
-                self.silent = -math.inf, when[1]
-            elif state == ENABLED:
-                self.fed = -math.inf, when[1]
-                self.outputs.forget()
-            if self.is_in_fault:
-                self._faults.appendleft((shown["fault"], (-math.inf, when[1])))
-        self.fault, self.latch = shown["fault"], shown["latch"]
+        super()._adopt(shown, when)
         self.token = shown.get("token", self.token)
-        self.is_shown, self.last_status = True, when[0]
-
-    def _name_of(self, state: int | None) -> str:
-        return "unknown" if state is None else name_of(STATES, state)
-
-    def _check_voltage(self, shown: Values, when: Interval) -> None:
-        """Check high voltage, and the interlock of one that has it."""
-        must_be = self.state in (ENABLED, _SWITCHED_ON)
-        where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
-        if must_be:
-            is_open = has_flag(shown, "interlock_open")
-            self._expect("high_voltage", end, f"interlock_open {where}", False, is_open)
-        if must_be or self._is_silent(when):
-            is_on = has_flag(shown, "high_voltage")
-            self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
-
-    def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
-        """Check a list of faults: the newest first, those that were seen, of their ages."""
-        ages = [each["age"] for each in listed]
-        self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
-        faults = [(each["fault"], each["age"] / 1000) for each in listed]
-        left = iter(faults)
-        for fault, since in self._faults:
-            drift = DRIFT * (when[1] - since[0])
-            slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
-            low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
-            if not any(each == fault and low <= age <= high for each, age in left):
-                must = f"{name_of(FAULTS, fault)} of {low:.3f} to {high:.3f} s ago, in its turn"
-                self.report("faults", when[1], "listed faults", must=must, seen=faults)
-                return
 
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""

@@ -12,6 +12,7 @@ HIGH_WORDS = SPAN // HIGH_STEPS
 HIGH_TIME = CLOCK_TURN / HIGH_WORDS
 """Seconds of a step of the high word."""
 _PER_SECOND = SPAN / CLOCK_TURN
+_PASSED = 0.25  # s
 
 
 def clock_at(seconds: float) -> int:
@@ -24,14 +25,17 @@ def ahead(clock: int, of: int) -> float:
     return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
 
 
-def word_at(seconds: float) -> int:
-    """Return the high word that a clock of `clock_at` shows at a time [s]."""
-    return high_word(clock_at(seconds))
+def word_passed(seconds: float) -> int:
+    """Return a high word that is no moment ahead at a time [s], by a clock near `clock_at`.
+
+    A quarter of a second behind: before it is steered, a clock may be some steps behind.
+    """
+    return high_word(clock_at(seconds - _PASSED))
 
 
-def word_behind(seconds: float) -> int:
-    """Return the high word with which a clock of `clock_at` begins its next step from a time on."""
-    return (high_word(clock_at(seconds) - 1) + 1) % HIGH_WORDS
+def moment_behind(seconds: float) -> float:
+    """Return when [s] a clock of `clock_at` next begins a high word, from a time [s] on."""
+    return seconds + (-clock_at(seconds) % HIGH_STEPS) / _PER_SECOND
 
 
 def moment_of(at: int, seconds: float) -> float | None:

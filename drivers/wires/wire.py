@@ -86,9 +86,13 @@ class Several:
 
 @dataclass(frozen=True, slots=True)
 class More:
-    """The request goes on with these bytes, as on Modbus."""
+    """The request goes on with these bytes, as on Modbus.
+
+    is_present: its reply is of the moment at which they arrive.
+    """
 
     data: bytes
+    is_present: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,8 @@
  *
  *     cc -O2 -o amplifier amplifier.c -lm && ./amplifier --pty    (or /dev/ttyUSB0)
  *
- * Written from the rules of the protocol alone. It plays nothing: `level_of` is where the samples
- * of a channel come from. Times are in seconds, amplitudes in full levels.
- */
+ * Written from the pages of the protocol alone. `sample_of` is what the output of a channel would
+ * play. Times are in seconds, amplitudes in full levels. */
 
 #define _GNU_SOURCE 1
 #include <complex.h>
@@ -19,8 +18,8 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { CHANNELS = 2, LAYERS = 4, VOICES = 8, KNOTS = 32, SET_WORDS = 512, PAYLOAD = 240 };
-enum { ADDRESS = 1, BROADCAST = 0, VERSION = 3, REPLY = 0x80, NO_CHANNEL = 255 };
+enum { CHANNELS = 2, LAYERS = 4, VOICES = 8, SLOTS = VOICES + LAYERS, KNOTS = 32, SET_WORDS = 512 };
+enum { ADDRESS = 1, BROADCAST = 0, VERSION = 4, REPLY = 0x80, NO_CHANNEL = 255, PAYLOAD = 240 };
 enum { HELLO = 1, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP, GET_STATUS, GET_FAULTS, CLEAR,
        PING, GET_ACHIEVED, EVENT = 30, NAK };
 enum { UNKNOWN_TYPE = 1, BAD_LENGTH, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN,
@@ -28,443 +27,446 @@ enum { UNKNOWN_TYPE = 1, BAD_LENGTH, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TO
 enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT, WATCHDOG_FAULT = 1 };
 enum { FREQUENCY_MIN = 200, FREQUENCY_MAX = 20000, FULL = 10000, RAMP_MAX = 1000 };
 
-typedef struct {
-    int knots;
-    double step;
-    double complex knot[KNOTS];
-} Envelope;
+/* The clock: 2^32 steps in 20 s, here without going round. */
+#define CLOCK_HZ (4294967296.0 / 20)
+static double clock_start, clock_from, clock_speed = CLOCK_HZ;
+static double clock_at(double time) { return clock_start + (time - clock_from) * clock_speed; }
+static uint32_t clock_word(double time) { return (uint32_t)(uint64_t)clock_at(time); }
+static double moment_of(double clock) { return clock_from + (clock - clock_start) / clock_speed; }
+static void set_clock(double time, int shift, int rate) {
+    clock_start = clock_at(time) + 65536.0 * shift, clock_from = time;
+    clock_speed = CLOCK_HZ * (1 + rate * 1e-7);
+}
 
+typedef double complex Amplitude;
 typedef struct {           /* a tone, from start through its points, a step apart */
-    int is_on, layer, has_ended, has_ending, points;
-    double frequency, origin, start, step;
-    double complex point[KNOTS + 2];
-    Envelope ending;
+    int is_on, is_released, layer, frequency, level, phase, points, has_ending;
+    double start, step;
+    Amplitude point[KNOTS + 2];
+    uint16_t ending[2 + 2 * KNOTS];
 } Voice;
 
+typedef struct {           /* one whose token is 0 is not there */
+    uint16_t token, word[SET_WORDS];
+    int words;
+} Stream;
+
 typedef struct {
-    uint16_t token, ramp, valid_for, waiting[SET_WORDS], waiting_token;
-    int waiting_words;
-    double ends, waits_until;
+    uint16_t token, head[3]; /* of the set that plays */
+    Stream waiting;
+    double waits_until, ends; /* 0: never */
 } Layer;
 
-static Voice voices[CHANNELS][VOICES];
+static Voice voices[CHANNELS][SLOTS];
 static Layer layers[LAYERS];
-static int limited;        /* the sum of a channel, since the last status */
+static int is_silent = 1, limited; /* limited: the sum of a channel, since the last Status */
 
-#define EACH_VOICE(channel, voice)                      \
-    for (int channel = 0; channel < CHANNELS; channel++) \
-        for (Voice *voice = voices[channel]; voice < voices[channel] + VOICES; voice++)
+#define EACH_CHANNEL(c) for (int c = 0; c < CHANNELS; c++)
+#define EACH_OF(c, voice) for (Voice *voice = voices[c]; voice < voices[c] + SLOTS; voice++)
+#define EACH_VOICE(c, voice) EACH_CHANNEL(c) EACH_OF(c, voice)
 
 static int plays_in(const Voice *voice, int layer) {
-    return voice->is_on && voice->layer == layer && !voice->has_ended;
+    return voice->is_on && voice->layer == layer && !voice->is_released;
 }
-
+static int is_over(int layer) {
+    EACH_VOICE(channel, voice) if (plays_in(voice, layer)) return 0;
+    return 1;
+}
 static double end_of(const Voice *one) { return one->start + one->step * (one->points - 1); }
-static double complex last_of(const Voice *voice) { return voice->point[voice->points - 1]; }
-
-static double complex amplitude_of(const Voice *voice, double time) {
+static Amplitude last_of(const Voice *voice) { return voice->point[voice->points - 1]; }
+static int lasts(const Voice *voice, double until) { /* longer than that */
+    return voice->is_on && (last_of(voice) || end_of(voice) > until);
+}
+static Amplitude amplitude_of(const Voice *voice, double time) {
     if (time >= end_of(voice)) return last_of(voice);
     double steps = (time - voice->start) / voice->step, way = steps - (int)steps;
-    int index = (int)steps;
+    const Amplitude *from = voice->point + (int)steps;
     if (voice->points == 2) way = (1 - cos(M_PI * way)) / 2;
-    return voice->point[index] + (voice->point[index + 1] - voice->point[index]) * way;
+    return from[0] + (from[1] - from[0]) * way;
 }
 
-static double level_of(int channel, double time) { /* at the most: voices may cancel */
+static double level_of(int channel, double time) {
     double level = 0;
-    for (int i = 0; i < VOICES; i++)
-        if (voices[channel][i].is_on) level += cabs(amplitude_of(&voices[channel][i], time));
-    if (level > 1 + 0.5 / FULL) limited = 1;
+    EACH_OF(channel, voice) {
+        Amplitude sum = 0;
+        int count = 0;     /* of the same frequency: each adds its share of their sum */
+        EACH_OF(channel, other) if (other->is_on && other->frequency == voice->frequency)
+            sum += amplitude_of(other, time), count++;
+        if (voice->is_on) level += cabs(sum) / count;
+    }
+    limited |= level > 1 + 1.001 / FULL;
     return fmin(level, 1);
 }
 
-static void lead(Voice *voice, double time, const Envelope *shape, double ramp,
-                 double complex last) {
-    voice->point[0] = amplitude_of(voice, time);
-    int knots = shape ? shape->knots : 0;
-    if (knots) memcpy(&voice->point[1], shape->knot, knots * sizeof shape->knot[0]);
-    voice->point[knots + 1] = last;
-    voice->points = knots + 2;
-    voice->start = time;
-    voice->step = shape ? shape->step : ramp;
-}
-
-static void fade(Voice *voice, double time, double ramp, int by_ending) {
-    int was_fading = voice->has_ended;
-    voice->has_ended = 1;
-    if (by_ending && voice->has_ending && !was_fading) lead(voice, time, &voice->ending, ramp, 0);
-    else if (last_of(voice) || end_of(voice) > time + ramp) lead(voice, time, NULL, ramp, 0);
-}
-
-static void let_last(int layer) { layers[layer].ends = layers[layer].waits_until = INFINITY; }
-static void fade_layer(int layer, double time, double ramp, int by_ending) {
-    EACH_VOICE(channel, voice) if (plays_in(voice, layer)) fade(voice, time, ramp, by_ending);
-    let_last(layer);
-}
-
-static Voice *free_voice(int channel) { /* or the one that began to fade first: layers are fewer */
-    Voice *oldest = NULL;
-    for (Voice *voice = voices[channel]; voice < voices[channel] + VOICES; voice++) {
-        if (!voice->is_on) return voice;
-        if (voice->has_ended && (!oldest || voice->start < oldest->start)) oldest = voice;
+double sample_of(int channel, double time) { /* of the output, from -1 to 1 */
+    double sum = 0;
+    EACH_OF(channel, voice) if (voice->is_on) {
+        uint32_t angle = (uint32_t)voice->frequency * clock_word(time);
+        sum += cimag(amplitude_of(voice, time) * cexp(I * 2 * M_PI * (angle / 4294967296.0)));
     }
-    return oldest;
+    return fmax(-1, fmin(1, sum));
+}
+static Amplitude polar(const uint16_t *word) {
+    return word[0] / (double)FULL * cexp(I * M_PI * (int16_t)word[1] / 18000);
+}
+static int is_polar(const uint16_t *word) {
+    return word[0] <= FULL && (int16_t)word[1] >= -18000 && (int16_t)word[1] < 18000;
 }
 
-typedef struct {
-    const uint16_t *word;
-    int count, at, code, channel;
-} Words;
+static void lead(Voice *voice, double time, const uint16_t *envelope, double ramp, Amplitude to) {
+    int knots = envelope ? envelope[0] : 0;
+    voice->point[0] = amplitude_of(voice, time);
+    for (int i = 1; i <= knots; i++) voice->point[i] = polar(envelope + 2 * i);
+    voice->point[knots + 1] = to;
+    voice->points = knots + 2, voice->start = time;
+    voice->step = envelope ? envelope[1] / 10000.0 : ramp;
+}
+static void fade(Voice *voice, double time, double ramp) {
+    if (last_of(voice) || end_of(voice) > time + ramp) lead(voice, time, NULL, ramp, 0);
+    voice->is_released = 1;
+}
+/* The fade or ending of a channel that began first, of those that last longer. */
+static Voice *oldest_fade(int channel, double until) {
+    Voice *first = NULL;
+    EACH_OF(channel, voice) if (voice->is_released && lasts(voice, until))
+        if (!first || voice->start < first->start) first = voice;
+    return first;
+}
 
-static uint16_t next(Words *words) {
-    if (words->at < words->count) return words->word[words->at++];
-    words->code = BAD_LENGTH;
+/* Words of a command, and of a layer: more than are left if the stream ends amid it. */
+static int words_of_command(const uint16_t *word, int left) {
+    int at = 4, envelopes = left < at ? 0 : (word[0] >> 1 & 1) + (word[0] & 1);
+    for (; envelopes; envelopes--) at += at + 2 > left ? 2 : 2 + 2 * word[at];
+    return at;
+}
+static int words_of_layer(const uint16_t *word, int left) {
+    int at = 3, commands = left < at ? 0 : word[0] & 31;
+    for (; commands && at < left; commands--) at += words_of_command(word + at, left - at);
+    return at + 4 * commands;
+}
+static int is_good_command(const uint16_t *word) {
+    int flags = word[0], is_driven = word[2] || flags & 2;
+    if (flags >> 8 || !is_polar(word + 2)) return 0;
+    if (is_driven && (word[1] < FREQUENCY_MIN || word[1] > FREQUENCY_MAX)) return 0;
+    word += 4;
+    for (int envelopes = (flags >> 1 & 1) + (flags & 1); envelopes; envelopes--) {
+        int knots = word[0];
+        if (knots > KNOTS || word[1] < 1 || word[1] > 1000) return 0;
+        for (word += 2; knots; knots--, word += 2) if (!is_polar(word)) return 0;
+    }
+    return 1;
+}
+/* The code for what is wrong with a stream, or 0, and the channel at fault. */
+static int check_stream(const uint16_t *word, int count, int *channel) {
+    if (count > SET_WORDS) return BAD_LENGTH;
+    for (int seen = 0; count;) {
+        int head = word[0], layer = head >> 7, commands = head & 31, channels = 0;
+        int size = words_of_layer(word, count);
+        if (size > count) return BAD_LENGTH;
+        int is_odd = commands ? head >> 5 & 1 : head >> 6 & 1; /* renew with, after without */
+        if (is_odd || layer >= LAYERS || seen >> layer & 1) return BAD_VALUE;
+        if (word[1] > RAMP_MAX || word[2] > 60000) return BAD_VALUE;
+        seen |= 1 << layer, count -= size;
+        for (word += 3; commands; commands--, word += words_of_command(word, SET_WORDS)) {
+            *channel = word[0] >> 4 & 15;
+            if (*channel >= CHANNELS || channels >> *channel & 1) return BAD_CHANNEL;
+            if (!is_good_command(word)) return BAD_VALUE;
+            channels |= 1 << *channel;
+        }
+        *channel = NO_CHANNEL;
+    }
     return 0;
 }
 
-static void check(Words *words, int is_good, int code, int channel) {
-    if (!is_good && !words->code) words->code = code, words->channel = channel;
-}
-
-/* Read a level and a phase. */
-static double complex polar(Words *words, int channel) {
-    uint16_t level = next(words);
-    int16_t phase = (int16_t)next(words);
-    check(words, level <= FULL && phase >= -18000 && phase < 18000, BAD_VALUE, channel);
-    return level / (double)FULL * cexp(I * M_PI * phase / 18000);
-}
-
-static void read_envelope(Words *words, Envelope *envelope, int channel) {
-    int knots = next(words), step = next(words);
-    check(words, knots <= KNOTS && step >= 10 && step <= 1000, BAD_VALUE, channel);
-    if (words->code) return;
-    envelope->knots = knots, envelope->step = step / 10000.0;
-    for (int i = 0; i < knots; i++) envelope->knot[i] = polar(words, channel);
-}
-
-/* Read one layer; with `plays` its commands start at a time, else it is only checked. */
-static void read_layer(Words *words, int plays, uint16_t token, double time, int is_due) {
-    int start = words->at;
-    uint16_t head = next(words), ramp = next(words), valid_for = next(words);
-    int layer = head >> 7, after = head >> 6 & 1, renew = head >> 5 & 1, count = head & 31;
-    check(words, layer < LAYERS && ramp <= RAMP_MAX, BAD_VALUE, NO_CHANNEL);
-    check(words, valid_for <= 60000 && !(count ? renew : after), BAD_VALUE, NO_CHANNEL);
-    if (words->code) return;
-    double ends = valid_for ? time + valid_for / 1000.0 : INFINITY, waits = time;
-    Layer *state = &layers[layer];
-    if (plays && renew) { state->ends = ends; return; }
-    if (plays && after && !is_due)
-        EACH_VOICE(channel, voice)
-            if (plays_in(voice, layer) && voice->points > 2) waits = fmax(waits, end_of(voice));
-    int plays_now = plays && waits <= time, named = 0;
-    for (int i = 0; i < count; i++) {
-        uint16_t flags = next(words), frequency = next(words);
-        int channel = flags >> 4 & 15, has_onset = flags >> 1 & 1, has_ending = flags & 1;
-        check(words, !(flags >> 8), BAD_VALUE, NO_CHANNEL);
-        int is_new = channel < CHANNELS && !(named >> channel & 1);
-        double complex last = polar(words, channel);
-        check(words, is_new, BAD_CHANNEL, channel);
-        int is_driven = last != 0 || has_onset;
-        int is_within = frequency >= FREQUENCY_MIN && frequency <= FREQUENCY_MAX;
-        check(words, is_within || !is_driven, BAD_VALUE, channel);
-        Envelope onset, ending;
-        if (has_onset) read_envelope(words, &onset, channel);
-        if (has_ending) read_envelope(words, &ending, channel);
-        if (words->code) return;
-        named |= 1 << channel;
-        if (!plays_now) continue;
-        Voice *kept = NULL;
-        for (Voice *voice = voices[channel]; voice < voices[channel] + VOICES; voice++) {
-            if (!plays_in(voice, layer)) continue;
-            int keeps = flags >> 3 & 1 && voice->frequency == frequency / 20.0;
-            if (is_driven && keeps) kept = voice;
-            else fade(voice, time, ramp / 1000.0, !is_driven && !(flags >> 2 & 1));
+/* Begin the commands of a layer, given by its words; without any it falls silent. */
+static void play(const uint16_t *word, int count, uint16_t token, double time) {
+    Layer *layer = &layers[word[0] >> 7];
+    double ramp = word[1] / 1000.0;
+    layer->waiting.token = 0, layer->ends = count && word[2] ? time + word[2] / 1000.0 : 0;
+    EACH_CHANNEL(channel) {
+        static const uint16_t none[4];
+        const uint16_t *command = none, *next = word + 3;
+        for (int i = 0; i < count; i++, next += words_of_command(next, SET_WORDS))
+            if (next[0] >> 4 == channel) command = next;
+        const uint16_t *onset = command[0] & 2 ? command + 4 : NULL;
+        const uint16_t *ending = command + (onset ? 6 + 2 * onset[0] : 4);
+        int is_driven = command[2] || onset, keeps_phase = command[0] & 8;
+        Voice *voice = NULL;
+        EACH_OF(channel, each) if (plays_in(each, word[0] >> 7)) voice = each;
+        if (voice && !(is_driven && keeps_phase && voice->frequency == command[1])) {
+            if (is_driven || command[0] & 4 || !voice->has_ending) fade(voice, time, ramp);
+            else lead(voice, time, voice->ending, ramp, 0);
+            voice->is_released = 1, voice = NULL;
         }
         if (!is_driven) continue;
-        if (!kept) {
-            kept = free_voice(channel);
-            *kept = (Voice){.is_on = 1, .layer = layer, .points = 1, .frequency = frequency / 20.0,
-                            .origin = time, .start = time};
+        if (!voice) {
+            voice = oldest_fade(channel, 0);
+            EACH_OF(channel, each) if (!each->is_on) voice = each;
+            *voice = (Voice){.is_on = 1, .layer = word[0] >> 7, .points = 1, .start = time};
         }
-        lead(kept, time, has_onset ? &onset : NULL, ramp / 1000.0, last);
-        kept->has_ending = has_ending;
-        if (has_ending) kept->ending = ending;
+        lead(voice, time, onset, ramp, polar(command + 2));
+        voice->frequency = command[1], voice->level = command[2], voice->phase = command[3];
+        voice->has_ending = command[0] & 1;
+        if (voice->has_ending) memcpy(voice->ending, ending, (2 + 2 * ending[0]) * sizeof *word);
+        int excess = -VOICES;
+        EACH_OF(channel, each) excess += lasts(each, time + 0.002);
+        for (; excess > 0; excess--) fade(oldest_fade(channel, time + 0.002), time, 0.002);
     }
-    if (!plays) return;
-    state->waits_until = INFINITY;
-    if (!plays_now) {
-        state->waits_until = waits;
-        state->waiting_words = words->at - start;
-        memcpy(state->waiting, words->word + start, state->waiting_words * sizeof(uint16_t));
-        state->waiting_token = token;
-        return;
+    if (count) layer->token = token, memcpy(layer->head, word, sizeof layer->head);
+}
+
+static void start(const Stream *stream, double time) {
+    for (int at = 0, size; at < stream->words; at += size) {
+        const uint16_t *word = stream->word + at;
+        int layer = word[0] >> 7, is_after = word[0] >> 6 & 1, renews = word[0] >> 5 & 1;
+        double waits_until = time;
+        EACH_VOICE(channel, voice) if (plays_in(voice, layer) && voice->points > 2)
+            waits_until = fmax(waits_until, end_of(voice));
+        Layer *one = &layers[layer];
+        size = words_of_layer(word, stream->words - at);
+        if (renews) {
+            if (!is_over(layer)) one->ends = word[2] ? time + word[2] / 1000.0 : 0;
+        } else if (is_after && waits_until > time) {
+            one->waits_until = waits_until;
+            one->waiting.token = stream->token, one->waiting.words = size;
+            memcpy(one->waiting.word, word, size * sizeof *word);
+        } else play(word, word[0] & 31, stream->token, time);
     }
-    EACH_VOICE(channel, voice)
-        if (plays_in(voice, layer) && !(named >> channel & 1)) fade(voice, time, ramp / 1000.0, 1);
-    state->token = token, state->ramp = ramp, state->valid_for = valid_for, state->ends = ends;
 }
 
 static int state = DISABLED, fault;
 static uint16_t session, latch, committed;
-static double watchdog, last_fed, silent_from, faults_at[2] = {-1, -1};
-static struct {
-    uint16_t token, word[SET_WORDS], part[127][118];
-    int words, parts, length[127], is_whole;
+static double watchdog, last_fed, faults_at[2] = {-1, -1};
+static Stream staged, waiting;
+static double waits_for;   /* the clock at which what waits starts */
+static struct {            /* what is staged keeps its token here, too */
+    uint16_t token, word[127][117];
+    int parts, length[127]; /* one more than the words of a part, 0 for none */
     double began;
-} staged;
+} collected;
 
-static uint16_t after(uint16_t number) { return number == 65535 ? 1 : number + 1; }
 static int is_newer(uint16_t token, uint16_t than) {
     return !than || (token != than && (uint16_t)(token - than) < 32768);
 }
-
+static void drop_set(void) { memset(&collected, 0, sizeof collected), staged.token = 0; }
 static void silence(double time, double ramp) {
-    silent_from = time;
-    for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
-    EACH_VOICE(channel, voice) {
-        if (!voice->is_on) continue;
-        fade(voice, time, ramp, 0);
-        silent_from = fmax(silent_from, end_of(voice));
-    }
-    memset(&staged, 0, sizeof staged);
+    for (int i = 0; i < LAYERS; i++) layers[i].ends = layers[i].waiting.token = 0;
+    EACH_VOICE(channel, voice) if (voice->is_on) fade(voice, time, ramp);
+    drop_set(), waiting.token = 0;
 }
 
+/* Let happen what is due until now, each at its moment. */
 static void tick(double now) {
-    if (state == ENABLED && now >= last_fed + watchdog) {
-        faults_at[1] = faults_at[0], faults_at[0] = last_fed + watchdog;
-        silence(faults_at[0], 0.005);
-        state = REACTION, fault = WATCHDOG_FAULT, latch = after(latch);
-    }
-    for (int layer = 0; layer < LAYERS; layer++) {
-        Layer *one = &layers[layer];
-        if (now >= one->waits_until) {
-            Words words = {.word = one->waiting, .count = one->waiting_words};
-            read_layer(&words, 1, one->waiting_token, one->waits_until, 1);
+    for (double time = -1; time < now;) {
+        time = now;
+        if (state == ENABLED) time = fmin(time, last_fed + watchdog);
+        if (waiting.token) time = fmin(time, moment_of(waits_for));
+        for (Layer *one = layers; one < layers + LAYERS; one++) {
+            if (one->waiting.token) time = fmin(time, one->waits_until);
+            if (one->ends) time = fmin(time, one->ends);
         }
-        if (now >= one->ends) fade_layer(layer, one->ends, one->ramp / 1000.0, 1);
+        EACH_VOICE(c, each) if (end_of(each) < time && !lasts(each, time)) each->is_on = 0;
+        if (state == ENABLED && time >= last_fed + watchdog) {
+            faults_at[1] = faults_at[0], faults_at[0] = time;
+            silence(time, 0.005), set_clock(time, 0, 0);
+            state = REACTION, fault = WATCHDOG_FAULT, latch = latch % 65535 + 1;
+        }
+        if (collected.token && time >= collected.began + 1) drop_set();
+        if (waiting.token && time >= moment_of(waits_for)) start(&waiting, time), waiting.token = 0;
+        for (Layer *one = layers; one < layers + LAYERS; one++) {
+            const uint16_t *next = one->waiting.word;
+            int starts = one->waiting.token && time >= one->waits_until;
+            if (starts) play(next, next[0] & 31, one->waiting.token, time);
+            else if (one->ends && time >= one->ends) play(one->head, 0, 0, time);
+        }
+        is_silent = 1;
+        EACH_VOICE(channel, voice) if ((voice->is_on = lasts(voice, time))) is_silent = 0;
+        EACH_CHANNEL(channel) level_of(channel, time);
+        if (is_silent && state == REACTION) state = FAULT;
+        if (is_silent && state == SWITCHED_ON) state = DISABLED;
     }
-    EACH_VOICE(channel, voice)
-        if (voice->is_on && !last_of(voice) && now >= end_of(voice)) voice->is_on = 0;
-    for (int channel = 0; channel < CHANNELS; channel++) level_of(channel, now);
-    if (state == REACTION && now >= silent_from) state = FAULT;
-    if (state == SWITCHED_ON && now >= silent_from) state = DISABLED;
 }
 
-/* Requests: words in, words out; the code of a refusal, or 0. */
+/* Start what is staged: at once, or in some steps of the high word of the clock. */
+static void commit(double now, uint16_t steps) {
+    if (waiting.token) start(&waiting, now), waiting.token = 0;
+    committed = staged.token;
+    waits_for = (floor(clock_at(now) / 65536) + steps) * 65536;
+    if (steps >= 1 && steps <= 1638) waiting = staged;
+    else start(&staged, now);
+    drop_set();
+}
+
+/* Requests: words in, words out; the code of a refusal, 0, or -1 for a part that is not kept. */
 static uint16_t out[120];
 static int out_count;
-static void put(int word) { out[out_count++] = (uint16_t)word; }
-
-static int token_of(int layer) {
-    EACH_VOICE(channel, voice) if (plays_in(voice, layer)) return layers[layer].token;
-    return 0;
-}
-static void status(double now) {
-    int is_on = state == ENABLED || state == SWITCHED_ON || now < silent_from;
-    put(state), put(fault), put(is_on | limited << 2), put(latch), limited = 0;
-    put(state == ENABLED ? (int)lround(1000 * (last_fed + watchdog - now)) : 0);
-    put(250), put(is_on ? 1800 : 0), put(committed), put(CHANNELS << 8 | LAYERS);
-    for (int channel = 0; channel < CHANNELS; channel++)
-        put((int)lround(FULL * level_of(channel, now)));
-    for (int layer = 0; layer < LAYERS; layer++) put(token_of(layer));
-}
-
-static void play(const uint16_t *word, int count, uint16_t token, double now) {
-    Words words = {.word = word, .count = count};
-    while (words.at < count) read_layer(&words, 1, token, now, 0);
-    committed = token;
-    staged.is_whole = staged.parts = 0;
-}
-
-static int drop(int code) { return memset(&staged, 0, sizeof staged), code; }
-static int taken(uint16_t token, int is_staged, int is_played, int missing) {
-    return put(token), put(1 << 2 | is_staged << 1 | is_played), put(missing), 0;
-}
-
+static void put(uint32_t word) { out[out_count++] = (uint16_t)word; }
 static int take_part(const uint16_t *in, int count, double now, int *channel) {
+    static uint16_t word[127 * 117];
     uint16_t token = in[1];
-    int index = in[2] >> 8, parts = in[2] >> 1 & 127, plays = in[2] & 1;
-    if (token == committed) return taken(token, 0, 1, 0);
-    if (!token || !is_newer(token, committed)) return BAD_TOKEN;
-    if (index >= parts || count > 121) return BAD_VALUE;
-    if (staged.token != token || now - staged.began > 1) {
-        if (staged.token && now - staged.began <= 1 && !is_newer(token, staged.token))
-            return BAD_TOKEN;
-        memset(&staged, 0, sizeof staged);
-        staged.token = token, staged.parts = parts, staged.began = now;
+    int index = in[2] >> 8, parts = in[2] >> 1 & 127, plays = in[2] & 1, words = 0;
+    int is_same = token == collected.token, is_staged = token == staged.token;
+    int is_old = !is_newer(token, committed) || !(is_same || is_newer(token, collected.token));
+    if (index < parts - 1) {
+        if (is_old || is_staged || (is_same && parts != collected.parts)) return -1;
+        if (!is_same) drop_set(), collected.began = now;
+        collected.token = token, collected.parts = parts, collected.length[index] = count + 1;
+        memcpy(collected.word[index], in + 3, count * sizeof *in);
+        return 0;
     }
-    if (staged.is_whole) return taken(token, 1, 0, 0);
-    if (staged.parts != parts) return BAD_VALUE;
-    memcpy(staged.part[index], in + 3, (count - 3) * sizeof *in);
-    staged.length[index] = count - 3 + 1;
-    for (int i = 0; i < parts; i++)
-        if (!staged.length[i]) return taken(token, 0, 0, i);
-    staged.words = 0;
-    for (int i = 0; i < parts; i++) {
-        int length = staged.length[i] - 1;
-        if (staged.words + length > SET_WORDS) return drop(BAD_LENGTH);
-        memcpy(staged.word + staged.words, staged.part[i], length * sizeof *in);
-        staged.words += length;
+    if (token != committed && !is_staged) {
+        if (is_old) return BAD_TOKEN;
+        if (index >= parts || (is_same && parts != collected.parts)) return BAD_VALUE;
+        for (int i = 0; i < index; words += collected.length[i++] - 1) {
+            if (!is_same || !collected.length[i]) return put(token), put(0), put(i), 0;
+            memcpy(word + words, collected.word[i], (collected.length[i] - 1) * sizeof *in);
+        }
+        memcpy(word + words, in + 3, count * sizeof *in), words += count;
+        int code = check_stream(word, words, channel);
+        if (code && is_same) drop_set();
+        if (code) return code;
+        if (!is_same) collected.began = now;
+        collected.token = staged.token = token, staged.words = words;
+        memcpy(staged.word, word, words * sizeof *word);
     }
-    Words words = {.word = staged.word, .count = staged.words, .channel = NO_CHANNEL};
-    int seen = 0;
-    while (words.at < words.count && !words.code) {
-        int layer = staged.word[words.at] >> 7 & 15;
-        check(&words, !(seen >> layer & 1), BAD_VALUE, NO_CHANNEL);
-        seen |= 1 << layer;
-        read_layer(&words, 0, 0, 0, 0);
-    }
-    if (words.code) return *channel = words.channel, drop(words.code);
-    staged.is_whole = 1;
-    if (plays) play(staged.word, staged.words, token, now);
-    return taken(token, !plays, plays, 0);
+    if (token != committed && plays) commit(now, 0);
+    return put(token), put(token == committed ? 5 : 6), put(0), 0; /* exact, and which */
 }
 
-static int commit(uint16_t token, double now) {
-    if (token == committed) return 0;
-    if (staged.token != token || now - staged.began > 1) return BAD_TOKEN;
-    if (!staged.is_whole) return staged.parts ? INCOMPLETE : BAD_TOKEN;
-    play(staged.word, staged.words, token, now);
-    return 0;
-}
-
-static int achieved(int layer) {
-    if (layer >= LAYERS) return BAD_VALUE;
-    int token = token_of(layer), count = 0, head = out_count + 1;
-    put(token), put(0);
-    put(token ? layers[layer].ramp : 0), put(token ? layers[layer].valid_for : 0);
-    EACH_VOICE(channel, voice) {
-        if (!plays_in(voice, layer)) continue;
-        put(channel << 4), put((int)lround(20 * voice->frequency));
-        put((int)lround(FULL * cabs(last_of(voice))));
-        put((int)lround(18000 / M_PI * carg(last_of(voice))));
-        count++;
-    }
-    out[head] = (uint16_t)(layer << 7 | count);
-    return 0;
-}
-
-static int handle(int type, const uint16_t *in, int count, double now, int *channel) {
-    static const int lengths[] = {[ARM] = 2, [DISARM] = 1, [SET] = 3, [COMMIT] = 2, [SILENCE] = 2,
-                                  [STOP] = 1, [CLEAR] = 1, [PING] = 1, [GET_ACHIEVED] = 1};
+static int handle(int type, const uint16_t *in, int bytes, double now, int *channel) {
+    static const char *const kinds[] = { /* session, token, watchdog, ramp, layer, others */
+        "", "sw*", "*", "st*", "st*", "sr", "*", "", "", "*", "s*", "l"};
     if (type < GET_CAPS || type > GET_ACHIEVED) return UNKNOWN_TYPE;
-    if (count < lengths[type] || (type != SET && count > lengths[type])) return BAD_LENGTH;
-    int feeds = type == ARM || type == SET || type == COMMIT || type == SILENCE || type == PING;
-    int plays = type == SET || type == COMMIT || type == SILENCE, code = 0;
-    if ((plays && state != ENABLED) || (type == ARM && state > ENABLED)) return WRONG_STATE;
-    if (feeds && !in[0]) return BAD_VALUE;
-    if (feeds && state == ENABLED && in[0] != session) return WRONG_SESSION;
-    if (type == ARM && state != ENABLED && in[0] == session) return WRONG_SESSION;
-    if (type == ARM && (in[1] < 100 || in[1] > 2000)) return BAD_VALUE;
-    if (type == SILENCE && in[1] > RAMP_MAX) return BAD_VALUE;
-    if (type == ARM) {
-        watchdog = in[1] / 1000.0;
-        if (state != ENABLED) silence(now, 0.005), committed = 0, session = in[0], state = ENABLED;
-    } else if (type == DISARM || type == STOP) {
-        if (type == STOP) latch = after(latch);
-        silence(now, fmin(in[0], RAMP_MAX) / 1000);
-        if (type == DISARM && state == ENABLED) state = SWITCHED_ON;
-        if (type == STOP && state < REACTION) state = STOPPED;
-    } else if (type == SILENCE) {
-        silence(now, in[1] / 1000.0);
-    } else if (type == CLEAR && state >= STOPPED) {
-        if (in[0] != latch) return WRONG_LATCH;
-        if (now >= silent_from && state != REACTION) state = DISABLED, fault = 0;
-    } else if (type == SET) {
-        code = take_part(in, count, now, channel);
-    } else if (type == COMMIT) {
-        code = in[1] ? commit(in[1], now) : BAD_TOKEN;
+    const char *kind = kinds[type - GET_CAPS];
+    int count = (int)strlen(kind), feeds = kind[0] == 's', is_armed = state == ENABLED, code = 0;
+    for (int i = 0; i < count; i++) {
+        int word = in[i];
+        if (bytes < 2 * i + 2) return BAD_LENGTH;
+        if (kind[i] == 't' && !word) return BAD_TOKEN;
+        if ((kind[i] == 's' && !word) || (kind[i] == 'w' && (word < 100 || word > 2000)) ||
+            (kind[i] == 'r' && word > RAMP_MAX) || (kind[i] == 'l' && word > 15)) return BAD_VALUE;
     }
-    if (code) return code;
-    if (feeds && state == ENABLED) last_fed = now;
+    if (bytes % 2 || (type != SET && bytes > 2 * count)) return BAD_LENGTH;
+    if (type == ARM ? state > ENABLED : feeds && type != PING && !is_armed) return WRONG_STATE;
+    if (feeds && is_armed && in[0] != session) return WRONG_SESSION;
+    if (type == ARM && !is_armed && in[0] == session) return WRONG_SESSION;
+    if (type == ARM) {
+        watchdog = in[1] / 1000.0, session = in[0], state = ENABLED;
+        if (!is_armed) silence(now, 0.005), set_clock(now, in[2], 0), committed = 0;
+    } else if (type == DISARM || type == STOP) {
+        silence(now, fmin(in[0], RAMP_MAX) / 1000), set_clock(now, 0, 0);
+        if (type == STOP) latch = latch % 65535 + 1;
+        if (type == STOP && state < STOPPED) state = STOPPED;
+        if (type == DISARM && is_armed) state = SWITCHED_ON;
+    } else if (type == SILENCE) silence(now, in[1] / 1000.0);
+    else if (type == CLEAR && (state == STOPPED || state == FAULT)) {
+        if (in[0] != latch) return WRONG_LATCH;
+        if (is_silent) state = DISABLED, fault = 0;
+    } else if (type == PING && is_armed) set_clock(now, 0, (int16_t)in[1]);
+    else if (type == SET) code = take_part(in, bytes / 2 - 3, now, channel);
+    else if (type == COMMIT && in[1] != committed) {
+        if (in[1] != collected.token) return BAD_TOKEN;
+        if (in[1] != staged.token) return INCOMPLETE;
+        commit(now, (uint16_t)(in[2] - (clock_word(now) >> 16)));
+    } else if (type == GET_ACHIEVED && in[0] >= LAYERS) return BAD_VALUE;
+    if (feeds && state == ENABLED && !code) last_fed = now;
     tick(now);
-    if (type == SET || type == GET_ACHIEVED) return type == SET ? 0 : achieved(in[0]);
-    if (type == GET_FAULTS) {
+    return code;
+}
+
+static void put_status(double now) {
+    int is_high = state == ENABLED || !is_silent;
+    put(state), put(fault), put(is_high | limited << 2), put(latch), limited = 0;
+    put(state == ENABLED ? (int)lround(1000 * (last_fed + watchdog - now)) : 0);
+    put(250), put(is_high ? 1800 : 0), put(clock_word(now) >> 16), put(clock_word(now));
+    put(committed), put(CHANNELS << 8 | LAYERS);
+    EACH_CHANNEL(i) put((int)lround(FULL * level_of(i, now)));
+    for (int i = 0; i < LAYERS; i++) put(is_over(i) ? 0 : layers[i].token);
+}
+static void put_achieved(int layer) {
+    static const Layer none;
+    const Layer *one = is_over(layer) ? &none : &layers[layer];
+    put(one->token), put(layer << 7), put(one->head[1]), put(one->head[2]);
+    EACH_VOICE(channel, voice) if (plays_in(voice, layer)) {
+        put(channel << 4), put(voice->frequency), put(voice->level), put(voice->phase);
+        out[1]++;          /* count */
+    }
+}
+static void put_reply(int type, const uint16_t *in, double now) {
+    static const uint16_t caps[] = {CHANNELS, LAYERS, VOICES, SET_WORDS, KNOTS, 0, FREQUENCY_MIN,
+                                    FREQUENCY_MAX, 1, FULL, 1, 1, RAMP_MAX, 0, 100, 2000, 1, 1000,
+                                    10, FREQUENCY_MIN, FREQUENCY_MAX, FULL, FREQUENCY_MIN,
+                                    FREQUENCY_MAX, FULL};
+    if (type == GET_CAPS) {
+        for (unsigned i = 0; i < sizeof caps / sizeof *caps; i++) put(caps[i]);
+    } else if (type == GET_FAULTS) {
         put((faults_at[0] >= 0) + (faults_at[1] >= 0));
         for (int i = 0; i < 2 && faults_at[i] >= 0; i++) {
             uint32_t age = (uint32_t)(1000 * (now - faults_at[i]));
-            put(WATCHDOG_FAULT), put(NO_CHANNEL), put(age >> 16), put(age & 0xFFFF);
+            put(WATCHDOG_FAULT), put(NO_CHANNEL), put(age >> 16), put(age);
         }
-        return 0;
-    }
-    if (type != GET_CAPS) return status(now), 0;
-    int caps[] = {CHANNELS, LAYERS, VOICES, SET_WORDS, KNOTS, 0, FREQUENCY_MIN, FREQUENCY_MAX, 1,
-                  FULL, 1, 1, RAMP_MAX, 65535, 100, 2000, 10, 1000};
-    for (unsigned i = 0; i < sizeof caps / sizeof *caps; i++) put(caps[i]);
-    for (int i = 0; i < CHANNELS; i++) put(FREQUENCY_MIN), put(FREQUENCY_MAX), put(FULL);
-    return 0;
+    } else if (type == GET_ACHIEVED) put_achieved(in[0]);
+    else if (type != SET) put_status(now);
 }
 
 /* The serial line: 00, COBS of (type, version, address, sequence, payload, CRC-32), 00. */
+enum { CRC_WITH_CRC = 0x2144DF1C }; /* of any bytes with their CRC behind them */
 static uint32_t crc_of(const uint8_t *data, int length) {
     uint32_t crc = 0xFFFFFFFF;
-    for (int i = 0; i < length; i++) {
-        crc ^= data[i];
-        for (int bit = 0; bit < 8; bit++) crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320 : 0);
+    for (int bit = 0; bit < 8 * length; bit++) {
+        crc ^= data[bit / 8] >> bit % 8 & 1;
+        crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320 : 0);
     }
     return ~crc;
 }
-
 static void send_frame(int line, uint8_t *frame, int length) {
     uint32_t crc = crc_of(frame, length);
     for (int i = 0; i < 4; i++) frame[length++] = (uint8_t)(crc >> 8 * i);
     uint8_t stuffed[PAYLOAD + 16] = {0};
-    int code = 1, at = 2;
+    int code = 1;
     for (int i = 0; i < length; i++) {
-        if (frame[i]) { stuffed[at++] = frame[i]; continue; }
-        stuffed[code] = (uint8_t)(at - code);
-        code = at++;
+        stuffed[i + 2] = frame[i];
+        if (!frame[i]) stuffed[code] = (uint8_t)(i + 2 - code), code = i + 2;
     }
-    stuffed[code] = (uint8_t)(at - code);
-    stuffed[at++] = 0;
-    if (write(line, stuffed, at) != at) perror("write");
+    stuffed[code] = (uint8_t)(length + 2 - code);
+    if (write(line, stuffed, length + 3) != length + 3) perror("write");
 }
 
 static void received(int line, const uint8_t *stuffed, int length, double now) {
+    static const char hello[] = "\x10\0" "\3you" "\22smallest amplifier" "\12SMALLEST-1" "\0011";
     uint8_t frame[PAYLOAD + 16];
-    int size = 0;
-    for (int at = 0; at < length;) {
-        int code = stuffed[at++];
-        for (int i = 1; i < code; i++) {
-            if (at >= length) return;
-            frame[size++] = stuffed[at++];
-        }
-        if (code < 255 && at < length) frame[size++] = 0;
+    int size = 0, code_at = 0;
+    for (int i = 0; i < length; i++) {
+        if (i) frame[size++] = i == code_at ? 0 : stuffed[i];
+        if (i == code_at) code_at += stuffed[i];
     }
-    if (size < 9 || size > PAYLOAD + 9) return;
-    uint32_t crc = 0;
-    for (int i = 0; i < 4; i++) crc |= (uint32_t)frame[size - 4 + i] << 8 * i;
+    if (code_at != length || size < 9 || crc_of(frame, size) != CRC_WITH_CRC) return;
     int type = frame[0], address = frame[2], bytes = size - 9;
-    if (crc != crc_of(frame, size - 4) || type & REPLY || type == EVENT) return;
-    if (address != ADDRESS && !(address == BROADCAST && (type == COMMIT || type == STOP))) return;
-    tick(now);
-    int code = 0, channel = NO_CHANNEL, version = VERSION;
+    int is_known = frame[1] == VERSION, is_for_all = is_known && (type == COMMIT || type == STOP);
+    if (type & REPLY || type == EVENT) return;
+    if (address != ADDRESS && !(address == BROADCAST && is_for_all)) return;
+    if (type == HELLO) {
+        frame[0] = HELLO | REPLY, frame[1] = 0;
+        memcpy(frame + 5, hello, sizeof hello - 1);
+        send_frame(line, frame, 5 + sizeof hello - 1);
+        return;
+    }
     uint16_t in[PAYLOAD / 2] = {0};
     for (int i = 0; i < bytes; i++) in[i / 2] |= (uint16_t)(frame[5 + i] << 8 * (i % 2));
     out_count = 0;
-    if (type == HELLO) {
-        static const char *const texts[] = {"you", "smallest amplifier", "SMALLEST-1", "1"};
-        frame[0] = HELLO | REPLY, frame[1] = 0, frame[5] = 1 << VERSION, frame[6] = 0;
-        int at = 7;
-        for (int i = 0; i < 4; i++) {
-            frame[at] = (uint8_t)strlen(texts[i]);
-            memcpy(frame + at + 1, texts[i], frame[at]), at += 1 + frame[at];
-        }
-        send_frame(line, frame, at);
-        return;
-    }
-    if (frame[1] != VERSION) code = UNSUPPORTED_VERSION, version = 0;
-    else if (bytes % 2) code = BAD_LENGTH;
-    else code = handle(type, in, bytes / 2, now, &channel);
-    if (address == BROADCAST) return;
+    tick(now);
+    int channel = NO_CHANNEL;
+    int code = is_known ? handle(type, in, bytes, now, &channel) : UNSUPPORTED_VERSION;
+    int is_part = is_known && type == SET && bytes >= 6 && in[2] >> 8 < (in[2] >> 1 & 127) - 1;
+    if (address == BROADCAST || is_part) return;
     if (code) out_count = 0, put(type), put(code), put(channel);
-    frame[0] = (uint8_t)((code ? NAK : type) | REPLY), frame[1] = (uint8_t)version;
+    else put_reply(type, in, now);
+    frame[0] = (uint8_t)((code ? NAK : type) | REPLY), frame[1] = is_known ? VERSION : 0;
     for (int i = 0; i < 2 * out_count; i++) frame[5 + i] = (uint8_t)(out[i / 2] >> 8 * (i % 2));
     send_frame(line, frame, 5 + 2 * out_count);
 }
-
 static void take(int line, const uint8_t *data, ssize_t count, double now) {
-    static uint8_t frame[PAYLOAD + 16];
+    static uint8_t frame[PAYLOAD + 11]; /* one byte more than the longest */
     static int length;
     for (ssize_t i = 0; i < count; i++) {
         if (data[i] && length < (int)sizeof frame) frame[length++] = data[i];
@@ -481,20 +483,18 @@ int main(int argc, char **argv) {
     if (is_pty) far = grantpt(line) || unlockpt(line) ? -1 : open(ptsname(line), flags);
     struct termios raw;
     if (far < 0 || tcgetattr(far, &raw)) return perror(argv[1]), 2;
-    cfmakeraw(&raw);
-    cfsetspeed(&raw, B921600);
-    tcsetattr(far, TCSANOW, &raw);
+    cfmakeraw(&raw), cfsetspeed(&raw, B921600), tcsetattr(far, TCSANOW, &raw);
     if (is_pty) printf("serial://%s\n", ptsname(line)), fflush(stdout);
-    for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
     uint8_t data[256];
     struct pollfd ready = {.fd = line, .events = POLLIN};
     for (;;) {
         poll(&ready, 1, 1);
+        if (ready.revents & (POLLHUP | POLLERR)) return 0;
+        ssize_t count = ready.revents & POLLIN ? read(line, data, sizeof data) : 0;
         struct timespec clock;
         clock_gettime(CLOCK_MONOTONIC, &clock);
         double now = (double)clock.tv_sec + clock.tv_nsec / 1e9;
         tick(now);
-        if (ready.revents & (POLLHUP | POLLERR)) return 0;
-        if (ready.revents & POLLIN) take(line, data, read(line, data, sizeof data), now);
+        take(line, data, count, now);
     }
 }

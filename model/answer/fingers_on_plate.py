@@ -154,4 +154,5 @@ class FingerForms:
         """
         fine, n = np.asarray(self.contacts.fine_fields), forms.era_count
         quiet = self.contacts.uncertain[:, others, None] + outer(fine[:, others][:, :, points])
-        return replace(forms, quiet=quiet.reshape(len(fine), -1, n, n), few=None, fine=None)
+        found = replace(forms, quiet=quiet.reshape(len(fine), -1, n, n), few=None, fine=None)
+        return found if forms.driven is None else found.among(forms.driven)

@@ -73,8 +73,9 @@ def answer(
     bands allow it; bands_may_swap: whether a finger may have the band of another one;
     min_contrast_db: below which the promise at the worst finger is not served as requested;
     limits: of the amplifiers. A stimulus whose modulation would leave a finger unserved, or whose
-    side bands do not fit, is steady, as is a shared one. Levels are lowered where stroke and limits
-    do not allow all: of the lower priorities first, of one priority the louder ones first.
+    side bands do not fit, is steady, as is a shared one, and all where clocks are not held.
+    Levels are lowered where stroke and limits do not allow all: of the lower priorities first, of
+    one priority the louder ones first.
     Raises InputError for fingers that contradict each other, and a band without frequencies.
     """
     if not 0 <= apart_hz < math.inf:  # False for NaN
@@ -196,7 +197,7 @@ class _Answering:
             below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
             found = best_by(allowed, worst_of)
             found = replace(found, applied=(*found.applied, below))
-        if is_modulated and self.drive_mode == UNRESTRICTED:
+        if is_modulated and self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
             found = with_modulation(self.table, found, playable=self.limits.frequencies)
         for stream in found.contents.streams:
             if stream.limit_db_sl is not None:

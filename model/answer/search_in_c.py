@@ -5,6 +5,8 @@ from ctypes import addressof
 from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from model.answer.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
 from model.answer.search import (
     KEPT,
@@ -113,7 +115,7 @@ def _with(table: LocalizationTable, fingers: int) -> _Fingers:
 
 def _kept_of(table: LocalizationTable) -> _Kept:
     """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
-    uncertainty = table.uncertainty
+    uncertainty, groups = table.uncertainty, table.clocks.groups
     variance = uncertainty.gain_variance
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
@@ -123,11 +125,14 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
         (WeightSearch * 3)(*map(_method, coherent.WITHIN_STROKE)),
+        1 + max(groups, default=0),
     )
     rules.point(
         rim=CENTRE_AND_RIM,
+        group=np.array(groups, dtype=np.int32) if groups else None,
         threshold=table.thresholds,
         error=table.error_power,
+        shares=table.attached.power_shares,
         frequencies=table.frequencies,
     )
     return plates_structure(table.on_eras), given_raster(table), rules, {}

@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
@@ -62,7 +64,8 @@ def choose_by_numpy(
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
     if contents.drive_mode == UNRESTRICTED:
-        kept = ranked(fingers, contents) if contents.is_ranked and not any(ringing) else rows
+        is_ranked = contents.is_ranked and not any(ringing) and not table.clocks.groups
+        kept = ranked(fingers, contents) if is_ranked else rows
         found, is_limited = _candidates(fingers, contents, kept, ringing)
         if len(kept) < len(rows) and (not found.drives or is_limited):
             found, is_limited = _candidates(fingers, contents, rows, ringing)
@@ -118,7 +121,10 @@ def _candidates(
     rows: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Candidates, bool]:
-    """The best tones of each content in each band, and whether a level was hard to reach."""
+    """The best tones of each content in each band, and whether a level was hard to reach.
+
+    Of all ERAs together, or of each group whose clocks are held together.
+    """
     count, hertz = len(contents.streams), fingers.table.frequencies
     formed = fingers.forms(rows, with_fine=None in ringing)
     apart_hz = contents.apart_hz if count > 1 else 0.0
@@ -135,17 +141,26 @@ def _candidates(
                 short = _short_candidates(asked, here, stream.targets, others, over)
                 found += [(number, band, score, drive) for score, drive in short]
                 continue
-            searched, forms = search_to_level(asked)
-            is_limited |= len(searched.level_limited) > 0 or forms is not asked
-            ways = [searched]
-            if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
-                ways.append(search(here.by_point(forms, others)))
-            for way in ways:
-                for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
-                    drive = [(int(here.rows[each]), way.weights[each])]
-                    found.append((number, band, float(way.score[each]), drive))
+            groups = [asked.among(each) for each in _groups(fingers.table)]
+            searches = [(each, *search_to_level(each)) for each in groups]
+            reaching = [each for each in searches if each[2] is each[0]]
+            for own, searched, forms in reaching or searches:
+                is_limited |= len(searched.level_limited) > 0 or forms is not own
+                ways = [searched]
+                if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
+                    ways.append(search(here.by_point(forms, others)))
+                for way in ways:
+                    for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
+                        drive = [(int(here.rows[each]), way.weights[each])]
+                        found.append((number, band, float(way.score[each]), drive))
     streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
+    """Which ERAs may play one content together (n,), for each group of them."""
+    groups = np.array(table.clocks.groups or [0] * len(table.eras))
+    return [groups == each for each in np.unique(groups)]
 
 
 def _short_candidates(
@@ -161,8 +176,10 @@ def _short_candidates(
     for a vibration that lasts.
     """
     count = MAX_DURING_EFFECT if others else MAX_ALONE
-    found, _ = search_to_level(_forms_over(steady, formed, targets, others, over))
-    best = _drives_of(found, formed.rows, best_first(found.score)[:count])
+    forms, best = _forms_over(steady, formed, targets, others, over), []
+    for is_driven in _groups(formed.fingers.table):
+        found, _ = search_to_level(forms.among(is_driven))
+        best += _drives_of(found, formed.rows, best_first(found.score)[:count])
     if not others:
         return best
     rows = np.unique([row for _, ((row, _),) in best])
@@ -170,7 +187,10 @@ def _short_candidates(
     during = forms_of(
         steady.at(some), formed.at(some), targets, others, responses.fields(), responses.count
     )
-    return best + _drives_of(search_all(during), rows, np.arange(len(rows)))
+    for is_driven in _groups(formed.fingers.table):
+        found = search_all(during.among(is_driven))
+        best += _drives_of(found, rows, np.arange(len(rows)))
+    return best
 
 
 def _forms_over(
@@ -201,7 +221,7 @@ def _switched_candidates(
 ) -> Candidates:
     """The best patterns of the mode `switched` for an only content.
 
-    Near the highest level where none reaches it.
+    Near the highest level where none reaches it; each of ERAs that may play one content together.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
@@ -211,10 +231,23 @@ def _switched_candidates(
     forms = _forms_over(forms, formed, stream.targets, quiet, over)
     if by_point:
         forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
-    found = find_switched(forms) or find_switched(replace(forms, level_margin=0.0))
-    if not found:
-        highest = NEARLY_HIGHEST * max_sensation_switched(forms)
-        found = find_switched(replace(forms, level_margin=0.0, wanted=highest))
+    groups = _groups(fingers.table)
+    among = [forms.among(each) for each in groups]
+    searches = [find_switched(each) for each in among]
+    among = [replace(each, level_margin=0.0) for each in among]
+    if not any(searches):
+        searches = [find_switched(each) for each in among]
+    if not any(searches):
+        highest = [NEARLY_HIGHEST * max_sensation_switched(each) for each in among]
+        levels = zip(among, highest, strict=True)
+        searches = [find_switched(replace(each, wanted=wanted)) for each, wanted in levels]
+    found = [
+        (score, drive)
+        for group, search in zip(groups, searches, strict=True)
+        for score, drive in search
+        if not any(weights[~group].any() for _, weights in drive)
+    ]
+    found.sort(key=itemgetter(0), reverse=True)
     drives = [[(int(rows[row]), weights) for row, weights in drive] for _, drive in found]
     none = np.zeros(len(found), dtype=int)
     return Candidates(none, none, np.array([score for score, _ in found]), drives)

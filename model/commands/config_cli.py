@@ -61,7 +61,8 @@ def check(
         print_report([str(error)], answer, as_json=as_json)
         raise typer.Exit(1) from error
     rows = [f"{file}: {good.line}", *(f"warning: {warning}" for warning in warnings)]
-    print_report(rows, {"ok": True, "errors": [], "warnings": warnings}, as_json=as_json)
+    answer = {"ok": True, "errors": [], "warnings": warnings, **good.more}
+    print_report(rows, answer, as_json=as_json)
 
 
 def _write_new(path: Path, text: str) -> None:

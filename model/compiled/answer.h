@@ -18,8 +18,9 @@ typedef struct {
     float judged, promised;        /* percentiles of drawn plates */
     phases phases;
     method one_finger, several, within[3];
-    const int *rim;
-    const float *threshold, *error, *frequencies; /* (f); (f, n); (f) [Hz] */
+    int groups;                    /* of ERAs whose clocks are held together: a content is of one of these */
+    const int *rim, *group;        /* (n) of each ERA */
+    const float *threshold, *error, *shares, *frequencies; /* (f); (f, n); (f, n, n) or NULL, as of `grouped`; (f) [Hz] */
 } rules;
 
 /* Fingers (k) and contents, as given. */

@@ -51,7 +51,7 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     }
     const grouped all = {.groups = 1, .p = k * p, .others = by->others, .gain_variance = by->gain_variance,
                          .ridge = by->ridge, .points = is_coarse ? on->centres : of->few_points, .weights = weights,
-                         .error = by->error};
+                         .error = by->error, .shares = by->shares};
     formed found = new_forms(on, &all, memory);
     best reached = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};
     value *target = values(memory, n);
@@ -90,9 +90,21 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     return kept;
 }
 
-/* A content's forms at LANES rows: by point of each other finger, or by their mean. */
+/* Rows (count, n) of ERAs of a group alone. */
+INLINE void among(value *rows, size_t count, const int *group, int own, size_t n) {
+    for (size_t i = 0; i < count * n; i++)
+        if (group[i % n] != own) rows[i] = ZERO;
+}
+
+/* Form (n, n) of ERAs of a group alone, each other with its own power. */
+INLINE void form_among(value *form, const int *group, int own, size_t n) {
+    for (size_t i = 0; i < n * n; i++)
+        if (i / n != i % n && (group[i / n] != own || group[i % n] != own)) form[i] = ZERO;
+}
+
+/* A content's forms at LANES rows: by point of each other finger, or by their mean; of a group of ERAs. */
 SHARED searched forms_of(const formed *found, const plates *on, const rules *by, const question *of, const int *rows,
-                         size_t content, int by_point, float level, float margin, arena *memory) {
+                         size_t content, int group, int by_point, float level, float margin, arena *memory) {
     const size_t n = on->n, k = on->k, first = of->starts[content], count = of->starts[content + 1] - first;
     value *target = values(memory, count * n), *expected_power = values(memory, count * n * n);
     char *is_other = take(memory, k);
@@ -136,6 +148,19 @@ SHARED searched forms_of(const formed *found, const plates *on, const rules *by,
         load(rest, of->background, n * n, rows);
         for (size_t e = 0; e < n; e++) rest[e * n + e] = scaled(rest[e * n + e], filled(1 + by->gain_variance));
         forms[q++] = rest;
+    }
+    for (size_t form = 0; by->groups > 1 && form < q; form++) {
+        value *own = values(memory, n * n);
+        memcpy(own, forms[form], n * n * sizeof(value));
+        form_among(own, by->group, group, n);
+        forms[form] = own;
+    }
+    for (size_t t = 0; by->groups > 1 && t < count; t++) form_among(expected_power + t * n * n, by->group, group, n);
+    if (by->groups > 1) {
+        among(target, count, by->group, group, n);
+        among(at, others * points, by->group, group, n);
+        among(at_few, others * few, by->group, group, n);
+        among(at_fine, others * fine, by->group, group, n);
     }
     lanes wanted;
     load_real(&wanted, by->threshold, 1, rows);
@@ -247,7 +272,8 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
         has_fine |= (int)find_others(is_other, of, content, k) <= by->max_by_point;
     const grouped each = {.groups = k, .p = of->few, .fine = has_fine ? k * of->fine : 0, .others = by->others,
                           .gain_variance = by->gain_variance, .ridge = by->ridge, .points = of->few_points,
-                          .fine_points = of->fine_points, .weights = of->few_weights, .error = by->error};
+                          .fine_points = of->fine_points, .weights = of->few_weights, .error = by->error,
+                          .shares = by->shares};
     formed *found = take(memory, blocks * sizeof(formed));
     searched *forms = take(memory, blocks * sizeof(searched));
     rows_found at = new_rows(blocks * LANES, n, memory);
@@ -262,28 +288,33 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
         for (int band = 0; band < of->bands; band++) {
             const int *ends = of->band + 2 * (content * of->bands + band);
             const int first = of->is_ranked ? 0 : ends[0], end = of->is_ranked ? count : ends[1];
-            float level = of->level[content] * (float)of->contents, margin = by->margin;
-            const int others = (int)find_others(is_other, of, content, k), start = to->count;
+            const int others = (int)find_others(is_other, of, content, k), before = to->count;
             const int ways = others > 0 && others <= by->max_by_point ? 2 : 1;
             const arena mark = *memory;
-            for (int way = 0; way < ways && (!way || to->count > start); way++) {
-                for (int tries = 0;; tries++) { /* without the margin where that must be, or else near the highest level */
-                    int some[LANES];
-                    for (int block = first / LANES; block * LANES < end; block++) {
-                        rows_at(some, rows, block * LANES, count);
-                        forms[block] = forms_of(found + block, on, by, of, some, content, way, level, margin, memory);
+            /* Of several groups those that reach the level, or else any. */
+            for (int is_any = by->groups == 1; is_any < 2 && to->count == before; is_any++)
+                for (int group = 0; group < by->groups; group++) {
+                    const int start = to->count;
+                    float level = of->level[content] * (float)of->contents, margin = by->margin;
+                    for (int way = 0; way < ways && (!way || to->count > start); way++) {
+                        for (int tries = 0;; tries++) { /* without the margin where that must be, or else near the highest level */
+                            int some[LANES];
+                            for (int block = first / LANES; block * LANES < end; block++) {
+                                rows_at(some, rows, block * LANES, count);
+                                forms[block] = forms_of(found + block, on, by, of, some, content, group, way, level, margin, memory);
+                            }
+                            int is_hard = search_rows(&at, forms, by, first, end, memory);
+                            limited |= is_hard && !way;
+                            if (way || !is_any || tries == 2 || highest_score(at.score, first, end) > 0) break;
+                            margin = 0, limited = 1;
+                            if (!tries) continue;
+                            for (int block = first / LANES; block * LANES < end; block++)
+                                forms[block].wanted = ZERO.re, forms[block].margin = 0;
+                            level = by->highest * highest_level(forms, by, rows, count, first, end, memory);
+                        }
+                        keep_apart(to, &at, by, of, content, band, rows, first, end, n, memory);
                     }
-                    int is_hard = search_rows(&at, forms, by, first, end, memory);
-                    limited |= is_hard && !way;
-                    if (way || tries == 2 || highest_score(at.score, first, end) > 0) break;
-                    margin = 0, limited = 1;
-                    if (!tries) continue;
-                    for (int block = first / LANES; block * LANES < end; block++)
-                        forms[block].wanted = ZERO.re, forms[block].margin = 0;
-                    level = by->highest * highest_level(forms, by, rows, count, first, end, memory);
                 }
-                keep_apart(to, &at, by, of, content, band, rows, first, end, n, memory);
-            }
             release(memory, mark);
         }
     return limited;

@@ -130,7 +130,7 @@ SHARED void worst_ratios(float *worst, const int *combinations, int count, size_
 SHARED int best_combination(int *chosen_tones, const candidates *from, const judged *every, const plates *on,
                             const rules *by, const question *of, arena *memory) {
     const int contents = of->contents, most = of->combinations;
-    const size_t each = (size_t)of->bands * 2 * of->candidates; /* tones of a content */
+    const size_t each = (size_t)of->bands * by->groups * 2 * of->candidates; /* tones of a content */
     const size_t room = each > (size_t)most ? each : (size_t)most;
     const arena mark = *memory;
     int *content_of = integers(memory, on->k), *kept = integers(memory, room * contents);
@@ -201,7 +201,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
         const int kept = ranked_rows(some, on, by, of, memory);
         if (kept && kept < count) rows = some, count = kept;
     }
-    const size_t most = contents * of->bands * 2 * of->candidates;
+    const size_t most = contents * of->bands * by->groups * 2 * of->candidates;
     candidates from = {.content = integers(memory, most), .band = integers(memory, most),
                        .rows = integers(memory, most), .scores = floats(memory, most),
                        .weights = floats(memory, 2 * most * n)};
@@ -265,7 +265,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
                    .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};
     of.starts = given->numbers, of.targets = of.starts + contents + 1, of.quiet = of.targets + of.starts[contents];
     of.priority = of.quiet + of.quiet_count;
-    of.is_ranked = contents == 1 && of.starts[1] == 1 && of.bands == 1 && of.quiet_count > 0;
+    of.is_ranked = contents == 1 && of.starts[1] == 1 && of.bands == 1 && of.quiet_count > 0 && by->groups == 1;
     find_rows(&of, of.priority + contents, memory);
     answered to = {.rows = found->rows, .weights = found->figures};
     to.gains = to.weights + 2 * contents * on.n, to.contrast = to.gains + contents, to.level = to.contrast + 3 * k;

@@ -9,9 +9,10 @@
 typedef struct {
     int count, bases, nodes, width; /* plates; thicknesses of changes; thicknesses of plates */
     int first_base, first_node;     /* of these by index among those of the plate */
+    int gains_of_row;               /* floats from the gains of a frequency to those of the next; 0: of all */
     const int *node;                /* (count) */
     const float *loss, *damping;    /* (width) */
-    const float *own, *gains;       /* (a, width); (2, a, width) real and imaginary parts */
+    const float *own, *gains;       /* (a, width); (rows, 2, a, width) real and imaginary parts */
     const float *errors;            /* (2, k, width) */
 } draws;
 
@@ -303,10 +304,11 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     const size_t from = first - 1, base = tone * by->bases + (group - 1) / groups_of(by);
     const float *loss = of->forces + 2 * 4 * a * base, *damping = loss + 2 * a, *own = damping + 2 * a, *gain = own + 2 * a;
     const float *T = of->by_force + 2 * (a + 1) * padded * base;
+    const float *gains = by->gains + (size_t)of->rows[tone] * by->gains_of_row;
     lanes by_loss = some(by->loss + from), by_damping = some(by->damping + from);
     for (size_t j = 0; j < a; j++) {
         lanes by_own = some(by->own + j * width + from);
-        lanes re = some(by->gains + j * width + from), im = some(by->gains + (a + j) * width + from);
+        lanes re = some(gains + j * width + from), im = some(gains + (a + j) * width + from);
         force[j].re = loss[2 * j] * by_loss + damping[2 * j] * by_damping + own[2 * j] * by_own + gain[2 * j] * re -
                       gain[2 * j + 1] * im;
         force[j].im = loss[2 * j + 1] * by_loss + damping[2 * j + 1] * by_damping + own[2 * j + 1] * by_own +

@@ -11,6 +11,7 @@ typedef struct {
     float gain_variance, ridge;
     const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
+    const float *shares;       /* (f, n, n) by which the power of h grows; NULL for none */
 } grouped;
 
 /* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is nominal. */
@@ -47,7 +48,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     value *damped = values(memory, n * n), *changes = values(memory, j * n);
     value *X = values(memory, (parts * p + j) * n), *R = to->power, *U = to->uncertain;
     value *modelled = values(memory, n * n);
-    lanes *error = take(memory, n * sizeof(lanes));
+    lanes *error = take(memory, n * sizeof(lanes)), *shares = take(memory, n * n * sizeof(lanes));
     put_fingers(&now, on, rows, cases, space);
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
@@ -55,6 +56,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     load(by_stiffness, on->by_stiffness, n, rows);
     load(without, on->moved, b * n, cases);
     load_real(error, of->error, n, rows);
+    if (of->shares) load_real(shares, of->shares, n * n, rows);
 
     /* By a force at each attachment; h by each ERA; and how it changes with all dampers. */
     to_points(t, a, of->points, at, &now, on, room);
@@ -112,6 +114,11 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
             for (size_t v = u; v < n; v++) {
                 form[u * n + v].re += modelled[u * n + v].re;
                 form[u * n + v].im += modelled[u * n + v].im;
+            }
+        for (size_t u = 0; of->shares && u < n; u++) /* clocks of amplifiers */
+            for (size_t v = u; v < n; v++) {
+                form[u * n + v].re += shares[u * n + v] * modelled[u * n + v].re;
+                form[u * n + v].im += shares[u * n + v] * modelled[u * n + v].im;
             }
         lanes trace = {0};
         for (size_t e = 0; e < n; e++) {

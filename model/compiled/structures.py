@@ -54,7 +54,7 @@ class PointGroups(Structure):
 
     _fields_ = [
         *_fields(i="groups p fine others", f="gain_variance ridge"),
-        *_fields(p="points fine_points weights error"),
+        *_fields(p="points fine_points weights error shares"),
     ]
 
 
@@ -62,7 +62,7 @@ class PlateDraws(Structure):
     """`draws`: plates within the uncertainty."""
 
     _fields_ = _fields(
-        i="count bases nodes width first_base first_node",
+        i="count bases nodes width first_base first_node gains_of_row",
         p="node loss damping own gains errors",
     )
 
@@ -90,7 +90,7 @@ class Rules(Structure):
         ("one_finger", WeightSearch),
         ("several", WeightSearch),
         ("within", 3 * WeightSearch),
-        *_fields(p="rim threshold error frequencies"),
+        *_fields(i="groups", p="rim group threshold error shares frequencies"),
     ]
 
 

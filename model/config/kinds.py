@@ -3,8 +3,8 @@
 The keys of a file determine its kind.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -18,10 +18,11 @@ DEFAULT_KIND = "rig"
 
 @dataclass(frozen=True)
 class CheckedFile:
-    """A valid configuration file: one line about it, and warnings."""
+    """A valid configuration file: one line about it, and warnings; more: to its report as data."""
 
     line: str
     warnings: Sequence[str] = ()
+    more: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

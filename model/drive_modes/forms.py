@@ -9,7 +9,7 @@ Tones of different frequencies are felt together as the root of the sum of their
 detection thresholds, and so are a score's powers: each in units of its threshold.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -41,6 +41,7 @@ class Forms:
     - few, fine: (f, q, p, eras) fields of each ERA at few points of each quiet fingertip, by whose
       mean the expected power counts the nominal plate, each times the root of its weight; and
       at many points, of which the loudest counts. None where the mean is good enough
+    - driven: (eras,) which ERAs may have weights, None for all; see `among`
     """
 
     targets: Complex64Array
@@ -51,6 +52,7 @@ class Forms:
     level_margin: float = LEVEL_MARGIN
     few: Complex64Array | None = None
     fine: Complex64Array | None = None
+    driven: NDArray[np.bool_] | None = None
 
     @property
     def era_count(self) -> int:
@@ -68,6 +70,25 @@ class Forms:
             self.level_margin,
             None if self.few is None else self.few.take(frequencies, axis=0),
             None if self.fine is None else self.fine.take(frequencies, axis=0),
+            self.driven,
+        )
+
+    def among(self, is_driven: NDArray[np.bool_]) -> "Forms":
+        """The forms for weights of some ERAs (eras,), all others 0: these do and cost nothing.
+
+        Each keeps its own power, so that a form can be inverted.
+        """
+        if is_driven.all():
+            return self
+        pairs = np.outer(is_driven, is_driven) | np.eye(len(is_driven), dtype=bool)
+        return replace(
+            self,
+            targets=self.targets * is_driven,
+            target_power=self.target_power * pairs,
+            quiet=self.quiet * pairs,
+            few=None if self.few is None else self.few * is_driven,
+            fine=None if self.fine is None else self.fine * is_driven,
+            driven=is_driven,
         )
 
     def amplitude(self, weights: Complex64Array) -> Float32Array:

@@ -29,6 +29,7 @@ from statistics import NormalDist
 import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
+from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     Era,
@@ -92,7 +93,7 @@ class AttachedPlate(Mounts):
     - shapes: (b, r) of the attachments
     - omega: (f,) [rad/s]
     - fingertip: of the rig, None for weightless ones
-    - uncertainty: of the rig's parameters
+    - uncertainty: of the rig's parameters; clocks: errors of those of its amplifiers
     """
 
     modal: ComplexArray
@@ -100,6 +101,7 @@ class AttachedPlate(Mounts):
     omega: FloatArray
     fingertip: Fingertip | None
     uncertainty: Uncertainty
+    clocks: ClockErrors
 
     @property
     def era_count(self) -> int:
@@ -133,6 +135,11 @@ class AttachedPlate(Mounts):
         return found.astype(np.complex64)
 
     @cached_property
+    def power_shares(self) -> Float32Array | None:
+        """`ClockErrors.power_shares` at its frequencies."""
+        return self.clocks.power_shares(self.omega / (2 * math.pi))
+
+    @cached_property
     def _finger(self) -> ComplexArray:
         if self.fingertip is None:
             return np.zeros(len(self.omega), dtype=complex)
@@ -151,6 +158,7 @@ def attach(
     uncertainty: Uncertainty,
     frequencies: FloatArray,
     dispersion: Dispersion | None = None,
+    clocks: ClockErrors = EXACT_CLOCKS,
 ) -> AttachedPlate:
     """Attach ERAs and masses to a reduced free plate.
 
@@ -168,6 +176,7 @@ def attach(
         omega=w,
         fingertip=fingertip,
         uncertainty=uncertainty,
+        clocks=clocks,
     )
 
 

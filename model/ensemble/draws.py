@@ -38,9 +38,9 @@ class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
     loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
-    masses, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
-    d): of discretisation at each finger, complex of mean square 1; node (d,): which of the
-    thicknesses each has.
+    masses, load of each finger; gains (1, a, d): relative change of each ERA's, complex, or (f, a,
+    d) at f frequencies; errors (k, d): of discretisation at each finger, complex of mean square 1;
+    node (d,): which of the thicknesses each has.
     """
 
     loss: Float32Array
@@ -71,7 +71,7 @@ def draw(
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    numbers = _exact(rng, 3 + n + k + 2 * n + 2 * k + 1, count)
+    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
     parameters, sizes, phases, real, imaginary, common = np.split(
         numbers, np.cumsum([3 + n + k, n, n, k, k])
@@ -82,7 +82,7 @@ def draw(
         loss=parameters[1].astype(np.float32),
         damping=parameters[2].astype(np.float32),
         own=own.astype(np.float32),
-        gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64),
+        gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64)[None],
         errors=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary), dtype=np.complex64),
         node=np.arange(count) * thicknesses // count,
     )
@@ -91,7 +91,7 @@ def draw(
     return drawn
 
 
-def _exact(rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
+def standard_normal(rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
     """Normal numbers (rows, count) with mean 0 and variance 1 in each row."""
     numbers = rng.standard_normal((rows, count))
     numbers -= numbers.mean(axis=1, keepdims=True)

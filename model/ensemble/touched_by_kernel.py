@@ -64,7 +64,13 @@ class TouchedByKernel(TouchedPlate):
         known = plate.uncertainty
         rules = known.thickness > 0, known.gain_variance, RIDGE
         of = PointGroups(g, p, g * fine_count, *rules)
-        of.point(points=points, fine_points=fine, weights=weights, error=error_power)
+        of.point(
+            points=points,
+            fine_points=fine,
+            weights=weights,
+            error=error_power,
+            shares=plate.power_shares,
+        )
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
         to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
@@ -134,8 +140,11 @@ def _structure(
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])
 
     count = len(draws.node)
-    found = PlateDraws(count, bases, nodes, count + _MAX_LANES, first_base, first_node)
-    gains, errors = (np.stack([each.real, each.imag]) for each in (draws.gains, draws.errors))
+    width, (f, a, _) = count + _MAX_LANES, draws.gains.shape
+    of_row = 2 * a * width if f > 1 else 0
+    found = PlateDraws(count, bases, nodes, width, first_base, first_node, of_row)
+    errors = np.stack([draws.errors.real, draws.errors.imag])
+    gains = np.stack([draws.gains.real, draws.gains.imag], axis=1)
     floats = {"loss": draws.loss, "damping": draws.damping, "own": draws.own}
     floats |= {"gains": gains, "errors": errors}
     found.point(node=draws.node, **{name: padded(each) for name, each in floats.items()})

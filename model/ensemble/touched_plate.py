@@ -28,6 +28,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
+from model.ensemble.delays import delayed
 from model.ensemble.draws import Drawing, Draws, draw, over_fingertips
 
 RIDGE = 1e-6
@@ -161,6 +162,7 @@ class TouchedPlate:
             weights,
             gain_variance=plate.uncertainty.gain_variance,
             error_power=error_power[rows, None],
+            shares=None if plate.power_shares is None else plate.power_shares[rows],
         )
         uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
         if fine is None:
@@ -231,7 +233,7 @@ class TouchedPlate:
                 (changes.loss, draws.loss),
                 (changes.damping, draws.damping),
                 (changes.own, draws.own),
-                (changes.drives, draws.gains),
+                (changes.drives, draws.gains[at if len(draws.gains) > 1 else 0]),
             )
         ]
         forces = np.add.reduce(parts).reshape(m, t, -1, t, d // t)
@@ -300,6 +302,9 @@ def drawn_on(
         common_gain=plate.uncertainty.common_gain,
         thicknesses=nodes,
     )
+    if plate.clocks.errors:
+        frequencies = plate.omega / (2 * math.pi)
+        draws = delayed(draws, plate.clocks, tuple(frequencies.tolist()), by.seed)
     first_base = on.first.get(by.bases, MODELLED)
     return draws, nodes, (by.bases if first_base else 1, first_base), first
 
@@ -311,16 +316,20 @@ def expected_power(
     *,
     gain_variance: float,
     error_power: Float32Array,
+    shares: Float32Array | None = None,
 ) -> Complex64Array:
     """Expected powers R at g groups of points, (f, g, n, n).
 
     fields: h and each of its changes (f, g, p, n); own (f, g, j, n): changes by the stiffness of
     each attachment and the load of each finger, root mean square over the points; weights (g, p) of
-    the points; error_power (f, ..., n): mean square of the error of each ERA's field.
+    the points; error_power (f, ..., n): mean square of the error of each ERA's field; shares (f, n,
+    n): by which the power of h grows, as the clocks of amplifiers are off.
     """
     f, g, _, n = own.shape
     root = np.sqrt(weights)[..., None]
     power = gram(np.concatenate([*(each * root for each in fields), own], axis=2))
+    if shares is not None:
+        power += shares[:, None] * gram(fields[0] * root)
     size = (weights[:, None] @ power_of(fields[0]))[:, :, 0]
     diagonal = power.reshape(f, g, -1)[..., :: n + 1]
     values = diagonal.real + np.float32(gain_variance) * size + error_power

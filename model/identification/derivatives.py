@@ -174,11 +174,14 @@ def _by_gains(plate: PlateAt) -> Columns:
     by_sensor = Y[..., None] * np.eye(Y.shape[1])[:, None]
     f = 1e-3 * plate.model.frequencies[:, None]
     by_inertia, by_drag = f**2 * plate.lag, -1j * f * plate.lag
+    count = len(plate.values.delays)
+    lateness = plate.model.lateness if count else np.zeros((*Y.shape[1:], 0))
     return {
         "gain": by_drive,
         "phase": 1j * by_drive,
         "inertia": by_drive * by_inertia[:, None, None],
         "drag": by_drive * by_drag[:, None, None],
+        "delay": -1j * plate.model.omega[:, None, None, None] * Y[..., None] * lateness,
         "sensor_gain": by_sensor,
         "sensor_phase": 1j * by_sensor,
         "sensor_scale": _by_scale(plate),
@@ -188,7 +191,7 @@ def _by_gains(plate: PlateAt) -> Columns:
 def _by_scale(plate: PlateAt) -> ComplexArray:
     """By the scale of each sensor, which may be zero."""
     count = len(plate.values.sensor_scales)
-    plain = plate.values.sensor_gains[:, None] * plate.drive[:, None]
+    plain = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late
     plain = plain * plate.receptance[:, plate.model.observed, : plate.base.shape[1]]
     return np.asarray(plain[..., None] * np.eye(len(plate.model.observed), count)[:, None])
 
@@ -207,7 +210,7 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "fingers",
     ),
     _by_gains: (
-        *("gain", "phase", "inertia", "drag"),
+        *("gain", "phase", "inertia", "drag", "delay"),
         *("sensor_gain", "sensor_phase", "sensor_scale"),
     ),
 }

@@ -40,12 +40,16 @@ LEAST_LOSS = 1e-9
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is ""."""
+    """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is "".
+
+    amplifier: on whose clock its phases count, "" for that of none.
+    """
 
     name: str
     era: str = ""
     x: float = 0.0
     y: float = 0.0
+    amplifier: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ class ForwardModel:
     """A rig's plate, as it was solved, on its attachments, with sensors and fingers.
 
     frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
-    others; space: what may differ; form: the plate in coordinates in which it may have form errors.
+    others; space: what may differ; form: the plate in coordinates in which it may have form errors;
+    amplifiers: those whose clocks may be off, in the order of the delays.
     Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
     """
 
@@ -73,6 +78,7 @@ class ForwardModel:
     free: FreePlate
     fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
+    amplifiers: Sequence[str] = ()
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -100,6 +106,18 @@ class ForwardModel:
             found.append(names.index(sensor.era) if sensor.era else after)
             after += not sensor.era
         return np.array(found, dtype=int)
+
+    @cached_property
+    def lateness(self) -> FloatArray:
+        """By which a response to an ERA is late by a clock that is, (s, n, amplifiers).
+
+        1 where its amplifier plays, -1 where it hears, since what it hears seems early.
+        """
+        names = [*self.amplifiers]
+        plays = [self.rig.wiring[era.name].amplifier for era in self.rig.eras]
+        hears = [each.amplifier for each in self.sensors]
+        own = [np.array([[each == name for name in names] for each in of]) for of in (plays, hears)]
+        return np.asarray(own[0].astype(float)[None] - own[1].astype(float)[:, None])
 
     @property
     def modes(self) -> Modes:
@@ -269,7 +287,15 @@ class PlateAt:
         gains = self.values.sensor_gains
         if len(self.values.sensor_scales):
             gains = gains * self.values.sensor_scales
-        return np.asarray(gains[:, None] * self.drive[:, None])
+        return np.asarray(gains[:, None] * self.drive[:, None] * self.late)
+
+    @cached_property
+    def late(self) -> ComplexArray | float:
+        """Factor of responses by clocks that are off (f, s, n), 1 where they agree."""
+        if not len(self.values.delays):
+            return 1.0
+        delays = self.model.lateness @ self.values.delays
+        return np.asarray(np.exp(-1j * self.model.omega[:, None, None] * delays))
 
     @cached_property
     def responses(self) -> ComplexArray:

@@ -12,6 +12,7 @@ from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
 
 _MISTAKEN = 0.01  # unexplained, beyond which a plate is not quite the rig's
+_LYING = 4.0  # standard errors
 _SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
 
 _ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase")
@@ -52,6 +53,53 @@ def estimates(found: Identification) -> list[ParameterEstimate]:
             difference = math.expm1(difference)
         difference, error, std = (known.per_unit * each for each in (difference, error, std))
         rows.append(ParameterEstimate(name, kind, difference, error, std, known.unit, known.key))
+    return rows
+
+
+@dataclass(frozen=True)
+class ClockEstimate:
+    """By which an amplifier's clock is late against the first one's, as the plate shows it [us].
+
+    error: standard one; stated: rms of both, as they and their lines state.
+    """
+
+    amplifier: str
+    delay_us: float
+    error_us: float
+    stated_us: float
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether what is stated explains it, but for one in 16 000 that are true."""
+        return abs(self.delay_us) <= _LYING * math.hypot(self.error_us, self.stated_us)
+
+
+def clock_estimates(found: Identification) -> list[ClockEstimate]:
+    """Clocks of all amplifiers but the first, by name, whose clocks are held to its own."""
+    stated = found.fitted.problem.measurement.clock_errors
+    first, *others = sorted(stated) or [""]
+    part = found.posterior.space.groups["delay"]
+    rows = zip([first, *others], found.values.delays, found.posterior.std[part], strict=False)
+    estimated = [
+        ClockEstimate(name, 1e6 * delay, 1e6 * error, 1e6 * math.hypot(stated[first], stated[name]))
+        for name, delay, error in rows
+        if name != first
+    ]
+    return [each for each in estimated if math.isfinite(each.stated_us)]
+
+
+def clock_rows(found: Identification) -> list[str]:
+    """Lines of clocks that are off, which the rig's gains take off, and of those that lie."""
+    rows = []
+    for each in clock_estimates(found):
+        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
+        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
+        if not each.is_believed:
+            rows.append(
+                f"amplifier {each.amplifier} or the first one must be within "
+                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
+                "or its output is late otherwise than that of its product"
+            )
     return rows
 
 
@@ -120,6 +168,9 @@ def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict
                 "standard_deviation_before": each.before,
             }
             for each in estimates(found)
+        ],
+        "clocks": [
+            {**asdict(each), "is_believed": each.is_believed} for each in clock_estimates(found)
         ],
         "uncertainty": asdict(found.rig.uncertainty),
         "expected_contrast": [

@@ -1,7 +1,7 @@
 """Responses that were measured on a rig in place, with their errors and repetitions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
@@ -46,8 +46,9 @@ class Measurement:
     gain [1/s²], phases as exp(+i omega t), NaN where not measured; std (f, s, n): of the real and
     of the imaginary part. half_level: tones repeated at half the level, per base displacement as
     well; at_end: the first tones, played last again; of both those that are loud beside noise,
-    which nothing is allowed for. drives_lag: whether bases follow what was played with an unknown
-    lag, as actuators do behind an amplifier of voltage.
+    which nothing is allowed for. clock_errors: of the amplifiers that played and heard, by name, as
+    their lines and they state, rms [s]; empty where all have one clock. drives_lag: whether bases
+    follow what was played with an unknown lag, as actuators do behind an amplifier of voltage.
     """
 
     sensors: tuple[Sensor, ...]
@@ -57,6 +58,7 @@ class Measurement:
     half_level: tuple[Repeat, ...] = ()
     at_end: tuple[Repeat, ...] = ()
     drives_lag: bool = False
+    clock_errors: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse values without an error, none at all, and frequencies in another order."""

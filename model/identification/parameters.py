@@ -75,6 +75,8 @@ KINDS = {
     # A resonance at 700 Hz with a damping ratio of 0.5.
     "inertia": Kind(1 / 0.7**2, "/kHz²", "1/kHz^2", 1.0),
     "drag": Kind(1 / 0.7, "/kHz", "1/kHz", 1.0),
+    # Of an amplifier's clock: what no exchange over unlike lines shows.
+    "delay": Kind(200e-6, "us", "us", 1e6),
     "sensor_gain": Kind(0.05),
     "sensor_phase": Kind(math.radians(5), *_PHASE),
     # By data sheets: of the plate's mass that an ERA carries.
@@ -207,6 +209,7 @@ def space_of(
     uncertainty: Uncertainty,
     *,
     drives_lag: bool = False,
+    amplifiers: Sequence[str] = (),
     masses: int = 0,
     mode_count: int = MODE_SHIFTS,
     form_of: int | None = None,
@@ -216,8 +219,8 @@ def space_of(
     uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
     mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
     found by, and tell nothing more of it. drives_lag: whether bases follow what is played with a
-    lag that nothing states; mode_count: elastic modes that may shift; form_of: number of sensors
-    beside ERAs of a plate with form errors.
+    lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic
+    modes that may shift; form_of: number of sensors beside ERAs of a plate with form errors.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
     none = np.zeros(0)
@@ -260,6 +263,9 @@ def space_of(
     for kind in ("inertia", "drag"):
         std = KINDS[kind].std * lagging
         add(kind, [f"{kind} of drive {name}" for name in eras], std, lower=0.0)
+    # Only differences count: those to the first.
+    delays = np.array([KINDS["delay"].std * (number > 0) for number in range(len(amplifiers))])
+    add("delay", [f"delay of amplifier {name}" for name in amplifiers], delays)
     add("sensor_gain", [f"gain of sensor {name}" for name in sensors])
     add("sensor_phase", [f"phase of sensor {name}" for name in sensors])
     least = [-era.bolt_mass / KINDS["bolt_mass"].std for era in rig.eras]

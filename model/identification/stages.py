@@ -50,6 +50,7 @@ SIMPLE = (
     "phase",
     "inertia",
     "drag",
+    "delay",
     "sensor_gain",
     "sensor_phase",
 )
@@ -70,15 +71,24 @@ class Setting:
         more: further sensors beside those of the measurement.
         """
         sensors = (*self.measurement.sensors, *more)
+        amplifiers = sorted(self.measurement.clock_errors)
         space = space_of(
             self.rig,
             [sensor.name for sensor in sensors],
             self.rig.uncertainty,
             drives_lag=self.measurement.drives_lag,
+            amplifiers=amplifiers,
             masses=masses,
             mode_count=len(lowest_elastic(self.free.modes.eigenvalues, MODE_SHIFTS)),
         )
-        return ForwardModel(self.rig, sensors, self.measurement.frequencies, space, self.free)
+        return ForwardModel(
+            self.rig,
+            sensors,
+            self.measurement.frequencies,
+            space,
+            self.free,
+            amplifiers=amplifiers,
+        )
 
 
 @dataclass(frozen=True, eq=False)

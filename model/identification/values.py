@@ -26,9 +26,11 @@ class Values:
     y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
     loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
     beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
-    (n,): of the drives, by which they lag. Of a plate with form errors, else empty: sensor_scales
-    (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs; foreign_mass (c,): in
-    cells, as shares of the plate's and none in all; stretch (3,): of length and width, relative,
+    (n,): of the drives, by which they lag; delays [s]: of the clocks of amplifiers, in the order of
+    their names, to the first; none where they agree. Of a plate with form errors, else empty:
+    sensor_scales (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs;
+    foreign_mass (c,): in cells, as shares of the plate's and none in all; stretch (3,): of length
+    and width, relative,
     and what is added to Poisson's ratio.
     """
 
@@ -48,6 +50,7 @@ class Values:
     fingers: FloatArray
     inertia: FloatArray
     drag: FloatArray
+    delays: FloatArray
     sensor_scales: FloatArray
     sensor_places: FloatArray
     foreign_mass: FloatArray
@@ -84,6 +87,7 @@ class Values:
             fingers=own("fingers").reshape(-1, 4),
             inertia=own("inertia"),
             drag=own("drag"),
+            delays=own("delay"),
             sensor_scales=1 + own("sensor_scale"),
             sensor_places=own("sensor_place").reshape(-1, 2),
             foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
@@ -154,17 +158,28 @@ def additional_masses(values: Values) -> Sequence[PointLoad]:
 def _gains(era: Era, rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     """Measured gains times what was identified; of an ERA without any at one frequency.
 
-    Over the rig's frequencies where the drive lags.
+    Over the rig's frequencies where the drive lags, and where the clock of its amplifier does.
     """
-    if values.drive_gains[number] == 1 and not (values.inertia[number] or values.drag[number]):
+    lags, delay = values.inertia[number] or values.drag[number], _delay(era, rig, values)
+    if values.drive_gains[number] == 1 and not (lags or delay):
         return era.gains
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
-    if values.inertia[number] or values.drag[number]:
+    if lags or (delay and not era.gains):
         low, high = rig.limits.frequency_min, rig.limits.frequency_max
         count = 1 + int(np.ceil((high - low) / _GAIN_STEP))
         before = tuple((float(f), 1.0, 0.0) for f in np.linspace(low, high, count))
-    factors = values.drive_gains[number] * values.lag(np.array([f for f, *_ in before]))[:, number]
+    f = np.array([f for f, *_ in before])
+    late = np.exp(-2j * np.pi * f * delay)
+    factors = values.drive_gains[number] * values.lag(f)[:, number] * late
     return tuple(
         (f, magnitude * float(abs(factor)), turned + float(np.angle(factor)))
         for (f, magnitude, turned), factor in zip(before, factors.tolist(), strict=True)
     )
+
+
+def _delay(era: Era, rig: Rig, values: Values) -> float:
+    """By which an ERA is late with its amplifier's clock [s]."""
+    if not len(values.delays):
+        return 0.0
+    names = sorted({channel.amplifier for channel in rig.wiring.values()})
+    return float(values.delays[names.index(rig.wiring[era.name].amplifier)])

@@ -1,5 +1,6 @@
 """Reading a rig from its file."""
 
+import math
 from pathlib import Path
 
 from model.arguments import expect_path, shown
@@ -86,6 +87,10 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             for name, amplifier in section.amplifiers.items()
             if amplifier.full_level == "output"
         ),
+        clock_errors={
+            name: math.inf if amplifier.clock_error == "unknown" else amplifier.clock_error
+            for name, amplifier in section.amplifiers.items()
+        },
         document=document,
     )
 

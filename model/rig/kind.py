@@ -8,13 +8,16 @@ import cmath
 import math
 import os
 from collections import Counter
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 from urllib.parse import quote
 
 from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
+from model.errors import InputError
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
@@ -46,8 +49,9 @@ def _check(document: Document) -> CheckedFile:
     if rig is None or problems:
         raise ConfigError(document.source, problems)
     note = rig.uncertainty.note
-    costs = [*gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
-    return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
+    line, lost, more = clock_costs(rig, _urls(document))
+    costs = [*lost, *gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
+    return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
 RIG = ConfigKind(
@@ -160,6 +164,50 @@ def _notes(era: Era, low: float, high: float) -> list[str]:
         f"eras.{era.name}.gains: phases differ by {math.degrees(angle):.0f} degrees between "
         f"{first:g} and {last:g} Hz, at most 20 are interpolated well; measure between them"
     ]
+
+
+_ARRANGEMENT = "drivers.by_hand.arrangement:arrangement_of"
+_COST = "model.study.clock_costs:clock_cost"
+_LOST_DB = 0.1  # contrast that is worth a warning
+
+
+def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
+    """What the clocks of several amplifiers leave: to the line of a good rig, warnings, and data.
+
+    urls: by the amplifier's name. Nothing of one alone.
+    """
+    arrangement = resolve_name(_ARRANGEMENT)(
+        urls, channels=rig.channel_counts, stated=rig.clock_errors
+    )
+    if arrangement is None:
+        return "", [], {}
+    errors = dict.fromkeys(rig.channel_counts, 0.0) | arrangement.errors
+    try:
+        cost = resolve_name(_COST)(rig, errors)
+    except InputError:  # no place for two fingers
+        return "", [], {}
+    alone = [name for name, each in errors.items() if math.isinf(each)]
+    us = 1e6 * max((each for each in errors.values() if math.isfinite(each)), default=0.0)
+    said = (
+        f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
+        f"together to {us:.0f} us; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB"
+    )
+    data = {
+        "lines": arrangement.lines,
+        "error_us": {
+            name: None if name in alone else round(1e6 * each, 1) for name, each in errors.items()
+        },
+        "exact_contrast_db": cost.exact_db,
+        "kept_contrast_db": cost.kept_db,
+    }
+    if cost.exact_db - cost.kept_db < _LOST_DB:
+        return f"; {said}", [], {"clocks": data}
+    remedy = f"; {arrangement.remedy} gives all of it" if arrangement.remedy and not alone else ""
+    unsteered = [
+        f"amplifier {name} has no clock that can be steered: its ERAs play contents of their own"
+        for name in alone
+    ]
+    return "", [said + remedy, *unsteered], {"clocks": data}
 
 
 _CHECK = "drivers.by_hand.rig_check:check_links"

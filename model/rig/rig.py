@@ -47,7 +47,8 @@ class Rig:
     of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
     threshold: name of the set of detection thresholds (`model.finger.perception`); outputs: the
     amplifiers whose full level is an output, to which bases move by their gains, not a motion;
-    document: its keys.
+    clock_errors: what each amplifier is taken to state of its clock [s], infinite for one that
+    cannot be steered; document: its keys.
     """
 
     plate: Plate
@@ -63,6 +64,7 @@ class Rig:
     threshold: str = DEFAULT_THRESHOLD
     supports: tuple[str, ...] = ()
     outputs: frozenset[str] = frozenset()
+    clock_errors: Mapping[str, float] = field(default_factory=dict)
     document: Document | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -132,6 +134,7 @@ MAY_DIFFER = {
     "Rig.amplifiers": "where levels go, not what they do",
     "Rig.limits": "patterns are held to those of the rig in service, whenever they are played",
     "Rig.outputs": "an amplifier that says otherwise is refused when it is opened",
+    "Rig.clock_errors": "each amplifier states its own when it is opened",
     "Rig.supports": "which of the masses have a name, not what they weigh",
     "Rig.document": "all that it says is in the other fields",
     "Rig.laminate": "all that is solved of it is in the plate",

@@ -272,6 +272,14 @@ class AmplifierSection(Section):
     full_level: Literal["motion", "output"] = "motion"
     """What it plays at level 1."""
 
+    clock_error: (
+        Annotated[float, Quantity(TIME, at_least=0, at_most=0.001)] | Literal["unknown"]
+    ) = 5e-6
+    """By which its clock may be wrong, for `era config check`; once connected it states it itself.
+
+    Limits: 0 to 1 ms, or `unknown` for a clock that cannot be steered
+    """
+
 
 def _within(key: str) -> Quantity:
     """The bounds of a parameter of an `Uncertainty`."""

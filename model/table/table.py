@@ -9,7 +9,7 @@ import math
 from array import array
 from collections.abc import Sequence
 from ctypes import c_void_p
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from weakref import WeakKeyDictionary
@@ -22,6 +22,7 @@ from model.compiled.kernels import kernels, run
 from model.compiled.structures import GivenRaster
 from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras, attach
+from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
@@ -91,6 +92,7 @@ class LocalizationTable:
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
       (`model.vibration.convergence`), maximum over the ERAs
+    - clocks: errors of those of its amplifiers, which no file has: of those that are connected
     """
 
     plate: Plate
@@ -113,6 +115,7 @@ class LocalizationTable:
     shapes: NDArray[np.float32]
     reference_mesh: PlateMesh
     discretisation_error: FloatArray
+    clocks: ClockErrors = EXACT_CLOCKS
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
@@ -136,6 +139,19 @@ class LocalizationTable:
     def inherit_ringing(self, other: "LocalizationTable") -> None:
         """Take what is prepared of ringing from a table of nearly the same plate."""
         self._ringings.update(other._ringings)
+
+    def with_clocks(self, clocks: ClockErrors) -> "LocalizationTable":
+        """The table for amplifiers whose clocks are off; takes no time, all is shared."""
+        if clocks == self.clocks:
+            return self
+        found = replace(self, clocks=clocks)
+        vars(found).update(vars(self) | vars(found))
+        if "on_eras" in vars(self):
+            plate = replace(self.attached, clocks=clocks)
+            vars(found).update(attached=plate, on_eras=replace(self.on_eras, plate=plate))
+        else:
+            vars(found).pop("attached", None)
+        return found
 
     def unit_fields(
         self, points: FloatArray, *, contacts: Sequence[Point] = (), loads: Sequence[float] = ()
@@ -285,6 +301,7 @@ class LocalizationTable:
             uncertainty=self.uncertainty,
             frequencies=self.frequencies,
             dispersion=self.modal_dispersion,
+            clocks=self.clocks,
         )
 
     @cached_property
@@ -325,10 +342,15 @@ class LocalizationTable:
         return touch(self.on_eras, centres, tuple(loads)).coordinates()
 
     def background(self, targets: Sequence[Point]) -> Complex64Array:
-        """Mean power of the plate beyond targets, without fingers on it, (f, eras, eras)."""
+        """Expected power of the plate beyond targets, without fingers on it, (f, eras, eras).
+
+        Of clocks that are off, beside the nominal one.
+        """
         points, fields, power = self._everywhere
         is_near = ~is_background(points, targets)
-        return (power - _power(fields[:, :, is_near])) / np.float32(np.sum(~is_near))
+        mean = (power - _power(fields[:, :, is_near])) / np.float32(np.sum(~is_near))
+        shares = self.attached.power_shares
+        return mean if shares is None else mean * (1 + shares)
 
 
 def _power(fields: Complex64Array) -> Complex64Array:

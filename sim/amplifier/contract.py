@@ -297,7 +297,7 @@ class Amplifier:
                 self.clock.steer(values["rate"], now)
                 if self._waiting is not None:
                     _, commit, waiting = self._waiting
-                    self._waiting = self.clock.reaches(commit["at"], now), commit, waiting
+                    self._play_when(waiting, commit, now)
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
@@ -380,7 +380,7 @@ class Amplifier:
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:
         """Play a committed set at the moment that its Commit names, if that is shortly ahead."""
-        at = commit["at"]
+        at, self._waiting = commit["at"], None
         if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
             self._waiting = self.clock.reaches(at, now), commit, layers
         else:

@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import CommandError
+from drivers.line_kinds import KIND_OF_PORT
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD, Place
 from drivers.wires.can_bus.canopen import BITRATE
 from drivers.wires.known import address_of
@@ -87,7 +88,7 @@ async def open_wires(wires: Mapping[str, Wire], devices: Devices) -> Urls:
     for device in devices:
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
-            wire = replace(wire, line_kind=_usual_line(wire))
+            wire = replace(wire, line_kind=_default_line(wire))
         lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
@@ -100,10 +101,10 @@ def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
     return {device.address: device for device in devices}
 
 
-def _usual_line(wire: Wire) -> str:
-    """The kind of line that is usual for a wire; of a serial line by the port of its URL."""
+def _default_line(wire: Wire) -> str:
+    """The default kind of line of a wire; of a serial line by the port of its URL."""
     port = Path(wire.line).name.rstrip("0123456789")
-    return _LINE_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
+    return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
 
 def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
@@ -113,9 +114,9 @@ def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
     return LINE_KINDS[wire.line_kind].delays((wire.seed, devices[0].name))
 
 
-def _speed(wire: Wire, usual: int) -> int | None:
-    """Bits per second of a line: as given, the usual ones where it is not prompt, or None."""
-    return wire.speed or (None if wire.line_kind in (None, PROMPT) else usual)
+def _speed(wire: Wire, default: int) -> int | None:
+    """Bits per second of a line: as given, the default where it is not prompt, or None."""
+    return wire.speed or (None if wire.line_kind in (None, PROMPT) else default)
 
 
 @asynccontextmanager
@@ -222,13 +223,6 @@ _LINE_OF_WIRE = {
     "socketcand": "can",
     "slcan": "can-usb",
 }
-_LINE_OF_PORT = {
-    "ttyUSB": "ftdi-low-latency",
-    "ttyACM": "usb-full-speed",
-    "ttyS": "native",
-    "ttyAMA": "native",
-}
-"""By the name of a port without its number."""
 
 
 def assign_wires(

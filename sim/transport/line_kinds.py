@@ -38,10 +38,10 @@ class Latency:
         return self.least + self.median * math.exp(log) + stalled
 
     @property
-    def longest(self) -> float:
+    def max_delay(self) -> float:
         """The longest one [s]."""
-        most = self.least + self.median * math.exp(_SIGMAS * self.sigma)
-        return most + (_STALLS * self.stall if self.stalls else 0.0)
+        typical = self.least + self.median * math.exp(_SIGMAS * self.sigma)
+        return typical + (_STALLS * self.stall if self.stalls else 0.0)
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class LineKind:
     latency_timer: float = 0.0
 
     @property
-    def longest(self) -> float:
+    def max_delay(self) -> float:
         """The longest delay of a few bytes there and back together [s]."""
-        programs = self.writing.longest + self.waking.longest
+        programs = self.writing.max_delay + self.waking.max_delay
         return programs + 2 * self.frame * (1 + _FRAME_ERROR) + self.latency_timer
 
     def delays(self, seed: object) -> "LineDelays":

@@ -35,6 +35,7 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
     status = await end.hosts["a"].read_status()
     assert end.levels("a") == [0.5, 0.0]
     assert {each: status[each] for each in status if each not in _FIRST} == STATED[age]
+    assert status_rows(status | {"clock": 0x40000000})["clock_s"] == 5.0  # a quarter of 20 s
     shown = {"older": None, "same": 0.0, "newer": "no key"}[age]
     assert status_rows(status).get("later_voltage_v", "no key") == shown
     assert (await group.stop())["a"].is_confirmed

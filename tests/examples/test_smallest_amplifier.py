@@ -2,6 +2,7 @@
 
 import asyncio
 import ctypes
+import math
 import subprocess
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +12,7 @@ import pytest
 
 import era_haptics
 from drivers.by_hand.actions import identify
+from drivers.wires.serial_line.frames import Frame, encode_frame
 from installed_program import installed_program
 from judged_line import judged
 
@@ -18,8 +20,7 @@ SOURCE = Path(era_haptics.__file__).parents[1] / "examples" / "smallest_amplifie
 MOVED = Path(__file__).parents[1] / "support" / "moved_smallest.c"
 BUILD = "-std=c11 -D_GNU_SOURCE -Wall -Wextra -Werror -O1 -fsanitize=undefined -shared -fPIC"
 SKIPPED = {
-    *("sensors", "steps_as_stated", "limited", "measured", "readings", "addresses"),
-    "phases",  # its levels are sums of magnitudes, which is allowed
+    *("sensors", "steps_as_stated", "limited", "measured", "readings", "addresses", "mark"),
 }
 
 
@@ -43,18 +44,45 @@ class SmallestEnd:
         self.receive(b"", now)
 
 
-@pytest.mark.parametrize("level", [0.2, 0.9])
-def test_conformance_on_a_clock_that_is_moved(level: float, tmp_path: Path) -> None:
-    """All checks pass, where time is that of the test, and its sums of layers are limited."""
-    library = tmp_path / "moved.so"
+@pytest.fixture
+def library(tmp_path: Path) -> Path:
+    """The program as a library whose time is that of its caller."""
+    made = tmp_path / "moved.so"
     compiler = installed_program("cc", package="gcc")
-    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", library, MOVED, "-lm"]
+    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", made, MOVED, "-lm"]
     subprocess.run(command, check=True)
+    return made
+
+
+@pytest.mark.parametrize("level", [0.2, 0.9])
+def test_conformance_on_a_clock_that_is_moved(level: float, library: Path) -> None:
+    """All checks pass, where time is that of the test, and its sums of layers are limited."""
     found = judged("serial", level=level, far=partial(SmallestEnd, library))
     failed = [f"{each.check.name}: {each.reason}" for each in found if each.result == "failed"]
     assert not failed, failed[0]
     skipped = {each.check.name for each in found if each.result == "skipped"}
     assert skipped == (SKIPPED if level < 0.5 else SKIPPED - {"limited"})
+
+
+@pytest.mark.parametrize(
+    ("frequency", "clock", "angle"),
+    [(2200, 0x0010_0000, 193.359375), (2200, 0xF000_0000, 180), (5010, 0x1234_5678, 96)],
+)
+def test_samples_have_the_angles_of_the_page(
+    frequency: int, clock: int, angle: float, library: Path
+) -> None:
+    """A tone of level 0.8 at 30° plays 0.8 · sin(angle + 30°), by a clock shifted and steered."""
+    far = SmallestEnd(library, lambda _: None)
+    ahead, rate = 1000, 10_000  # steps of shift that the clock has yet to run, 1000 ppm faster
+    tone = (1, 0, 0, 0, frequency, 8000, 3000)  # layer 0 with one command, along a ramp of 0
+    shift = ((clock >> 16) - ahead) % 65536
+    for kind, words in ((3, (7, 2000, shift)), (12, (7, rate)), (5, (7, 1, 1 << 1 | 1, *tone))):
+        far.receive(encode_frame(Frame(kind, 1, kind, b"", 4), words), 0)
+    sample_of = ctypes.CDLL(str(library)).sample_of
+    sample_of.argtypes, sample_of.restype = [ctypes.c_int, ctypes.c_double], ctypes.c_double
+    time = ((ahead << 16) + clock % 65536) * 20 / 2**32 / (1 + rate * 1e-7)
+    expected = 0.8 * math.sin(math.radians(angle + 30))
+    assert sample_of(0, time) == pytest.approx(expected, abs=2e-5)
 
 
 @pytest.mark.real_time

@@ -109,7 +109,8 @@ async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> Non
     await group.open()
     await group.arm()
     played = layer((0, 110.0, 0.5), ramp=0.0)
-    await group.apply({name: [played] for name in names})
+    applied = await group.apply({name: [played] for name in names})
+    await asyncio.sleep(applied.starts_at + 0.005 - clock.now())  # by clocks that are just armed
     reader, writer = await asyncio.open_unix_connection(control)
     writer.write(b'{"op": "state"}\n{"op": "inject_fault", "fault": "arc", "amplifier": "side"}\n')
     state = json.loads(await reader.readline())["amplifiers"]

@@ -158,6 +158,11 @@ class Acted(Taken, Chain):
         return [round(1e3 * (each.latency or math.nan), 2) for each in self.applied]
 
     @property
+    def latencies_from_ms(self) -> list[float]:
+        """Of each pattern, down to 5 ms."""
+        return [each // 5 * 5 for each in self.latencies_ms]
+
+    @property
     def reason(self) -> str:
         """Why it fell silent last."""
         return self.silenced[-1].reason

@@ -62,6 +62,10 @@ class MemoryMachine:
             self.later(_NOTICED, port.outward.take, _BOOT_TEXT)  # which no witness judges
         return port
 
+    def be_prompt(self) -> None:
+        """Let bytes pass at once, on serial lines and TCP connections."""
+        self.passing = self._loop.latency = (0.0, 0.0)
+
     def kill_host(self) -> None:
         """Close the host's ports without notice, as when its process dies."""
         for port in tuple(self._open.values()):

@@ -92,7 +92,7 @@ async def far_side(
     bench, devices = make_bench(rig, seed=seed, imperfections=imperfections)
     wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
     if machine is not None and len(bench.amplifiers) > 1:
-        machine.passing = (0.0, 0.0)  # the lines have delays of their kinds
+        machine.be_prompt()  # the lines have delays of their kinds
     async with open_wires(wires, [*devices.values()]) as urls:
         try:
             yield FarSide(urls, devices, bench, machine)

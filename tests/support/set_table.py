@@ -19,6 +19,7 @@ from model.answer.plan import answer, prepare_answers, query
 from model.answer.search import Contents, Stream, Tones
 from model.answer.strength import scaled
 from model.arrays import FloatArray
+from model.ensemble.delays import ClockErrors
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
@@ -57,6 +58,7 @@ class SetTable:
     ) -> None:
         self.excitation = excitation
         self.plate = plate
+        self.eras: tuple[Era, ...] = ()  # whose clocks change nothing
         self.shared = shared
         self.strokes = defaultdict[str, float](lambda: STROKE)
         self.frequencies = np.array([90.0, 110.0, 150.0, 250.0])  # Hz
@@ -77,6 +79,10 @@ class SetTable:
         if isinstance(drive, Exception):
             raise drive
         return set_answer(fingers, drive, drive_mode=drive_mode, limits=limits)
+
+    def with_clocks(self, clocks: ClockErrors) -> "SetTable":
+        """Itself: its answers count no clocks."""
+        return self
 
     def amplitudes(
         self, excitation: Excitation, points: FloatArray

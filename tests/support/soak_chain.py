@@ -26,6 +26,7 @@ from plate_witness import PlateTimes
 from registry import clock
 from rig_on_wire import after_each, on_amplifiers
 from sim.far_ends.opening import Wire
+from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line_kinds import LINE_KINDS, PROMPT
 from small_table import small_table
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
@@ -112,6 +113,9 @@ async def _run(
         for number, (name, line) in enumerate(zip(rig.amplifiers, 3 * plan.lines, strict=False))
     }
     options: dict[str, Any] = {"timing": _timing(), "judged": _judged(plan), "seed": plan.seed}
+    if plan.amplifiers > 1:
+        crystals = draw_imperfections(rig, seed=plan.seed).crystals
+        options["imperfections"] = Imperfections(crystals=crystals)
     async with Soak.on(wires, rig, small_table(), **options) as soak:
         soak.plate_judge.violations = violations
         soak.plan, soak.trace, soak.counts = plan, trace, counts

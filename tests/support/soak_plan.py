@@ -26,7 +26,7 @@ KINDS: Mapping[str, Sequence[int | None]] = {
 _SERIAL_LINES = ("native", "usb-high-speed", "usb-full-speed", "ftdi-low-latency", "ftdi")
 LINES: Mapping[str, Sequence[str]] = {
     "serial": _SERIAL_LINES,
-    "modbus-rtu": _SERIAL_LINES,
+    "modbus-rtu": _SERIAL_LINES[:-1],  # in responses later than that a witness reads nothing
     "modbus-tcp": ("ethernet",),
     "socketcand": ("can",),
     "slcan": ("can-usb",),

@@ -66,10 +66,14 @@ class _Selector(selectors.DefaultSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """The loop; rng: of the latencies of connections; seen: observer of their bytes."""
+    """The loop; rng: of the latencies of connections; seen: observer of their bytes.
+
+    latency [s]: shortest and longest of a connection.
+    """
 
     def __init__(self, rng: random.Random | None = None, seen: Seen | None = None) -> None:
         self.now = START
+        self.latency = _LATENCY
         super().__init__(_Selector(self))
         self.rng = rng or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
@@ -112,7 +116,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self, factory: Any, host: Any = None, port: Any = 0, **_: Any
     ) -> Any:
         """Connect to a listener; raises ConnectionRefusedError without one."""
-        await asyncio.sleep(self.rng.uniform(*_LATENCY))
+        await asyncio.sleep(self.rng.uniform(*self.latency))
         server = self._servers.get(port)
         if server is None:
             raise ConnectionRefusedError(111, "Connection refused")
@@ -228,7 +232,7 @@ class MemoryTransport(asyncio.Transport):
         loop = self._loop
         # Timers of one moment fire in any order; bytes of one connection stay in order.
         soonest = self._arrives + 1e-9
-        self._arrives = max(soonest, loop.time() + loop.rng.uniform(*_LATENCY))
+        self._arrives = max(soonest, loop.time() + loop.rng.uniform(*loop.latency))
         loop.call_at(self._arrives, callback, *args)
 
 

@@ -14,7 +14,7 @@ from registry import clock
 _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _READINGS, _APART = 30, 0.03  # of one state; s between two at most
-_LONGEST = 3.0  # s; in which a rate must show
+_MAX_DURATION = 3.0  # s; in which a rate must show
 _SHIFTS = 1, 0x4000, 0xC001
 
 
@@ -64,7 +64,7 @@ async def clock_rate(subject: Subject) -> None:
     _require_known(subject)
     width = max(subject.exchange_time, subject.client.transit)
     duration = max(0.5, 1.5 * width / (_HIGHEST * RATE - DRIFT))
-    require(duration <= _LONGEST, "its exchanges are too long to see a rate")
+    require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
     async def steer(rate: int) -> None:
         end = clock.now() + duration

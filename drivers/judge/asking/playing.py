@@ -262,7 +262,7 @@ async def phases(subject: Subject) -> None:
 async def _expect_cancelled(subject: Subject) -> None:
     """Play the opposite of a tone of seconds before, amid which the clock has gone round."""
     await subject.status()
-    left = HIGH_WORDS - subject.shown.present - round(_LONG / 2 / HIGH_TIME)
+    left = HIGH_WORDS - subject.shown.clock.present - round(_LONG / 2 / HIGH_TIME)
     await subject.arm(shift=left % HIGH_WORDS)
     subject.shown.outputs.interferes = True
     halves = (subject.tone(0, 0.5, each, frequency=subject.near(1) | 1) for each in (0.0, 180.0))

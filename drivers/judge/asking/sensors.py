@@ -5,7 +5,6 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from drivers.judge.amplifier import ROUNDED
 from drivers.judge.asking.check import driving, reading
 from drivers.judge.asking.client import (
     Answer,
@@ -17,6 +16,7 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import layer, send
 from drivers.judge.asking.subject import Subject
+from drivers.judge.states import ROUNDED
 from drivers.protocol.clock import ahead
 from drivers.protocol.records import Record, Values
 from drivers.protocol.table import NO_CHANNEL, READING_STATES, sensor_reading

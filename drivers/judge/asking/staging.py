@@ -96,7 +96,7 @@ async def starts_at_its_moment(subject: Subject) -> None:
     soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
     for duration in (soon, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
-    present = subject.shown.present
+    present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
     await subject.in_time(partial(_starts, subject, soon, shift=over_the_end))
 

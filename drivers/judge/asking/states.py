@@ -5,12 +5,12 @@ import math
 from functools import partial
 from itertools import chain, cycle
 
-from drivers.judge.amplifier import FADE
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require, require_in_time
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
+from drivers.judge.states import FADE
 from drivers.protocol.clock import ahead
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import ENABLED, QUANTITIES

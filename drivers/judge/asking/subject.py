@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from drivers.judge.amplifier import OFF
 from drivers.judge.asking.client import (
     QUIET,
     REPLY_TIMEOUT,
@@ -35,6 +34,7 @@ from drivers.judge.asking.material import (
     play,
     send,
 )
+from drivers.judge.states import OFF
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
@@ -168,11 +168,11 @@ class Subject(Material):
 
     def moment(self, duration: float) -> int:
         """Return the high word of its clock that comes a time [s] after its last status."""
-        return round(self.shown.present + duration / HIGH_TIME) % HIGH_WORDS
+        return round(self.shown.clock.present + duration / HIGH_TIME) % HIGH_WORDS
 
     def filled(self, values: Values) -> Values:
         """Return values with those that a request has unless others are given."""
-        present = self.expected.present if self.expected is not None else 0
+        present = self.expected.clock.present if self.expected is not None else 0
         return {"session": self.session, "rate": 0, "shift": 0, "at": present, **values}
 
     def _parts_came(self, latest: float) -> float:
@@ -217,7 +217,7 @@ class Subject(Material):
         That may have been read later than the request was carried out, but for a GetStatus.
         """
         dating, judge = self.dating, self.expected
-        if name == "Mark" or (judge is not None and judge.is_marked):
+        if name == "Mark" or (judge is not None and judge.clock.is_marked):
             return when
         if name == "Arm" and not (
             judge and judge.is_enabled and judge.session == values["session"]

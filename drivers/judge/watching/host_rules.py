@@ -10,7 +10,7 @@ from drivers.judge.watching.config import TimeLimits
 from drivers.judge.watching.decoded import FEEDING, Request
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating
-from drivers.protocol.table import LATCHED
+from drivers.protocol.table import LATCHED, REACTION
 
 IN_FLIGHT = 0.003  # s; from the host's write until a frame is seen, of Modbus RTU at its end
 _IN_TRANSPORT = 0.010  # s; bytes may wait before they pass, while their host counts from its write
@@ -18,7 +18,7 @@ _OTHER_HOST = 2.0  # s; for which a host that hears another one sends nothing th
 _ATTEMPTS = 3  # of a request that has no reply
 _REPEATED = 0.1  # s; within which a stop that is not confirmed goes on, for each amplifier
 CONFIRMED = 0.3  # s; then the host says that it is not
-_READINGS = ("GetSensors", "Measure", "GetReading", "GetMeasured")
+_READINGS = ("GetStatus", "GetSensors", "Measure", "GetReading", "GetMeasured")
 SILENCING = ("Stop", "Disarm", "Silence")
 
 
@@ -61,22 +61,21 @@ class HostRules:
         """Check that no reply is pending that a request must wait for.
 
         preempted_by: number of the last request before which others may lose their replies. A
-        reading gives way, and the status of an amplifier that has left a request without a reply.
+        reading is given up once its reply, which begins within 10 ms, is due no more.
         """
-        mute = {each.address for each in pending if each.is_overdue}
         for each in pending:
-            name = each.name
-            is_reading = name in _READINGS or (name == "GetStatus" and each.address in mute)
             waits = request.started_at - each.started_at
             is_preempted = each.number < preempted_by
             # The host counts from its write: the bytes may have waited in a transport since.
             is_given_up = waits >= self._times.reply - max(self._times.slack, _IN_TRANSPORT)
-            if not (is_preempted or is_given_up or is_reading):
+            if each.name in _READINGS:
+                is_given_up = request.started_at >= each.since + REACTION - IN_FLIGHT
+            if not (is_preempted or is_given_up):
                 session.report_always(
                     "credit",
                     request.started_at,
                     f"host sent {request.name} to {session.name} {waits * 1e3:.1f} ms after "
-                    f"{name}, whose reply is pending",
+                    f"{each.name}, whose reply is pending",
                 )
 
     def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:

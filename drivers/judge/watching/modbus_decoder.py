@@ -56,11 +56,12 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _Transaction:
-    """One whose response is missing; request: None where it is no request."""
+    """One whose response is missing; request: None where it is none; tag: of what it reads."""
 
     adu: Adu
     key: Hashable
     request: Pdu | None = None
+    tag: int = 0
 
 
 class ModbusDecoder(Decoder):
@@ -123,9 +124,9 @@ class ModbusDecoder(Decoder):
         written = self._written.get((adu.unit, number))
         is_reply = number in BY_NUMBER and offset == REPLY
         if is_reply and written is not None and not written.is_read:
-            self._remember(_Transaction(adu, written.key, request))
+            self._remember(_Transaction(adu, written.key, request, written.tag))
             return Notice("read on", key=written.key)
-        self._remember(_Transaction(adu, key, request))
+        self._remember(_Transaction(adu, key, request, written.tag if written is not None else 0))
         if request.address == IDENTITY:
             return Request(HELLO, adu.unit, key)
         is_present = is_reply and BY_NUMBER[number].name in PRESENT
@@ -152,9 +153,10 @@ class ModbusDecoder(Decoder):
             return Reply(adu.unit, problem=problem)
         if request.function_code == WRITE:
             return Notice("carried out", key=key)
-        return self._reply(adu.unit, key, request.address, response.registers)
+        return self._reply(transaction, request.address, response.registers)
 
-    def _reply(self, unit: int, key: Hashable, address: int, words: Sequence[int]) -> Reply:
+    def _reply(self, transaction: _Transaction, address: int, words: Sequence[int]) -> Reply:
+        unit, key, tag = transaction.adu.unit, transaction.key, transaction.tag
         number, offset = divmod(address, BOX)
         if address == IDENTITY and len(words) == IDENTITY_COUNT:
             try:
@@ -164,7 +166,6 @@ class ModbusDecoder(Decoder):
         if offset != REPLY or number not in BY_NUMBER or len(words) < HEAD:
             return Reply(unit, key)
         written = self._written.get((unit, number))
-        tag = 0 if written is None else written.tag
         if words[0] != tag:
             return Reply(unit, problem=f"tag must be {tag}, got {words[0]}")
         if written is not None and written.key == key:

@@ -6,7 +6,8 @@ A request without a reply may have been carried out: the next status says so.
 import math
 from functools import partial
 
-from drivers.judge.amplifier import OFF, ExpectedAmplifier
+from drivers.judge.amplifier import ExpectedAmplifier
+from drivers.judge.states import OFF
 from drivers.judge.watching.capture import ReportViolation
 from drivers.judge.watching.decoded import (
     CHANGING,
@@ -46,6 +47,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         self.is_answered = True
         self.reported_at = -math.inf
         self._answered = 0  # number of the newest request of which a reply was seen
+        self._requested = 0  # statuses since the last that was heard
         self._fed_before = math.inf
         # Silence where there must be none, which an unreported fault would explain.
         self._suspicions: list[tuple[str, float, str, object, object]] = []
@@ -106,7 +108,8 @@ class WatchedAmplifier(ExpectedAmplifier):
             self._fed_before = self.fed[1]
             self.fed = self.fed[0], max(self.fed[1], request.started_at + REACTION)
         if request.name == "Mark" and request.key is None:
-            self._marked = request.started_at, request.since + REACTION
+            self.clock.mark((request.started_at, request.since + REACTION))
+        self._requested += REPLIES.get(request.name) is STATUS and request.key is not None
         if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 
@@ -121,6 +124,9 @@ class WatchedAmplifier(ExpectedAmplifier):
         name = request.name
         self.advance(request.earliest)
         if REPLIES.get(name) is STATUS:
+            if self._requested > 1:
+                self.clock.unheard()
+            self._requested = 0
             self._resolve(request.number, values, end)
         elif name in ("GetAchieved", "GetFaults") and self.unanswered:
             return

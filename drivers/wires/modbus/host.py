@@ -30,6 +30,7 @@ from drivers.wires.modbus.frames import (
     HEAD,
     IDENTITY,
     IDENTITY_COUNT,
+    PRESENT,
     READ_SIZE,
     REPLY,
     RESPONSE_SIZE,
@@ -182,7 +183,8 @@ class ModbusWire(Wire):
             elif request.message.function_code == WRITE and not response.exception:
                 if request.has_reply:
                     self._request = self._read_of(request)
-                    arrivals.append(More(self._request.frame))
+                    is_present = request.name in PRESENT
+                    arrivals.append(More(self._request.frame, is_present=is_present))
                 else:
                     self._request, self._last, self._replied = None, request, response
                     arrivals.append(Written())

@@ -41,7 +41,7 @@ extern struct sound_format sound_format;
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-#define CLOCK_ERROR 500 // 0.1 us; of the time at which the server or driver says that a block is played
+#define CLOCK_ERROR 65535 // not known: times of servers and drivers were not measured on a card
 
 #define FAULTS_KEPT 16
 

@@ -114,8 +114,10 @@ async def measured(
         pytest.param("serial", False, id="two wires", marks=pytest.mark.long),
     ],
 )
-def test_two_amplifiers_hear_each_other(wire: str, is_shared: bool, rig: Rig, truth: Rig) -> None:
-    """On one bus and on two wires, whose clocks the host holds together: as a direct solution."""
+def test_two_amplifiers_hear_each_other_where_their_clocks_are_held(
+    wire: str, is_shared: bool, rig: Rig, truth: Rig
+) -> None:
+    """All responses as a direct solution; on two wires but for 20 us, 0.06 rad at 500 Hz."""
 
     async def run() -> MeasuredPlate:
         wires = SHARED_WIRES if is_shared else WIRES
@@ -127,6 +129,7 @@ def test_two_amplifiers_hear_each_other(wire: str, is_shared: bool, rig: Rig, tr
     assert taken.duration < 10
     assert len(measurement.frequencies) == 28
     assert (measurement.known.sum(axis=0) == 7).all()
+    assert sorted(measurement.clock_errors) == sorted(on_two_amplifiers(rig).amplifiers)
     expected = direct_responder(truth.plate, truth.mesh)(
         truth.eras,
         measurement.frequencies,
@@ -137,7 +140,8 @@ def test_two_amplifiers_hear_each_other(wire: str, is_shared: bool, rig: Rig, tr
     number = {era.name: n for n, era in enumerate(rig.eras)}
     at = [number[sensor.era] for sensor in measurement.sensors]
     fields = (expected / strokes[:, None]).swapaxes(1, 2)[:, at]
-    assert np.nanmax(abs(measurement.values - fields)) < 0.01 * abs(fields).max()
+    bound = 0.01 if is_shared else 0.06
+    assert np.nanmax(abs(measurement.values - fields)) < bound * abs(fields).max()
 
 
 @pytest.mark.parametrize("is_cancelled", [True, False])

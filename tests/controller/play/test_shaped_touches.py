@@ -114,7 +114,9 @@ async def test_touch_starts_along_its_onset(shapes: Shapes) -> None:
         assert level(chain) == pytest.approx(FULL / 2, abs=1e-4)
         (applied,) = chain.applied
         assert applied.layer.onset is not None
-        assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
+        # It plays with its last byte: of 60 words and 12 bytes, of ten bits at 921 600 baud.
+        assert applied.time - begin == pytest.approx(132 / 92_160, abs=1e-6)
+        assert applied.from_rest
         assert applied.transient_contrast_db == 30.0
 
 
@@ -140,6 +142,29 @@ async def test_ending_follows_and_changes_nothing_that_plays(shapes: Shapes) -> 
             [FULL * (1 - number / 8) for number in range(1, 8)]
         )
         assert not any(each.ending or each.level for each in silent)
+
+
+@in_virtual_time
+async def test_ending_gives_way_to_a_touch(shapes: Shapes) -> None:
+    """On two amplifiers, whose replies take 2 ms: it is staged when the finger slides.
+
+    The set of that is the next one to play, and has its ending afterwards.
+    """
+    async with set_running("main", "side", knots=32, timing=shapes) as chain:
+        chain.far_end.delay(0.002)
+        chain.put(FINGER, OTHER)
+        await asyncio.sleep(ONSET)
+        count = len(chain.far_end.requests("Set"))
+        for _ in range(1000):
+            await asyncio.sleep(0.0001)
+            if len(chain.far_end.requests("Set")) > count:
+                break
+        chain.put((1, 0.18, 0.1), OTHER)
+        await asyncio.sleep(0.1)
+        _, *others = (each.layer.commands[0] for each in sets(chain))
+        assert [len(levels_of(each.ending)) for each in others if each.ending] == [7]
+        assert len(others) == 2
+        assert not chain.refused
 
 
 @in_virtual_time

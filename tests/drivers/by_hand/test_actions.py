@@ -69,7 +69,7 @@ async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
     """
     async with WORD_WIRES["serial"](1) as far:
         rows = await actions.identify(f"{far.url(1)}&baud=115200")
-    assert (rows["serial_number"], rows["versions"], rows["channels"]) == ("SIM-1", [3], 1)
+    assert (rows["serial_number"], rows["versions"], rows["channels"]) == ("SIM-1", [4], 1)
     assert (rows["watchdog_min_s"], rows["watchdog_max_s"]) == (0.1, 2.0)
     assert rows["channel_limits"][0].keys() == {
         *("frequency_min_hz", "frequency_max_hz", "level_max")
@@ -97,6 +97,7 @@ async def test_status_of_what_plays_and_clear_of_a_stop(wire: str) -> None:
         )
         assert 0 < rows["watchdog_left_s"] <= 2.0
         assert rows["last_round_trip_s"] > 0
+        assert 0 <= rows["clock_s"] < 20
         await actions.stop(far.url(2))
         assert (await actions.clear(far.url(2)))["state"] == "SWITCH_ON_DISABLED"
 

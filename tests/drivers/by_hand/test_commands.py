@@ -89,7 +89,8 @@ def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
 
 URL = f"sim://{example_rig_path()}?exact"
 COMMON = {
-    *("url", "state", "fault", "token", "watchdog_left_s", "levels", "layer_tokens", "reports"),
+    *("url", "state", "fault", "token", "watchdog_left_s", "clock_s", "levels"),
+    *("layer_tokens", "reports"),
     *(*STATUS_FLAGS, *(each.key for each in READINGS)),
 }
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.by_hand.rig_check import COMMIT_SKEW, check_links, phase_error, remaining_contrast
+from drivers.by_hand.rig_check import check_links
 from registry.limits import GuardLimits
 
 BUS = "can+socketcan://can0"
@@ -56,17 +56,6 @@ def test_check_links_refuses_two_amplifiers_at_one_address() -> None:
     assert "amplifier a" in wrong["c"]
 
 
-def test_check_links_warns_of_eras_on_several_links() -> None:
-    """No warning for one bus, one link, or a second link without ERAs."""
-    urls = {"a": "serial:///dev/ttyUSB0", "b": f"{BUS}#1"}
-    assert check_links(urls, channels={"a": 4}, limits=LIMITS) == ({}, [])
-    assert checked("modbus+tcp://host/1", "sim://rig.yaml") == ({}, [])
-    wrong, (warning,) = check_links(urls, channels={"a": 2, "b": 2}, limits=LIMITS)
-    assert wrong == {}
-    assert "2 links (/dev/ttyUSB0, can+socketcan://can0)" in warning
-    assert "36 degrees at 100 Hz and 90 at 250 Hz" in warning
-
-
 @pytest.mark.parametrize(
     ("urls", "times"),
     [
@@ -90,10 +79,3 @@ def test_check_links_warns_of_late_loss_detection(urls: list[str], times: list[s
     assert len(late) == len(times)
     for warning, time in zip(late, times, strict=True):
         assert time in warning
-
-
-def test_remaining_contrast_of_a_skew() -> None:
-    """1 ms is a tenth of a period of 100 Hz; 2 sin(18 degrees) of one half remains at the null."""
-    assert phase_error(100.0, COMMIT_SKEW) == pytest.approx(36.0)
-    assert remaining_contrast(100.0, COMMIT_SKEW) == pytest.approx(4.18, abs=0.01)
-    assert remaining_contrast(400.0, COMMIT_SKEW) == 0.0

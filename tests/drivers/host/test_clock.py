@@ -1,4 +1,4 @@
-"""One clock as its host sees it: readings of a counter that is made by hand, in a time of its own."""
+"""One clock as its host sees it: readings of a counter made by hand, in a time of its own."""
 
 import math
 import random
@@ -111,6 +111,7 @@ def test_shift_is_the_nearest_step_and_the_rate_undoes_the_crystal() -> None:
     talk = Exchanges(Counter(40e-6, shown=START + 3.2001 - 40e-6))
     assert talk.arm() == 65536 - 10486
     assert abs(talk.counter.lead) <= STEP / 2 + 1e-6
+    assert talk.held.scatter(talk.now) < 20e-6  # what was read before goes on to count
     talk.run(10.0)
     assert talk.counter.rate == pytest.approx(-40e-6, abs=0.5e-6)
     assert abs(talk.counter.lead) < 2e-6
@@ -133,7 +134,7 @@ def test_frames_of_usb_only_add(frame: float, bound: float) -> None:
 
 
 def test_lost_pings_make_it_swing_no_further() -> None:
-    """Every second Ping lost, in bursts: after 5 s it never again is 20 us off."""
+    """Every second Ping lost, in bursts: after 5 s it never again is 30 us off."""
     rng = random.Random(3)
     talk = Exchanges(Counter(50e-6), frames(1, 125e-6))
     talk.arm()
@@ -143,7 +144,7 @@ def test_lost_pings_make_it_swing_no_further() -> None:
         talk.run(5.0)
         talk.leads.clear()
         talk.run(30.0)
-        assert max(map(abs, talk.leads)) < 20e-6
+        assert max(map(abs, talk.leads)) < 30e-6
 
 
 def test_bits_of_a_request_are_no_lead() -> None:
@@ -159,21 +160,36 @@ def test_clock_goes_round_unnoticed() -> None:
     talk = Exchanges(Counter(30e-6, shown=START + 9.9995))
     talk.run(1.0)
     before = talk.held.lead(talk.now)
-    talk.run(30.0)
+    for _ in range(600):
+        talk.run(0.05)
+        assert talk.held.scatter(talk.now) < 10e-6
     gained = math.remainder(talk.held.lead(talk.now) - before, 20)
     assert gained == pytest.approx(900e-6, abs=5e-6)
     assert talk.held.problem(talk.now) is None
 
 
+def test_readings_begin_anew_after_a_pause() -> None:
+    """10 s without a reply, longer than readings count: its crystal has not changed meanwhile."""
+    talk = Exchanges(Counter(30e-6))
+    talk.run(2.0)
+    talk.now += 10.0
+    talk.run(1.0)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
+
+
 def jumps(counter: Counter) -> None:
+    """Move it on by 10 ms."""
     counter.shown += 0.01
 
 
 def jumps_back(counter: Counter) -> None:
+    """Move it back by as much."""
     counter.shown -= 0.01
 
 
 def stands_still(counter: Counter) -> None:
+    """Stop it."""
     counter.crystal = -1.0
 
 
@@ -183,7 +199,7 @@ def test_clock_that_jumps_is_not_trusted(fault: Callable[[Counter], None]) -> No
     talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
     talk.arm()
     talk.run(5.0)
-    assert talk.held.error(talk.now) < 10e-6
+    assert talk.held.error(talk.now) < 12e-6
     fault(talk.counter)
     talk.run(0.1)
     assert talk.held.problem(talk.now) == "clock_jumped"
@@ -235,9 +251,9 @@ def test_what_it_states_is_in_its_error() -> None:
 
 
 def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
-    """The reply to Arm is lost: its clock is read anew, whether it was shifted or not."""
+    """The reply to Arm is lost: its clock is read anew, whether it was shifted by a step or not."""
     for is_obeyed in (True, False):
-        talk = Exchanges(Counter(shown=START + 5.0))
+        talk = Exchanges(Counter(shown=START - STEP))
         talk.run(1.0)
         shift = talk.held.shift(talk.now)
         talk.lost = lambda: True
@@ -246,3 +262,29 @@ def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
         talk.counter.shown += is_obeyed * shift * STEP
         talk.run(0.2)
         assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
+
+
+def test_only_marks_count_once_they_are_used() -> None:
+    """Two behind one line: a Mark is as late for both, other requests are not, and do not count."""
+    rng, other, talks = random.Random(5), random.Random(6), list[Exchanges]()
+    for crystal in (40e-6, -30e-6):
+        talk = Exchanges(Counter(crystal), lambda: other.uniform(0.0, 0.5e-3))
+        talk.run(1.0)
+        talk.held.read_marks(talk.now)
+        talks.append(talk)
+    for _ in range(120):
+        late = 0.2e-3 + rng.uniform(0.0, 0.5e-3)
+        for talk in talks:
+            talk.send("GetStatus")
+            talk.now += 0.05
+            talk.held.sent("Mark", {}, talk.now, talk.now)
+            talk.counter.go(talk.now + late)
+            marked = talk.counter.word
+            talk.now += 2e-3
+            talk.held.sent("GetStatus", {}, talk.now, talk.now)
+            status = {"state": OFF, "clock": marked}
+            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3, bits=1e-3)
+    for talk in talks:
+        talk.counter.go(talk.now)
+    seen = talks[0].held.lead(talks[0].now) - talks[1].held.lead(talks[1].now)
+    assert seen == pytest.approx(talks[0].counter.lead - talks[1].counter.lead, abs=3e-6)

@@ -1,40 +1,53 @@
 """Commits of several lines: at one moment, or none of them; and tokens that fall far behind."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
+from drivers.errors import CommandRefused, DriverError, LinkTimeout, Overtaken, Preempted
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
+from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire
 from drivers.wires.serial_line.host import SerialWire
 from drivers.wires.wire import Wire
+from sim.amplifier.clock import AmplifierClock, Crystal
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of
 
 LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
-# By hand: a commit is a frame of 16 bytes of ten bits, of 15 of eleven after 3.5 characters, of one
-# CAN frame with eight bytes: 111 bits and at most 24 stuffed.
-LINES: dict[str, tuple[str, Callable[[], Wire], float]] = {
-    "slow serial": ("serial", lambda: SerialWire(19_200, sequence=0), 160 / 19_200),
-    "serial": ("serial", lambda: SerialWire(921_600, sequence=0), 160 / 921_600),
-    "rtu": ("rtu", lambda: ModbusWire(19_200, is_rtu=True, number=0), 203.5 / 19_200),
-    "tcp": ("tcp", lambda: ModbusWire(0, is_rtu=False, number=0), 0.0),
-    "slow can": ("can", lambda: CanWire(20_000, sequence=0), 135 / 20_000),
+# By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
+# most 111 bits and 24 stuffed, of which each is packed with a head.
+LINES: dict[str, tuple[str, Callable[[], Wire], Callable[[bytes], float]]] = {
+    "slow serial": ("serial", lambda: SerialWire(19_200, sequence=0), lambda d: len(d) / 1920),
+    "serial": ("serial", lambda: SerialWire(921_600, sequence=0), lambda d: len(d) / 92_160),
+    "rtu": (
+        "rtu",
+        lambda: ModbusWire(19_200, is_rtu=True, number=0),
+        lambda d: 11 * (len(d) + 3.5) / 19_200,
+    ),
+    "tcp": ("tcp", lambda: ModbusWire(0, is_rtu=False, number=0), lambda _: 0.0),
+    "slow can": (
+        "can",
+        lambda: CanWire(20_000, sequence=0),
+        lambda d: 135 * len(unpack_frames(d)) / 20_000,
+    ),
 }
+STATUS, COMMIT = (f"1:{MESSAGES[name].number}" for name in ("GetStatus", "Commit"))
+SLACK = 0.0002  # s; what is under way for longer than its bits
 
 
 def timed_line(name: str, amplifier: str) -> MemoryLine:
-    """A line on which commits take as long as their bits."""
+    """A line on which bytes take as long as their bits, and 0.2 ms."""
     kind, wire, takes = LINES[name]
     end = MemoryLine(kind, amplifier)
     end.line.wire = wire()
-    end.inward = lambda message, data: [(takes if message == "Commit" else 0.0002, data)]
+    end.inward = end.outward = lambda _, data: [(takes(data) + SLACK, data)]
     return end
 
 
@@ -55,20 +68,81 @@ async def started(*ends: MemoryLine) -> list[list[float]]:
 async def test_sets_start_together_on_lines_of_any_speed_that_are_busy(
     names: tuple[str, str],
 ) -> None:
-    """At one moment of their clocks, while a line carries a status whose reply takes 9 ms."""
+    """Just armed: within a step of the shift. 3 s later: within 1 us, as their amplifiers state.
+
+    With crystals of +40 and -40 ppm, and a status under way whose reply takes 9 ms. No clock is
+    read before the commit, which would wait for it.
+    """
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
+    now = ends[0].loop.time
+    for end, error in zip(ends, (40e-6, -40e-6), strict=True):
+        for far in end.far.values():
+            far.clock = AmplifierClock(Crystal(error), since=now())
     group = await group_of(*ends, watchdog=1.0)
-    ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
+    outward = ends[1].outward
 
     async def keep_busy() -> None:
         await asyncio.sleep(0.0005)
         await group.amplifiers["b"].read_status()
 
-    busy = asyncio.ensure_future(keep_busy())
-    await group.apply({name: [LAYER] for name in group.amplifiers})
-    await busy
-    ((first,), (second,)) = await started(*ends)
-    assert first == pytest.approx(second, abs=1e-6)
+    async def apart() -> float:
+        """By how much the starts of a set are apart [s]."""
+        ends[1].outward = lambda name, data: (
+            [(0.009, data)] if name == "GetStatus" else outward(name, data)
+        )
+        busy = asyncio.ensure_future(keep_busy())
+        ends[0].sent.clear()
+        await group.apply({name: [LAYER] for name in group.amplifiers})
+        await busy
+        ends[1].outward = outward
+        sent = [each for _, each in ends[0].sent]
+        assert sent.index(COMMIT) < (sent.index(STATUS) if STATUS in sent else math.inf)
+        ((first,), (second,)) = await started(*ends)
+        await group.silence(0.0)
+        return abs(first - second)
+
+    assert await apart() < 305e-6
+    until = now() + 3.0
+    while now() < until:
+        await asyncio.sleep(0.05)
+        await group.beat()
+    assert await apart() < 1e-6
+
+
+@pytest.mark.parametrize("lines", [("a", "b"), ("ab",)], ids=len)
+@in_virtual_time
+async def test_sets_start_together_by_clocks_that_cannot_be_steered(lines: tuple[str, ...]) -> None:
+    """Each its own way around: b's is 0.35 s behind, where the word of 0.25 s ago is ahead.
+
+    On two lines within a step of the word that names the moment; on one all play at once.
+    """
+    ends = [MemoryLine("serial", *names) for names in lines]
+    for end in ends:
+        for name, far in end.far.items():
+            far.capabilities["clock_error"] = CLOCK_UNKNOWN
+            crystal = Crystal(ahead={"a": 7.3, "b": -0.35}[name])
+            far.clock = AmplifierClock(crystal, since=end.loop.time())
+    group = await group_of(*ends)
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    began = [each for starts in await started(*ends) for each in starts]
+    assert len(began) == 2
+    if len(lines) == 2:
+        assert max(abs(each - applied.starts_at) for each in began) < 305e-6
+
+
+@in_virtual_time
+async def test_amplifier_that_does_not_start_at_its_moment_is_found() -> None:
+    """By two statuses, 1 and 12 ms after the moment, that show nothing of the set."""
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    group = await group_of(*ends)
+    ends[1].far["b"].playback.commit = lambda *_: None  # type: ignore[method-assign]
+    applied = await group.apply({"a": [LAYER], "b": [LAYER]})
+    read_status = group.amplifiers["b"].read_status
+    await asyncio.sleep(applied.starts_at + 0.001 - ends[0].loop.time())
+    await read_status()
+    await asyncio.sleep(0.011)
+    with pytest.raises(CommandRefused):
+        await read_status()
 
 
 @pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])
@@ -170,6 +244,43 @@ async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> Non
         await applying
     await reading
     assert await started(*ends) == [[], []]
+
+
+@pytest.mark.parametrize(
+    ("names", "is_busy", "staged"), [("a", True, [0]), ("ab", True, [0, 1]), ("ab", False, [1, 1])]
+)
+@in_virtual_time
+async def test_set_gives_way_until_an_amplifier_is_to_play_it(
+    names: str, is_busy: bool, staged: list[int]
+) -> None:
+    """The line of one is busy for 3 ms, or its reply takes that; another one has staged it.
+
+    What plays goes on, and the next set plays at once.
+    """
+    ends = [MemoryLine("serial", each) for each in names]
+    group = await group_of(*ends)
+    await group.apply({each: [LAYER] for each in names})
+    await started(*ends)
+    for end in ends:
+        end.sent.clear()
+    ends[0].outward = lambda _, data: [(0.003, data)]
+    readings = [group.amplifiers["a"].read_status()] if is_busy else []
+    has_come = False
+    ending = group.apply({each: [loud(0, 0.4)] for each in names}, lambda: has_come)
+    giving_way = asyncio.ensure_future(ending)
+    await asyncio.sleep(0.001)
+    has_come = True
+    with pytest.raises(Overtaken):
+        await giving_way
+    await asyncio.gather(*readings)
+    sent = [[each for _, each in end.sent] for end in ends]
+    assert [each.count(f"1:{MESSAGES['Set'].number}") for each in sent] == staged
+    assert not any(f"1:{MESSAGES['Commit'].number}" in each for each in sent)
+    assert [end.levels()[0] for end in ends] == [0.5] * len(ends)
+    assert group.is_armed
+    await group.apply({each: [loud(0, 0.2)] for each in names})
+    await started(*ends)
+    assert [end.levels()[0] for end in ends] == [0.2] * len(ends)
 
 
 def loud(number: int, level: float) -> Layer:

@@ -19,12 +19,12 @@ _ROWS = [(wire, amplifiers, 1) for wire in WIRES for amplifiers in AMPLIFIERS]
 def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None:
     """Up to 16 ms either way: nothing is wrong, and each click that was not played is counted.
 
-    But for some that come while all is disarmed.
+    But for some that come while all is disarmed. On one amplifier, in one exchange, all may be.
     """
     counts = play(wire, amplifiers, seed)
     taps, played, too_late = map(counts.pop, ("taps", "played", "too late"))
     assert not counts - Counter(["clicks"] * taps)
-    assert too_late > 0
+    assert too_late > 0 or amplifiers == 1
     assert played + too_late >= 0.9 * taps
 
 

@@ -5,6 +5,7 @@ Words of replies are altered after they were packed, by the name of the first va
 
 import asyncio
 import contextlib
+import math
 import random
 from collections.abc import Callable, Iterator
 
@@ -13,10 +14,12 @@ import pytest
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.clock import HIGH_TIME, SPAN
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames
+from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.far_ends import serial_amplifiers
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, Alter, MemoryLine, group_of, unaltered
@@ -301,3 +304,81 @@ async def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> N
     if has_noise and not (kind in ("tcp", "rtu") and lie == "after events"):
         odd = counters.invalid_frames + counters.unexpected_frames + counters.events
         assert odd > 0 or (kind == "can" and lie.startswith("after"))
+
+
+class Still(AmplifierClock):
+    """Shows what it showed first, and never reaches a moment."""
+
+    def reading(self, time: float) -> int:
+        return super().reading(self._since)
+
+    def reaches(self, high: int, time: float) -> float:
+        return math.inf
+
+
+class Backwards(Still):
+    """Runs backwards."""
+
+    def reading(self, time: float) -> int:
+        return -AmplifierClock.reading(self, time) % SPAN
+
+
+class Random(Still):
+    """Shows any number."""
+
+    chance = random.Random(1)
+
+    def reading(self, time: float) -> int:
+        return self.chance.randrange(SPAN)
+
+
+CLOCKS: dict[str, tuple[type[AmplifierClock], float, float]] = {
+    "0.4 s behind, not steered": (AmplifierClock, -0.4, 0.0),
+    "jumps back by 0.3 s": (AmplifierClock, 0.0, -0.3),
+    "jumps on by 19.6 s": (AmplifierClock, 0.0, 19.6),
+    "stands still": (Still, 0.0, 0.0),
+    "runs backwards": (Backwards, 0.0, 0.0),
+    "random": (Random, 0.0, 0.0),
+}
+"""A clock, by how much it is ahead at first, and jumps after 0.5 s [s]."""
+
+
+@pytest.mark.parametrize("lie", CLOCKS)
+@pytest.mark.parametrize("lines", [("a", "b"), ("ab",)], ids="-".join)
+@in_virtual_time
+async def test_clock_that_lies_costs_promise_and_stops_nothing(
+    lie: str, lines: tuple[str, ...]
+) -> None:
+    """It is said, its error is no longer known, and sets go on for 5 s."""
+    kind, ahead, jump = CLOCKS[lie]
+    ends = [MemoryLine("serial", *names) for names in lines]
+    far = ends[0].far["a"]
+    far.clock = kind(Crystal(3e-5, 0.0, ahead))
+    if "not steered" in lie:
+        far.capabilities["clock_error"] = CLOCK_UNKNOWN
+    group = await group_of(*ends, draw=random.Random(3).randint)
+    for beat in range(100):
+        if beat == 10:
+            far.clock.shift(round(jump / HIGH_TIME))
+        if beat % 5 == 0:
+            level = 0.1 + beat / 1000
+            tones = (Tone(0, 100.0, level),)
+            await group.apply({name: [Layer(beat % 3, tones, 0.001)] for name in group.amplifiers})
+        await asyncio.sleep(0.05)
+        await group.beat()
+    (said,) = set(group.amplifiers["a"].reported_at) - {"clock_unsettled"}
+    assert said == ("clock_not_steered" if "not steered" in lie else "clock_jumped")
+    assert group.clock_errors["a"] > 0.1
+    await stops_truthfully(group, ends[0])
+
+
+@in_virtual_time
+async def test_set_starts_at_once_where_a_clock_cannot_be_steered() -> None:
+    """One that is 0.4 s behind would wait 0.1 s for a moment that has passed on the host's."""
+    ends = [MemoryLine("serial", name) for name in "ab"]
+    far = ends[0].far["a"]
+    far.capabilities["clock_error"], far.clock = CLOCK_UNKNOWN, AmplifierClock(Crystal(ahead=-0.4))
+    group = await group_of(*ends)
+    await group.apply({name: [LOUD] for name in group.amplifiers})
+    await asyncio.sleep(0.01)
+    assert ends[0].levels("a") == ends[1].levels("b") == [0.5, 0.0]

@@ -11,6 +11,7 @@ from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
 from drivers.host.jobs import Job, Priority
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.clock import word_passed
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames
@@ -114,11 +115,11 @@ async def test_refusal_after_no_reply_says_that_it_may_have_played(
     lost = iter([True])
     end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
     with pytest.raises(CommandRefused) as raised:
-        await host.commit(5)
+        await host.commit(5, word_passed(end.loop.time()))
     assert raised.value.may_play
     await host.stage(6, [Layer(0, ())])
     with pytest.raises(CommandRefused) as raised:
-        await host.commit(6)
+        await host.commit(6, word_passed(end.loop.time()))
     assert not raised.value.may_play
 
 

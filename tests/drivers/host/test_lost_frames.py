@@ -78,7 +78,7 @@ async def _play(kind: str, lines: str, rng: random.Random, count: int) -> list[s
                 found.append(f"{name} does not play {token}, though it is said")
         played_sets += result is not None
         await _recovered(group)
-    if played_sets < count / 3:  # of the rest it is said, as of 8 parts on Modbus RTU
+    if played_sets < 0.6 * count:  # of the rest it is said, as of 8 parts on Modbus RTU
         found.append(f"{played_sets} of {count} sets play")
     return found
 

@@ -9,6 +9,7 @@ import pytest
 from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement, Stimulus, check_fingers, together
 from model.answer.plan import answer, query
+from model.ensemble.delays import ClockErrors
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
@@ -228,3 +229,18 @@ def test_query_without_quiet_fingers_contrasts_with_the_plate_around(targets, mo
     level = min(each.level_db_sl for each in felt)
     assert layer.contrast_to_plate_db == pytest.approx(level - around, abs=0.01)
     assert {each.contrast_db for each in felt} == {None}
+
+
+@pytest.mark.parametrize("level", [14.0, 120.0])
+def test_a_switched_content_keeps_to_one_amplifier_where_clocks_are_not_held(level):
+    """ERAs of two play at once where they are held together; a level in reach, and one beyond."""
+    exact, spans = smooth_table(), list[list[int]]()
+    for table in (exact, exact.with_clocks(ClockErrors((0, 1, 0, 1), (0.0, math.inf)))):
+        spans.append([])
+        for target, quiet in contact_sets(6, fingers=2, seed=3):
+            placed = Placement((target,), (quiet,))
+            (layer,) = query(table, placed, level, drive_mode="switched").layers
+            names = [era.name for era in table.eras]
+            spans[-1].append(len({names.index(name) % 2 for name in layer.excitation}))
+    assert max(spans[0]) == 2
+    assert spans[1] == [1] * 6

@@ -98,7 +98,7 @@ ELSEWHERE: dict[tuple[type[Section], str], tuple[str, tuple[Any, ...]]] = {
 }
 
 MAY_DIFFER = {
-    *("mesh", "amplifiers", "url", "full_level", "amplifier", "channel", "name"),
+    *("mesh", "amplifiers", "url", "full_level", "clock_error", "amplifier", "channel", "name"),
     *("limits", *sections.LimitsSection.model_fields),
 }
 """Keys that may have other values than the rig of a table, by the reference of the table's file."""
@@ -122,6 +122,7 @@ OTHERS: dict[str, Any] = {
     "amplifiers": {"main": {"url": "sim://"}, "other": {"url": "serial:///dev/b"}},
     "url": "serial:///dev/b",
     "full_level": "output",
+    "clock_error": "unknown",
     "name": "another",
     "limits": {"level": 0.5},
     "frequency": [50, 400],

@@ -1,5 +1,6 @@
 """Parts of a set, and Commit at a moment, against the rule of docs/decisions/0088 step by step."""
 
+import math
 import random
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import STATES
+from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.amplifier.contract import Amplifier
 
 SESSION = 7
@@ -202,6 +204,19 @@ def test_moment_over_the_end_of_the_clock() -> None:
     commit(amplifier, 1, at, 3)
     assert level(amplifier, 20 + 3 * STEP - 1e-6) == 0
     assert level(amplifier, 20 + 3 * STEP + 1e-6) == HALF
+
+
+def test_ping_in_the_very_moment_does_not_put_it_off_by_a_turn() -> None:
+    """In the last floating-point number before each of 50 moments, by a rate for each."""
+    amplifier = armed()
+    amplifier.clock = AmplifierClock(Crystal(error=4e-5, warm_up=1e-6))
+    for number in range(1, 51):
+        at = number / 2
+        send(amplifier, cut(number, 100 * number, count=1)[0], at)
+        commit(amplifier, number, at, ((amplifier.clock.reading(at) >> 16) + 300) % 65536)
+        moment = math.nextafter(amplifier.next_event, 0.0)
+        amplifier.handle("Ping", {"session": SESSION, "rate": 600 * number}, moment)
+        assert level(amplifier, moment + 0.001) == 100 * number
 
 
 @pytest.mark.parametrize("is_now", [False, True])

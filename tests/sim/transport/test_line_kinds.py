@@ -68,7 +68,7 @@ def test_delays_keep_the_order_and_are_those_of_their_seed(name: str) -> None:
 
     times = drawn(("line", 1))
     spent = [time - n % 300 * 1e-4 for n, time in enumerate(times)]
-    assert max(spent[:300]) + max(spent[300:]) <= LINE_KINDS[name].longest + 1e-3
+    assert max(spent[:300]) + max(spent[300:]) <= LINE_KINDS[name].max_delay + 1e-3
     assert times[:300] == sorted(times[:300])
     assert times[300:] == sorted(times[300:])
     assert times == drawn(("line", 1)) != drawn(("line", 2))

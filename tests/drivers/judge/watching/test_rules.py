@@ -197,13 +197,11 @@ def test_stop_that_was_not_heard_is_over_for_a_host_that_opens_the_wire_again(
     assert sorted({*talk.found}) == broken
 
 
-@pytest.mark.parametrize(("before", "broken"), [(0.06, ["answer"]), (0.0, ["credit"])])
-def test_status_of_an_amplifier_that_is_mute_gives_way(before: float, broken: list[str]) -> None:
-    """What is mute has left a request without a reply; of another one the reply is awaited."""
+@pytest.mark.parametrize(("after", "broken"), [(0.011, []), (0.005, ["credit"])])
+def test_reading_gives_way_once_its_reply_is_due_no_more(after: float, broken: list[str]) -> None:
+    """A reply begins within 10 ms, or never: what is sent before may meet it on the line."""
     talk = Talk().armed()
-    if before:
-        talk.sends(hand.GET_STATUS).rest(before)
-    talk.sends(hand.GET_STATUS).rest(0.005).says()
+    talk.sends(hand.GET_STATUS).rest(after).says()
     assert talk.found == broken
 
 
@@ -229,6 +227,58 @@ def test_ramp_of_a_stop_is_clipped() -> None:
     talk.rest(0.497).says(hand.STOPPED, kind=hand.GET_STATUS, levels=(2500, 0), **latched)
     talk.rest(0.6).says(hand.STOPPED, kind=hand.GET_STATUS, **latched)
     assert [each for each in talk.found if each != "stop"] == []
+
+
+def _committed_at(at: int) -> Talk:
+    """0.2 on channel 0 plays; a set of 0.5 is committed for a moment, 1 ms after the clock was 0.
+
+    Its high word counts 0.305 ms.
+    """
+    talk = Talk().armed().playing(4, 0.2).staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
+    before: dict[str, Any] = {"tokens": (4, 0, 0, 0), "levels": (2000, 0)}
+    talk.says(clock=0, token=4, **before)
+    return talk.exchange(hand.COMMIT, (9, 5, at), hand.status(token=5, **before))
+
+
+@pytest.mark.parametrize(("token", "level"), [(4, 2000), (5, 5000)])
+def test_status_of_a_moment_may_be_of_before_or_after_it(token: int, level: int) -> None:
+    """The moment comes 30 ms after the clock was 0, amid 27 ms of a status, which may show either.
+
+    Meanwhile an Event would have the witness know how late it is; here contacts do.
+    """
+    talk = _committed_at(100).rest(0.007).sends(hand.GET_STATUS).rest(0.026)
+    talk.told("contacts", ()).rest(0.001)
+    status = hand.status(token=5, tokens=(token, 0, 0, 0), levels=(level, 0))
+    assert talk.replies(hand.GET_STATUS, status).found == []
+
+
+@pytest.mark.parametrize(
+    ("level", "later", "broken"), [(2000, 0, []), (5000, 0, []), (0, 5000, ["silent"])]
+)
+def test_silence_at_the_moment_of_a_set_fades_either(
+    level: int, later: int, broken: list[str]
+) -> None:
+    """It is carried out before the moment or behind it; 40 ms later all is silent."""
+    fading = hand.status(token=5, levels=(level, 0))
+    talk = _committed_at(12).exchange(hand.SILENCE, (9, 20), fading)
+    assert talk.rest(0.04).says(token=5, levels=(later, 0)).found == broken
+
+
+@pytest.mark.parametrize(("at", "broken"), [(3, ["token"]), (5, []), (6, [])])
+def test_moment_amid_the_exchange_of_a_commit_may_have_come(at: int, broken: list[str]) -> None:
+    """Its reply may show what played before, unless the moment has passed at its first byte."""
+    assert _committed_at(at).found == broken
+
+
+@pytest.mark.parametrize(("is_heard", "broken"), [(True, ["clock"]), (False, [])])
+def test_status_that_was_not_heard_may_have_shown_a_mark(is_heard: bool, broken: list[str]) -> None:
+    """A Mark is shown once: a status 0.15 s later, 32.2 million steps, shows the present."""
+    talk = Talk().armed()
+    talk.sends(hand.MARK, address=0).rest(0.05)
+    if not is_heard:
+        talk.sends(hand.GET_STATUS)
+    talk.rest(0.1).says(kind=hand.GET_STATUS, left=98, clock=32_212_000)
+    assert [each for each in talk.found if each != "answer"] == broken
 
 
 def test_capture_replays_as_it_was_heard(tmp_path: Path) -> None:

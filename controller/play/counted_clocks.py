@@ -1,0 +1,79 @@
+"""Errors of the amplifiers' clocks as answers count them, so that a promise holds while they vary.
+
+They are counted anew where one is worse than counted, and where all have become far better: not at
+each reading, of which every one differs.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+
+from model.ensemble.delays import MAX_HELD, ClockErrors
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+MARGIN = 1.25
+"""By how much more is counted than is known."""
+
+_FAR_BETTER = 2.0  # times what is counted
+
+_logger = logging.getLogger(__name__)
+
+
+class CountedClocks:
+    """Errors by amplifier of a rig; now: gives what is known, rms [s], infinite if unknown."""
+
+    def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
+        self._rig, self._now = rig, now
+        self._names = sorted(rig.channel_counts)
+        self.errors: dict[str, float] = {}
+        """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
+
+    def counted_by(self, table: LocalizationTable) -> LocalizationTable:
+        """The table with the clocks as they are counted now; takes no time."""
+        if len(self._names) < 2:
+            return table
+        known = self._now()
+        if self._is_other(known):
+            before = self.errors
+            self.errors = {name: MARGIN * known[name] for name in self._names}
+            self._say(before)
+        eras = [era.name for era in table.eras]
+        return table.with_clocks(ClockErrors.of(eras, self._rig.wiring, self.errors))
+
+    @property
+    def is_one_lost(self) -> bool:
+        """Whether a clock is held no longer to those with which its amplifier shares contents."""
+        known = self._now() if self.errors else {}
+        return any(
+            error > counted and MARGIN * error > MAX_HELD >= counted
+            for counted, error in ((self.errors[name], known[name]) for name in self.errors)
+        )
+
+    def _is_other(self, known: Mapping[str, float]) -> bool:
+        """Whether a clock is worse than counted, or one far better."""
+        return not self.errors or any(
+            known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted
+            for name, counted in self.errors.items()
+        )
+
+    def _say(self, before: Mapping[str, float]) -> None:
+        """Log which amplifiers play contents of their own from now on, and which no longer.
+
+        No clock is known when its line has just been opened, so that it is no warning then.
+        """
+        level = logging.WARNING if before else logging.INFO
+        for name, error in self.errors.items():
+            is_alone = error > MAX_HELD
+            if is_alone and before.get(name, 0.0) <= MAX_HELD:
+                _logger.log(
+                    level,
+                    "amplifier %s: its clock is not held to the others', so its ERAs play contents "
+                    "of their own; if that lasts, see its clock_error in era amp status",
+                    name,
+                )
+            elif not is_alone and before.get(name, 0.0) > MAX_HELD:
+                _logger.info(
+                    "amplifier %s: clock held to %.0f us, its ERAs play with the others'",
+                    name,
+                    1e6 * error,
+                )

@@ -1,0 +1,200 @@
+"""Amplifiers whose clocks are off: two halves by hand, mean squares, promises by Monte Carlo."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from model.answer.answer import Answer
+from model.answer.fingers import Finger, Placement, Stimulus
+from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.plan import answer
+from model.arrays import FloatArray
+from model.ensemble.delays import EXACT_CLOCKS, ClockErrors, delayed
+from model.ensemble.draws import PROMISED_DRAWS, Drawing, draw
+from model.errors import InputError
+from model.rig.rig import Channel
+from model.rig.uncertainty import Uncertainty
+from model.study.exact_plates import draw_plates, powers_on
+from model.table.build import build_table
+from model.table.table import LocalizationTable, read_fingertips
+from paper_table import contact_sets, smooth_rig
+
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+ERAS = tuple(era.name for era in smooth_rig().eras)
+WIRING = {name: Channel("ab"[number % 2], number) for number, name in enumerate(ERAS)}
+"""Each amplifier has two ERAs of the four at the corners."""
+
+OF = np.array([0, 1, 0, 1])
+
+
+@cache
+def table() -> LocalizationTable:
+    """The paper's plate after an identification."""
+    rig = replace(smooth_rig(), uncertainty=IDENTIFIED)
+    return build_table(rig, frequencies=np.arange(40.0, 321.0, 10.0), drive_mode="phased")
+
+
+def clocks(**errors: float) -> ClockErrors:
+    """Clocks of amplifiers a and b with these errors [s]."""
+    return ClockErrors.of(ERAS, WIRING, errors)
+
+
+def test_two_equal_halves_leave_what_their_delay_says() -> None:
+    """2 sin(pi f t) of one half, t apart, and in the mean square 2 (exp(p²) - 1) of the mean's."""
+    known = {"masses": 0, "gain": 0.0, "phase": 0.0, "common_gain": 0.0, "thicknesses": 1}
+    draws, off = draw(2, 1, count=200, seed=8, **known), ClockErrors((0, 1), (20e-6, 20e-6))
+    gains = delayed(draws, off, (1.0, 250.0), 8).gains.astype(complex)
+    delays = -np.angle(1 + gains[0, :2]) / (2 * math.pi)  # [s], by the phase at 1 Hz
+    assert delays.std(axis=1) == pytest.approx([20e-6, 20e-6], rel=0.01)
+    left = np.abs(gains[1, 0] - gains[1, 1])
+    by_hand = 2 * np.abs(np.sin(math.pi * 250 * (delays[0] - delays[1])))
+    np.testing.assert_allclose(left, by_hand, atol=2e-4)
+    shares = off.power_shares(np.array([250.0]))
+    assert shares is not None
+    power = (1 + shares[0]) * [[1, -1], [-1, 1]]
+    assert power.sum() == pytest.approx(2 * math.expm1((2 * math.pi * 250 * 20e-6) ** 2), rel=1e-4)
+
+
+def test_eras_of_one_amplifier_are_late_together() -> None:
+    """Their factors are one number, and those of the other amplifier another."""
+    known = {"masses": 1, "gain": 0.0, "phase": 0.0, "common_gain": 0.0, "thicknesses": 1}
+    draws = draw(4, 2, count=64, seed=1, **known)
+    gains = delayed(draws, clocks(a=1e-4, b=2e-4), (100.0,), 1).gains[0]
+    assert (gains[0] == gains[2]).all()
+    assert (gains[1] == gains[3]).all()
+    assert np.abs(gains[0] - gains[1]).min() > 0
+    assert not gains[4:].any()  # a mass and two fingers have no drive
+
+
+@pytest.mark.parametrize(
+    ("wiring", "errors"),
+    [
+        (dict.fromkeys(ERAS, Channel("a", 0)), {"a": math.inf}),
+        (WIRING, {"a": 0.0, "b": 0.0}),
+    ],
+    ids=["one amplifier", "exact"],
+)
+def test_nothing_changes_where_no_clock_is_off(
+    wiring: Mapping[str, Channel], errors: Mapping[str, float]
+) -> None:
+    """All ERAs on one amplifier, however bad its clock is; or clocks that agree: the same table."""
+    found = ClockErrors.of(ERAS, wiring, errors)
+    assert found == EXACT_CLOCKS
+    assert table().with_clocks(found) is table()
+
+
+@pytest.mark.parametrize("errors", [{"a": 1e-6}, {"a": 1e-6, "b": math.nan}, {"a": 0, "b": -1e-6}])
+def test_clock_errors_must_be_known_of_all(errors: dict[str, float]) -> None:
+    """Missing, not a number, negative."""
+    with pytest.raises(InputError, match="amplifier b"):
+        ClockErrors.of(ERAS, WIRING, errors)
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
+    """w^H R w of random weights is the mean over 4000 plates, relative to the mean amplitude's.
+
+    Which is smaller by exp(-p² / 2), p = 2 pi f times 0.2 ms; all else is certain.
+    """
+    exact = np.zeros_like(table().discretisation_error)
+    known = replace(table(), uncertainty=Uncertainty.none(), discretisation_error=exact)
+    off = known.with_clocks(clocks(a=2e-4, b=2e-4))
+    fingers = FingersOnPlate.of(off, [(0.09, 0.07), (0.25, 0.18)], ())
+    rows, n = np.array([3, 12, 25]), 4
+    rng = np.random.default_rng(0)
+    weights = (rng.normal(size=(3, n)) + 1j * rng.normal(size=(3, n))).astype(np.complex64)
+    forms = fingers.touched.forms(
+        rows, fingers.tips.fine, fingers.tips.fine_weights, off.error_power
+    )
+    found = np.einsum("fi,fqij,fj->fq", weights.conj(), forms.power, weights).real
+    powers = fingers.powers(Drawing(4000, 5, 1), rows, weights)[..., 1:].mean(axis=-1)
+    squares = (powers * fingers.tips.fine_weights).sum(axis=-1) * off.thresholds[rows, None] ** 2
+    shrunk = np.exp(-((2 * math.pi * off.frequencies[rows] * 2e-4) ** 2))
+    np.testing.assert_allclose(found * shrunk[:, None], squares, rtol=0.06)
+
+
+def kept(found: Answer, delays: Callable[[], FloatArray], *, seed: int, count: int = 100) -> float:
+    """Share of exactly solved plates that keep the worst finger's promise; delays (d, 2) [s]."""
+    rng, places = np.random.default_rng(seed), [each.finger.at for each in found.fingers]
+    plates = draw_plates(rng, IDENTIFIED, count=count, era_count=4, contact_count=len(places))
+    late, weights = delays()[:, OF], read_fingertips(table(), places).fine_weights
+    power = []
+    for layer in found.layers:
+        (frequency,) = {tone.frequency for tone in layer.excitation.values()}
+        turned = replace(plates, gain=plates.gain * np.exp(-2j * math.pi * frequency * late))
+        placed = Placement((places[0],), tuple(places[1:]))
+        _, (one,) = powers_on(table(), placed, layer.excitation, turned)
+        threshold = table().thresholds[table().rows_of(np.array([frequency]))[0]]
+        power.append(one.reshape(len(places), -1, count) / float(threshold) ** 2)
+    worst = np.full(count, math.inf)
+    for number, layer in enumerate(found.layers):
+        (finger,) = layer.fingers
+        own = (weights[finger][:, None] * np.sqrt(power[number][finger])).sum(axis=0)
+        others = sum(each[finger] for each in power) - power[number][finger]
+        worst = np.minimum(worst, own / np.sqrt(others.max(axis=0)))
+    promised = found.promised_worst_db
+    assert promised is not None
+    return float((20 * np.log10(worst) >= promised).mean())
+
+
+def two(of: LocalizationTable, places: list[tuple[float, float]]) -> Answer:
+    """Two fingers with a content each."""
+    return answer(of, [Finger(at, Stimulus(14.0)) for at in places], min_contrast_db=-math.inf)
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_promises_count_the_delays_and_are_kept() -> None:
+    """By 84 to 94 % of plates solved exactly with clocks 50 us off, by far fewer if not counted.
+
+    Plates and delays are drawn here, by numpy alone.
+    """
+    off = table().with_clocks(clocks(a=50e-6, b=50e-6))
+    shares = []
+    for of in (off, table()):
+        each = []
+        for seed, places in enumerate(contact_sets(12, fingers=2, seed=3)):
+            rng = np.random.default_rng(seed)
+            late = 50e-6 * rng.standard_normal((100, 2))
+            each.append(kept(two(of, places), lambda late=late: late, seed=seed))
+        shares.append(np.mean(each))
+    assert 0.84 <= shares[0] <= 0.94
+    assert shares[1] < 0.7
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_an_amplifier_whose_clock_is_not_held_plays_contents_of_its_own() -> None:
+    """Each content is of one amplifier's ERAs, and kept whatever the phases between these are."""
+    off = table().with_clocks(clocks(a=math.inf, b=math.inf))
+    each = []
+    for seed, places in enumerate(contact_sets(8, fingers=2, seed=4)):
+        found = two(off, places)
+        assert len(found.layers) == 2
+        for layer in found.layers:
+            assert len({WIRING[era].amplifier for era in layer.excitation}) == 1
+        rng = np.random.default_rng(seed)
+        late = rng.uniform(0, 1, (100, 2))
+        each.append(kept(found, lambda late=late: late, seed=seed))
+    assert 0.84 <= np.mean(each) <= 0.96
+
+
+def test_amplifiers_that_are_held_play_together_beside_one_that_is_not() -> None:
+    """Of three amplifiers two are held: their ERAs are one group, and the third's another."""
+    wiring = {name: Channel("abc"[min(number, 2)], 0) for number, name in enumerate(ERAS)}
+    errors = {"a": 5e-6, "b": math.inf, "c": 5e-6}
+    assert ClockErrors.of(ERAS, wiring, errors).groups == (0, 1, 0, 0)
+    assert ClockErrors.of(ERAS, wiring, dict.fromkeys("abc", 1e-4)).groups == ()
+    assert ClockErrors.of(ERAS, wiring, dict.fromkeys("abc", 1e-3)).groups == (0, 1, 2, 2)
+
+
+def test_plates_of_the_promise_are_the_same_but_for_the_clocks() -> None:
+    """Only gains differ, and these by factors of magnitude 1."""
+    known = {"masses": 0, "gain": 0.05, "phase": 0.1, "common_gain": 0.0, "thicknesses": 40}
+    exact = draw(4, 1, count=PROMISED_DRAWS.count, seed=PROMISED_DRAWS.seed, **known)
+    off = delayed(exact, clocks(a=1e-4, b=1e-4), (100.0, 200.0), PROMISED_DRAWS.seed)
+    for name in ("loss", "damping", "own", "errors", "node"):
+        assert getattr(off, name) is getattr(exact, name)
+    np.testing.assert_allclose(np.abs(1 + off.gains[1]), np.abs(1 + exact.gains[0]), rtol=1e-5)

@@ -326,7 +326,8 @@ class Subject(Material):
         ramp_max = self.can["ramp_max"]
         layers = tuple([replace(one, ramp=min(one.ramp, ramp_max)) for one in layers])
         stream = pack_layers(layers)
-        made = parts(stream, session=1, token=token, now=bool(now), max_words=len(stream) // count)
+        max_words = math.ceil(len(stream) / count)
+        made = parts(stream, session=1, token=token, now=bool(now), max_words=max_words)
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
     def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:

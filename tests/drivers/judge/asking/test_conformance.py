@@ -331,9 +331,11 @@ TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "
 def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After 9 ms, where 10 are allowed: every check has its verdict."""
+    """After 9 ms, where 10 are allowed: every check has its verdict, or says what is not seen."""
     monkeypatch.setattr("judged_line.DELAY", 0.0045)
-    expect_passed(judged(kind, names), set() if names else SKIPPED[kind], within=1.5 * MINUTE)
+    unseen = {"watchdog_fade", "clock_rate"}  # of exchanges that are too long
+    skipped = set() if names else SKIPPED[kind] | unseen
+    expect_passed(judged(kind, names), skipped, within=1.6 * MINUTE)
 
 
 def test_request_that_comes_after_an_onset_is_no_violation(
@@ -421,7 +423,7 @@ RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 
 OFF = {
     **{"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0},
-    **{"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8},
+    **{"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8, "clock": 0},
 }
 ARMED = {**OFF, "state": 4, "flags": 1}
 
@@ -455,8 +457,9 @@ def expected_by(moment: float, level: float) -> None:
     """
     start, when = When(0.0, 0.0), When(moment, moment)
     judge = armed(1000)
-    judge.sets.sent({**PART, "stream": pack_layers([RISE])}, 0.0)
-    judge.granted("Set", {**PART, "session": 1}, {**PART, "staged": 0, "played": 1}, start)
+    part = {**PART, "session": 1, "stream": pack_layers([RISE])}
+    judge.sets.sent(part)
+    judge.granted("Set", part, {**PART, "staged": 0, "played": 1}, start)
     left = {"watchdog_left": round(1000 - 1000 * moment), "token": 1}
     played = {"levels": [round(10_000 * level), 0, 0, 0], "tokens": [1, *[0] * 7]}
     judge.check({**ARMED, **left, **played}, when)

@@ -162,7 +162,7 @@ def _judged(plan: Plan) -> Mapping[str, Any]:
 def _late(plan: Plan) -> float:
     """By how much the slowest line lets an exchange take longer [s]."""
     kinds = [LINE_KINDS[line.line_kind] for line in plan.lines if line.line_kind != PROMPT]
-    return max([kind.longest for kind in kinds], default=0.0)
+    return max([kind.max_delay for kind in kinds], default=0.0)
 
 
 @dataclass

@@ -14,7 +14,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}
 FOR_ALL = {
-    "serial": {"broadcasts", "discarded_frames"},
+    "serial": {"broadcasts"},
     "rtu": {"broadcasts", "present_areas", "events"},
     "tcp": {"events"},
     "can": {"broadcasts", "network_management"},

@@ -48,6 +48,8 @@ class Request:
     passed, infinite where it has one frame, until that is known [s]. number: in the order of
     requests. since: from which on its amplifier has to respond, infinite while it is the host's
     turn; earliest, end: between which it is carried out, None for until its reply [s].
+    is_given_up: whether the host has sent another behind it that need not wait for its reply, which
+    a response that comes late does not undo.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Request:
     earliest: float = math.inf
     end: float | None = None
     is_overdue: bool = False
+    is_given_up: bool = False
 
     @property
     def has_reply(self) -> bool:

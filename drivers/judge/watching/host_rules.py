@@ -69,7 +69,8 @@ class HostRules:
             # The host counts from its write: the bytes may have waited in a transport since.
             is_given_up = waits >= self._times.reply - max(self._times.slack, _IN_TRANSPORT)
             if each.name in _READINGS:
-                is_given_up = request.started_at >= each.since + REACTION - IN_FLIGHT
+                each.is_given_up |= request.started_at >= each.since + REACTION - IN_FLIGHT
+                is_given_up = each.is_given_up
             if not (is_preempted or is_given_up):
                 session.report_always(
                     "credit",

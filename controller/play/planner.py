@@ -124,12 +124,12 @@ class Planner:
         layers.builder = replace(layers.builder, timing=timing)
         self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
 
-    def _count_clocks(self) -> None:
+    def _count_clocks(self, *, is_one_lost: bool) -> None:
         """Answer by the clocks as they are now.
 
         What plays stays until it changes, but for what one that is lost may be part of.
         """
-        if self.clocks.is_one_lost:
+        if is_one_lost:
             self._selector.choose_anew()
         chooser = self._selector.chooser
         counted = self.clocks.counted_by(chooser.table)
@@ -245,11 +245,12 @@ class Planner:
         before, contacts = self._plan, self._tracker.contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
-            is_due = self._tracker.changed or now >= self.due or self.clocks.is_one_lost
+            is_one_lost = self.clocks.is_one_lost
+            is_due = self._tracker.changed or now >= self.due or is_one_lost
             if before is not None and not is_due:
                 return self._go_on(before, now)
             self._seen = contacts
-            self._count_clocks()
+            self._count_clocks(is_one_lost=is_one_lost)
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)
             self._intent_due = intent.due(now)

@@ -10,6 +10,7 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from statistics import median
 from typing import Any
 
@@ -17,7 +18,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.clock import WINDOW
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
-from drivers.protocol.table import CLOCK_UNKNOWN, has_feature
+from drivers.protocol.table import has_feature
 from drivers.protocol.timing import HEARTBEAT
 
 _GOOD, _POOR = 5e-6, 12e-6  # s; an error that costs nothing of a promise, and one that does
@@ -76,7 +77,7 @@ class Clocks:
                 continue
             unmarked.append((line, of_line))
             for each in of_line:
-                if each.clock.stated != CLOCK_UNKNOWN:
+                if each.clock.can_be_steered:
                     worst = max(worst, each.clock.scatter(now))
         if worst <= _GOOD:
             return
@@ -123,9 +124,15 @@ def _mark(line: Line) -> None:
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
     """Return what amplifiers and lines have in common whose requests are as late at the least."""
     line, identity = amplifier.line, amplifier.identity
-    device = re.match(r"/.*/(\D*)", line.name)
     return (
         type(line.wire),
-        device and device[1],
+        _device(line.name),
         *(identity.get(each) for each in ("vendor", "product", "firmware")),
     )
+
+
+@cache
+def _device(line: str) -> str:
+    """Return the name of the device of a line without its number; empty for a network."""
+    device = re.match(r"/.*/(\D*)", line)
+    return device[1] if device else ""

@@ -32,7 +32,7 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import HIGH_TIME
+from drivers.protocol.clock import HIGH_TIME, MAX_AHEAD
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -43,7 +43,6 @@ from drivers.protocol.sets import (
     parts,
 )
 from drivers.protocol.table import (
-    AHEAD_MAX,
     COMMAND,
     ENABLED,
     ENVELOPE,
@@ -323,7 +322,7 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                self._may_wait_until = -math.inf if is_now else now + AHEAD_MAX * HIGH_TIME
+                self._may_wait_until = -math.inf if is_now else now + MAX_AHEAD
                 error, starts = 0.0, None if is_now or self.starts <= now else self.starts
                 if starts is not None:
                     error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))

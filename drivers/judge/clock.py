@@ -2,12 +2,11 @@
 
 from drivers.judge.outputs import DRIFT, Report
 from drivers.playing.uncertain import Interval
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, ahead, high_word
-from drivers.protocol.table import AHEAD_MAX, QUANTITIES
+from drivers.protocol.clock import HIGH_STEPS, MAX_AHEAD, ahead, high_word
+from drivers.protocol.table import QUANTITIES
 
 _DRIFT = DRIFT + QUANTITIES["rate"].high
 """Of the clock, at any rate."""
-_MAX_AHEAD = AHEAD_MAX * HIGH_TIME  # s
 
 
 class ExpectedClock:
@@ -57,13 +56,13 @@ class ExpectedClock:
         None where that is surely at once.
         """
         if self._read is None:
-            return when[0], when[1] + _MAX_AHEAD
+            return when[0], when[1] + MAX_AHEAD
         clock, read = self._read
         left = ahead(at * HIGH_STEPS, clock)
         drift = _DRIFT * max(when[1] - read[0], left)
         early, late = read[0] + left - drift, read[1] + left + drift
-        if early > when[1] and late <= when[0] + _MAX_AHEAD:
+        if early > when[1] and late <= when[0] + MAX_AHEAD:
             return early, late
-        if late <= when[0] or early > when[1] + _MAX_AHEAD:
+        if late <= when[0] or early > when[1] + MAX_AHEAD:
             return None
         return when[0], max(when[1], late)

@@ -11,6 +11,8 @@ HIGH_STEPS = 1 << 16
 HIGH_WORDS = SPAN // HIGH_STEPS
 HIGH_TIME = CLOCK_TURN / HIGH_WORDS
 """Seconds of a step of the high word."""
+MAX_AHEAD = AHEAD_MAX * HIGH_TIME
+"""Seconds by which a Commit may name a moment ahead."""
 _PER_SECOND = SPAN / CLOCK_TURN
 _PASSED = 0.25  # s
 

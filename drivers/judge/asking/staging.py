@@ -8,8 +8,8 @@ from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.judge.outputs import LATE
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
-from drivers.protocol.table import AHEAD_MAX, COMMAND, LAYER
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
+from drivers.protocol.table import COMMAND, LAYER
 from registry import clock
 
 _PLACE = "protocol.md#sets"
@@ -93,8 +93,8 @@ def committed_together(subject: Subject) -> Rows:
 @driving(_PLACE)
 async def starts_at_its_moment(subject: Subject) -> None:
     """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
-    soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * AHEAD_MAX * HIGH_TIME
-    for duration in (soon, 0.95 * AHEAD_MAX * HIGH_TIME, beyond, -0.1, 0.0):
+    soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * MAX_AHEAD
+    for duration in (soon, 0.95 * MAX_AHEAD, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
     present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
@@ -108,7 +108,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.run([stage(one)])
     at, began = await _commit(subject, duration), clock.now()
     await subject.run([play(one, token=1), send("Commit", token=1)])
-    is_ahead = 0 < duration <= AHEAD_MAX * HIGH_TIME
+    is_ahead = 0 < duration <= MAX_AHEAD
     await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
     while clock.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()

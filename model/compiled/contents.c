@@ -101,33 +101,54 @@ SHARED judged *by_sets(const float *own, const float *loudest, size_t plates, co
     return found;
 }
 
+/* The least power ratio of a combination (contents) at any finger, of the first contents, on LANES plates. */
+INLINE lanes least_ratio(const int *tone, size_t contents, const judged *on, size_t from, const int *content_of,
+                         size_t fingers, const question *of) {
+    const size_t draws = on->draws;
+    lanes least = filled(INFINITY), weakest = filled(INFINITY);
+    for (size_t j = 0; j < contents; j++) weakest = smaller(weakest, some(on->own + tone[j] * draws + from));
+    for (size_t finger = 0; finger < fingers; finger++) {
+        const int own_content = content_of[finger];
+        if (own_content < 0 || (own_content < (int)contents && contents == 1)) continue;
+        if (own_content >= (int)contents && own_content < of->contents) continue;
+        lanes others = {0}, level = weakest;
+        for (size_t j = 0; j < contents; j++)
+            if ((int)j != own_content) others += some(on->loudest + (tone[j] * fingers + finger) * draws + from);
+        if (own_content < (int)contents) level = some(on->own + tone[own_content] * draws + from);
+        least = smaller(least, level / larger(others, filled(FAINT)));
+    }
+    return least;
+}
+
 /* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents, the least over
- * the sets (on). */
+ * the sets (on). LANES combinations at once, of which the lowest ratios are kept in order. */
 SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, const judged *on,
                          const int *content_of, size_t fingers, const rules *by, const question *of, arena *memory) {
     const size_t draws = on->draws;
+    const double place = (double)by->judged / 100 * (double)(draws - 1);
+    const size_t low = (size_t)place;
     const arena mark = *memory;
-    float *ratios = floats(memory, draws + LANES);
-    for (int each = 0; each < count; each++) worst[each] = INFINITY;
-    for (int one = 0; one < by->sets * count; one++) {
-        const int each = one / by->sets, *tone = combinations + (size_t)each * of->contents;
-        const float *own = on[one % by->sets].own, *loudest = on[one % by->sets].loudest;
-        for (size_t from = 0; from < draws; from += LANES) {
-            lanes least = filled(INFINITY), weakest = filled(INFINITY);
-            for (size_t j = 0; j < contents; j++) weakest = smaller(weakest, some(own + tone[j] * draws + from));
-            for (size_t finger = 0; finger < fingers; finger++) {
-                const int own_content = content_of[finger];
-                if (own_content < 0 || (own_content < (int)contents && contents == 1)) continue;
-                if (own_content >= (int)contents && own_content < of->contents) continue;
-                lanes others = {0}, level = weakest;
-                for (size_t j = 0; j < contents; j++)
-                    if ((int)j != own_content) others += some(loudest + (tone[j] * fingers + finger) * draws + from);
-                if (own_content < (int)contents) level = some(own + tone[own_content] * draws + from);
-                least = smaller(least, level / larger(others, filled(FAINT)));
+    lanes *lowest = take(memory, (low + 2) * sizeof(lanes));
+    for (int first = 0; first < count; first += LANES) {
+        lanes found = filled(INFINITY);
+        for (int set = 0; set < by->sets; set++) {
+            for (size_t i = 0; i < low + 2; i++) lowest[i] = filled(INFINITY);
+            for (size_t from = 0; from < draws; from += LANES) {
+                lanes ratios[LANES];
+                for (int l = 0; l < LANES; l++) {
+                    const size_t each = first + l < count ? first + l : count - 1;
+                    ratios[l] = least_ratio(combinations + each * of->contents, contents, on + set, from, content_of, fingers, of);
+                }
+                transpose(ratios);
+                for (size_t d = 0; d < LANES && from + d < draws; d++)
+                    for (size_t i = 0; i < low + 2; i++) {
+                        const lanes below = smaller(lowest[i], ratios[d]);
+                        ratios[d] = larger(lowest[i], ratios[d]), lowest[i] = below;
+                    }
             }
-            memcpy(ratios + from, &least, sizeof least);
+            found = smaller(found, lowest[low] + filled((float)(place - (double)low)) * (lowest[low + 1] - lowest[low]));
         }
-        worst[each] = fminf(worst[each], percentile(ratios, (int)draws, by->judged));
+        for (int l = 0; l < LANES && first + l < count; l++) worst[first + l] = found[l];
     }
     release(memory, mark);
 }

@@ -284,7 +284,7 @@ class Answer:
         return short if short > SAME_LEVEL else 0.0
 
     def pauses(self, number: int) -> bool:
-        """Whether a layer, by its number, ends or comes and goes: what masks others is not there."""
+        """Whether a layer, by its number, ends or comes and goes, and with it what it masks."""
         stream = self.contents.streams[number]
         stimulus = self.asked[stream.targets[0]].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None

@@ -366,7 +366,7 @@ class _Answering:
         if contents.streams:
             tones = choose_tones(table, contents)
         else:
-            tones = Tones.none(len(contents.places))
+            tones = Tones.none(len(contents.places), len(table.threshold_sets))
         if not tones.is_apart:
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         given = self.fingers, contents, tones, plan.held, applied

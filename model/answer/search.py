@@ -193,8 +193,8 @@ class Tones:
         return found
 
     @classmethod
-    def none(cls, fingers: int) -> "Tones":
-        """Nothing that plays at so many fingers."""
+    def none(cls, fingers: int, sets: int) -> "Tones":
+        """Nothing that plays at so many fingers; sets: of thresholds."""
         contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
-        heard = [(-math.inf,)] * fingers
+        heard = [(-math.inf,) * sets] * fingers
         return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)

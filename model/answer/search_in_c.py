@@ -72,7 +72,9 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
         *(addressof(judging), addressof(promise)),
     )
     size = 2 * n * count
-    rows, figures = array("i", bytes(4 * count)), array("f", bytes(4 * (size + count + k * (5 + rules.sets) + 2)))
+    of_fingers = k * (3 + 2 + rules.sets)
+    rows = array("i", bytes(4 * count))
+    figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
     to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
     status = run(by.library.answer, to, plates, raster, rules, given)
     if status != FOUND:

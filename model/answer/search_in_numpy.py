@@ -351,9 +351,7 @@ def best_combination(
                 worst = worst_ratios(combinations, streams, contents.quiet, *some, sensitivities)
                 combinations = combinations[best_few(worst, contents.combinations)]
         if len(combinations):
-            worst = worst_ratios(
-                combinations, streams, contents.quiet, own, loudest, sensitivities
-            )
+            worst = worst_ratios(combinations, streams, contents.quiet, own, loudest, sensitivities)
             return combinations[best_of(worst)], gap == contents.apart_hz
     raise AssertionError("contents with as many bands must have a combination")
 

@@ -19,7 +19,8 @@ def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """Return an answer whose stimuli that are limits are as strong as the others allow.
 
     Quiet fingers have IMPERCEPTIBLE_DB_SL, by the rig's own thresholds, of all of them together at
-    most, on nine of ten plates. For those that feel a vibration of their own none is raised above that, nor lowered.
+    most, on nine of ten plates. For those that feel a vibration of their own none is raised above
+    that, nor lowered.
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]

@@ -430,10 +430,11 @@ class RigSection(Section):
     """
 
     promised_thresholds: Annotated[
-        list[Annotated[str, AfterValidator(check_threshold)]], Field(min_length=1)
-    ] = [*THRESHOLDS]
-    """Sets by which promises hold, each finger's by the one that says least, beside `threshold`; all
-    that are published unless stated. Name that of `threshold` alone for promises by it alone.
+        list[Annotated[str, AfterValidator(check_threshold)]],
+        Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
+    ]
+    """Sets beside that of `threshold` by which promises hold: the one that says least counts. All
+    that are published if left out; name that of `threshold` alone for promises by it alone.
 
     Limits: a list of `vibrotactile-probe`, `pressing-fingertip`
     """

@@ -293,10 +293,15 @@ class LocalizationTable:
 
     @cached_property
     def sensitivities(self) -> Float32Array:
-        """How much higher amplitudes are to the thresholds of each set than to the first's, (s, f).
-        """
+        """How much higher amplitudes are to the thresholds of each set than to the first, (s, f)."""
         found = sensitivities(self.frequencies, self.threshold_sets, self.threshold)
         return found.astype(np.float32)
+
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> FloatArray:
+        """A level of an excitation by each set of thresholds (s,), at least [dB SL]."""
+        played = np.array([tone.frequency for tone in excitation.values()])
+        factors = sensitivities(played, self.threshold_sets, self.threshold)
+        return level_db_sl + decibels(factors.min(axis=1))
 
     @cached_property
     def modal_dispersion(self) -> Dispersion | None:

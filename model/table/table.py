@@ -293,7 +293,7 @@ class LocalizationTable:
 
     @cached_property
     def sensitivities(self) -> Float32Array:
-        """How much higher amplitudes are to the thresholds of each set than to the first, (s, f)."""
+        """How much higher amplitudes are to the thresholds of each set than the first, (s, f)."""
         found = sensitivities(self.frequencies, self.threshold_sets, self.threshold)
         return found.astype(np.float32)
 

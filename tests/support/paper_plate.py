@@ -1,7 +1,6 @@
 """The founding paper's plate, for tests that need a rig without a file."""
 
 from model.fem.mesh import Mesh
-from model.finger.perception import DEFAULT_THRESHOLD
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era, damping_from_ratio
 from model.structure.plate import Material, Plate
@@ -13,10 +12,7 @@ LENGTH, WIDTH = 0.3048, 0.2286
 
 
 def make_paper_rig(nx: int, ny: int, *, damping_ratio: float = 0.05) -> Rig:
-    """The paper's plate with ERAs at its corners, on a mesh of nx by ny.
-
-    Its promises are by the thresholds of its levels alone.
-    """
+    """The paper's plate with ERAs at its corners, on a mesh of nx by ny."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=0.01)
     damping = damping_from_ratio(
         damping_ratio, stiffness=17000.0, plate_mass=plate.mass, era_count=4
@@ -28,12 +24,4 @@ def make_paper_rig(nx: int, ny: int, *, damping_ratio: float = 0.05) -> Rig:
     )
     wiring = {era.name: Channel("main", number) for number, era in enumerate(eras)}
     limits = GuardLimits(frequency_min=40.0, frequency_max=500.0, level=1.0)
-    return Rig(
-        plate,
-        Mesh(nx, ny, LENGTH, WIDTH),
-        eras,
-        wiring,
-        {"main": "sim://"},
-        limits,
-        promised_thresholds=(DEFAULT_THRESHOLD,),
-    )
+    return Rig(plate, Mesh(nx, ny, LENGTH, WIDTH), eras, wiring, {"main": "sim://"}, limits)

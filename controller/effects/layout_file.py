@@ -9,7 +9,7 @@ from pydantic import Field
 from controller.effects.effect import (
     MAX_DB_SL,
     MIN_DB_SL,
-    USUAL_MAX_DB_SL,
+    DEFAULT_MAX_DB_SL,
     Effect,
     Level,
     TunedSection,
@@ -55,7 +55,7 @@ class LayoutSection(Section):
     ]
     elsewhere: Identifier | None = BUZZ
     max_level_db_sl: Annotated[float, Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)] = (
-        USUAL_MAX_DB_SL
+        DEFAULT_MAX_DB_SL
     )
 
 
@@ -175,7 +175,7 @@ def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effe
 
 def level_problem(level_db_sl: float, highest: float | None = None) -> str | None:
     """Return why a level [dB SL] is too high for a layout; highest: None for the usual one."""
-    highest = USUAL_MAX_DB_SL if highest is None else highest
+    highest = DEFAULT_MAX_DB_SL if highest is None else highest
     if level_db_sl <= highest:
         return None
     return (

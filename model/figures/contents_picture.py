@@ -102,10 +102,10 @@ def _draw(
 
 def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
     """Write verdict, level and contrast beside a finger, on the side towards the middle."""
-    told = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
-    lines = [str(told)]
+    words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
+    lines = [str(words)]
     if finger.layer is not None:
-        lines = [f"{_frequency(contents[finger.layer])}, {told}"]
+        lines = [f"{_frequency(contents[finger.layer])}, {words}"]
         figures = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
         lines += [
             f"{each:.0f} dB {what}"

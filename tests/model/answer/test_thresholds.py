@@ -167,5 +167,5 @@ def test_a_texture_is_mixed_where_a_steady_content_is_own():
     assert found.fingers[0].promised_contrast_db >= 12
     assert [each.verdict for each in steady.fingers] == [OWN, OWN]
     assert [each.verdict for each in found.fingers] == [MIXED, OWN]
-    told = [verdict_shown(each.verdict, is_foreign_felt=True) for each in found.fingers]
-    assert told == [MIXED, "own, others faintly felt"]
+    words = [verdict_shown(each.verdict, is_foreign_felt=True) for each in found.fingers]
+    assert words == [MIXED, "own, others faintly felt"]

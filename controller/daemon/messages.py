@@ -201,12 +201,12 @@ def contact_status(
     if isinstance(report, PlayReport) and any(each.key == contact.key for each in report.quiet):
         # Of several quiet contacts only the level of the loudest is known.
         is_known, one = len(report.quiet) == len(report.contents) == 1, report.felt
-        foreign = max(report.quiet_levels.get(contact.key, ()), default=None)
+        highest = max(report.quiet_levels.get(contact.key, ()), default=None)
         status |= {
             "role": "quiet",
             "level_db_sl": _quiet_level(one) if is_known and one is not None else None,
-            "foreign_level_db_sl": _finite(foreign),
-            "is_foreign_felt": is_felt(foreign),
+            "foreign_level_db_sl": _finite(highest),
+            "is_foreign_felt": is_felt(highest),
         }
     return ContactStatus.model_validate(status)
 

@@ -7,9 +7,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from controller.effects.effect import (
-    MAX_DB_SL,
-    MIN_DB_SL,
     DEFAULT_MAX_DB_SL,
+    MAX_DB_SL,
     Effect,
     Level,
     TunedSection,
@@ -54,9 +53,9 @@ class LayoutSection(Section):
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
     elsewhere: Identifier | None = BUZZ
-    max_level_db_sl: Annotated[float, Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)] = (
-        DEFAULT_MAX_DB_SL
-    )
+    max_level_db_sl: Annotated[
+        float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)
+    ] = DEFAULT_MAX_DB_SL
 
 
 def load_layout(
@@ -174,7 +173,7 @@ def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effe
 
 
 def level_problem(level_db_sl: float, highest: float | None = None) -> str | None:
-    """Return why a level [dB SL] is too high for a layout; highest: None for the usual one."""
+    """Return why a level [dB SL] is too high for a layout; highest: None for the default."""
     highest = DEFAULT_MAX_DB_SL if highest is None else highest
     if level_db_sl <= highest:
         return None

@@ -30,6 +30,9 @@ from registry.suggestions import did_you_mean
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 
 
+_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)]
+
+
 class RegionSection(ShapedSection, TunedSection):
     """A region of the plate and its effects."""
 
@@ -53,9 +56,7 @@ class LayoutSection(Section):
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
     elsewhere: Identifier | None = BUZZ
-    max_level_db_sl: Annotated[
-        float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)
-    ] = DEFAULT_MAX_DB_SL
+    max_level_db_sl: _HighestLevel = DEFAULT_MAX_DB_SL
 
 
 def load_layout(

@@ -37,7 +37,7 @@ def test_load_layout_reads_the_example() -> None:
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None
-    found = layout.region_at(0.22, 0.06)
+    found = layout.region_at(0.205, 0.045)
     assert found is not None
     assert found.name == "knob"
     assert layout.region_at(0.30, 0.01) is None

@@ -139,7 +139,7 @@ class Amplifier(Dialogue):
         self._times.clear()
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
         self.status_time = self.line.wire.transit(status_words)
-        self.clock.stated = can["clock_error"]
+        self.clock.identified(can["clock_error"])
         self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()

@@ -33,8 +33,16 @@ class Clocks:
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self._amplifiers = amplifiers
+        self._are_alike = True  # and so are their lines
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+
+    def follow(self) -> None:
+        """Know all from now on: one alone, or by which lines and amplifiers they differ."""
+        every = self._amplifiers.values()
+        self._are_alike = len({_kind(each) for each in every}) == 1
+        for each in every:
+            each.clock.is_alone = len(every) == 1
 
     @property
     def errors(self) -> Mapping[str, float]:
@@ -53,11 +61,10 @@ class Clocks:
         if len({each.line for each in amplifiers}) == 1 and now - marked_from > WINDOW:
             held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
             common = median([each.lead(now) for each in held] or [0.0])
-        is_alike = len({_kind(each) for each in amplifiers}) == 1
         return {
             name: math.hypot(
                 each.clock.error(now, common=common),
-                0.0 if is_alike else each.clock.shortest / 2,
+                0.0 if self._are_alike else each.clock.shortest / 2,
             )
             for name, each in every.items()
         }
@@ -123,12 +130,9 @@ def _mark(line: Line) -> None:
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
     """Return what amplifiers and lines have in common whose requests are as late at the least."""
-    line, identity = amplifier.line, amplifier.identity
-    return (
-        type(line.wire),
-        _device(line.name),
-        *(identity.get(each) for each in ("vendor", "product", "firmware")),
-    )
+    line, of = amplifier.line, amplifier.identity
+    made = of.get("vendor"), of.get("product"), of.get("firmware")
+    return type(line.wire), _device(line.name), made
 
 
 @cache

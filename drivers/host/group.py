@@ -104,6 +104,7 @@ class Group:
         await self._all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
+        self._clocks.follow()
         self._heartbeats.follow()
         # Each amplifier says itself what it has latched before.
         self.state = GroupState.DISARMED if members.epoch == before else GroupState.STOPPED

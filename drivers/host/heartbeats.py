@@ -45,10 +45,8 @@ class Heartbeats:
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
 
     def follow(self) -> None:
-        """Know all from now on: one alone, and those of a line, who are fed ahead of one's sets."""
+        """Know those of a line from now on, who are fed ahead of one's sets."""
         every = self._members.amplifiers.values()
-        for each in every:
-            each.clock.is_alone = len(every) == 1
         for line in {each.line for each in every}:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None

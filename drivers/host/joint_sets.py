@@ -179,18 +179,19 @@ class JointSets:
             moment = moment_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
         for each in staged:
             each.starts = -math.inf if moment is None else moment
+        if moment is None:
+            words = dict.fromkeys(staged, word_passed_by_all(clock.now(), [*staged]))
+        else:
+            words = words_of(moment, [*staged])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
-            if moment is None:
-                words = [word_passed_by_all(clock.now(), sharing)] * len(sharing)
-            else:
-                words = words_of(moment, sharing)
-            if len(sharing) == 1 or len({*words}) > 1:  # that of a clock which is not steered
-                for each, at in zip(sharing, words, strict=True):
-                    requests[each] = each.commit(token, at)
+            at = words[sharing[0]]
+            if len(sharing) == 1 or any(words[each] != at for each in sharing):
+                for each in sharing:  # alone, or with a clock that is not steered
+                    requests[each] = each.commit(token, words[each])
                 continue
-            make = partial(_commit_of, sharing, token, words[0])
+            make = partial(_commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()

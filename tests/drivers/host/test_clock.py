@@ -57,7 +57,7 @@ class Exchanges:
 
     def __post_init__(self) -> None:
         """Identify it."""
-        self.held.stated = self.stated
+        self.held.identified(self.stated)
         self.held.is_alone = False
 
     def send(self, name: str, **values: int) -> None:

@@ -58,7 +58,7 @@ class HeldClock:
     """The clock of an amplifier, by its messages; times [s] are of the host's clock."""
 
     def __init__(self) -> None:
-        self.identified(CLOCK_UNKNOWN)
+        self.identified(CLOCK_UNKNOWN, bits=0.0)
         self.shortest = math.inf
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
         self.is_alone = True
@@ -83,9 +83,9 @@ class HeldClock:
         self._line = _Line(time)
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
 
-    def identified(self, stated: int) -> None:
-        """Note its `clock_error` as of the wire: whether it obeys shift and rate."""
-        self.stated, self.can_be_steered = stated, stated != CLOCK_UNKNOWN
+    def identified(self, stated: int, *, bits: float) -> None:
+        """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
+        self.stated, self.can_be_steered, self._bits = stated, stated != CLOCK_UNKNOWN, bits
 
     def lead(self, time: float) -> float:
         """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
@@ -155,10 +155,8 @@ class HeldClock:
         elif name == "Ping":
             self._pinged = (self._pinged[0] if self._pinged else arrives), arrives
 
-    def replied(
-        self, name: str, values: Values, status: Values, received: float, *, bits: float
-    ) -> None:
-        """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
+    def replied(self, name: str, values: Values, status: Values, received: float) -> None:
+        """Note a Status that replies to a request at a time [s]."""
         if self.is_alone:
             return
         (sent, arrives), marks, self._marks = self._requested, self._marks, 0
@@ -172,7 +170,7 @@ class HeldClock:
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0
-        self.shortest = min(self.shortest, max(received - time - bits, 0.0))
+        self.shortest = min(self.shortest, max(received - time - self._bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
         is_kept = (self._pinged is None or name == "Ping") and (
             marks == 1 or received < self.marked_from

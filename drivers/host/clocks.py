@@ -18,6 +18,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.clock import WINDOW
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
+from drivers.host.members import Members
 from drivers.protocol.table import has_feature
 from drivers.protocol.timing import HEARTBEAT
 
@@ -29,10 +30,10 @@ _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
 
 class Clocks:
-    """The clocks of amplifiers by name, whose lines are open."""
+    """The clocks of the amplifiers of a group, whose lines are open."""
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        self._amplifiers = amplifiers
+    def __init__(self, members: Members) -> None:
+        self._members, self._amplifiers = members, members.amplifiers
         self._are_alike = True  # and so are their lines
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
@@ -110,10 +111,11 @@ class Clocks:
 
     def _read(self, amplifiers: Sequence[Amplifier]) -> None:
         """Read the statuses of amplifiers that reply, can be steered and are not being read."""
+        if self._members.has_joint_set:
+            return
         for each in amplifiers:
             reading = self._readings.get(each)
             is_free = each.clock.can_be_steered and (reading is None or reading.done())
-            is_free = is_free and not each.line.has_set
             if is_free and each.silence_cause is None and each.line.loss is None:
                 self._readings[each] = each.read_status(Priority.READING)
 

@@ -72,7 +72,7 @@ class Group:
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
         """What they play together."""
-        self._clocks = Clocks(self.amplifiers)
+        self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first

@@ -100,9 +100,10 @@ class Heartbeats:
                 all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
-                feed = partial(self._read_and_feed, each, self._members.epoch, reading)
+                feed = partial(self._feed_after, each, self._members.epoch, reading)
             elif is_late and (later := self._clocks.dither()):
-                feed = partial(self._feed_later, each.ping, self._members.epoch, later)
+                pause = asyncio.sleep(later)
+                feed = partial(self._feed_after, each, self._members.epoch, pause)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))
         return feeds
@@ -114,18 +115,13 @@ class Heartbeats:
             self._sets.token = token_after(self._sets.token)
         return committed or self._sets.token
 
-    async def _read_and_feed(
-        self, amplifier: Amplifier, before: int, reading: "asyncio.Future[Values]"
+    async def _feed_after(
+        self, amplifier: Amplifier, before: int, awaited: Awaitable[object]
     ) -> Values:
-        await reading
+        """Feed one after a reading or a pause, unless a stop or disarm came since an epoch."""
+        await awaited
         self._members.check_none_since(before)
         return await amplifier.ping()
-
-    async def _feed_later(self, feed: Feed, before: int, later: float) -> object:
-        """Feed after a time [s], unless a stop or disarm has come since an epoch."""
-        await asyncio.sleep(later)
-        self._members.check_none_since(before)
-        return await feed()
 
     def _listen(self, amplifier: Amplifier) -> None:
         """Read the status of one that is mute, until it replies or is lost."""

@@ -153,3 +153,9 @@ native: a UART of the board; ftdi: with the chip's timer of 16 ms, or as the hos
 where it can; can: a controller of the board, can-usb: an adapter; ethernet: Modbus TCP, servers.
 On CAN a frame waits for that on the bus, too.
 """
+LINE_NAMES = (*LINE_KINDS, PROMPT)
+
+
+def delays_of(kind: str | None, *line: object) -> LineDelays | None:
+    """Return those of a line of a kind by its name, None where it is prompt, as without a name."""
+    return None if kind in (None, PROMPT) else LINE_KINDS[kind].delays(line)

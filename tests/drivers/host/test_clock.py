@@ -57,7 +57,7 @@ class Exchanges:
 
     def __post_init__(self) -> None:
         """Identify it."""
-        self.held.identified(self.stated)
+        self.held.identified(self.stated, bits=1e-3)
         self.held.is_alone = False
 
     def send(self, name: str, **values: int) -> None:
@@ -75,7 +75,7 @@ class Exchanges:
         if name == "Arm":
             self.state = ARMED
         status = {"state": self.state, "clock": counter.word}
-        self.held.replied(name, values, status, counter.at + 2e-3, bits=1e-3)
+        self.held.replied(name, values, status, counter.at + 2e-3)
 
     def arm(self) -> int:
         """Read it for a second, then arm; returns the shift."""

@@ -131,13 +131,9 @@ class Line:
         As late as replies have come, by three frames of USB at the most. One that is lost is not
         waited for: it is repeated 30 ms later.
         """
-        takes = self.wire.transit(_COMMIT_WORDS)
-        return (
-            max(self.time(), self._free_at, self._sent_until)
-            + takes
-            + min(self.late, _MAX_COMMIT_LATE)
-            + _SENDING
-        )
+        begins = max(self.time(), self._free_at, self._sent_until)
+        late = min(self.late, _MAX_COMMIT_LATE) + _SENDING
+        return begins + self.wire.transit(_COMMIT_WORDS) + late
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""

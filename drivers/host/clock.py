@@ -164,8 +164,7 @@ class HeldClock:
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and self._is_armed:
-            steps = (values["shift"] + HIGH_WORDS // 2) % HIGH_WORDS - HIGH_WORDS // 2
-            self._added += steps * HIGH_TIME
+            self._added += values["shift"] * HIGH_TIME
             self._near_at = time
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)

@@ -10,7 +10,7 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -81,7 +81,8 @@ class Clocks:
         now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
             if of_line[0].clock.marked_from < now:
-                loop.call_later(self._later(_INTERVAL), _mark, line)
+                mark = partial(line.submit, None, Priority.HEARTBEAT, "Mark", {})
+                loop.call_later(self._later(_INTERVAL), mark)  # they keep their clocks
                 continue
             unmarked.append((line, of_line))
             for each in of_line:
@@ -95,7 +96,10 @@ class Clocks:
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
-                takes = sum([_takes(each) for each in of_line])
+                takes = 0.0  # a reading of each, as its last exchange shows
+                for each in of_line:
+                    last = each.counts.last_round_trip or 0.0
+                    takes += max(each.exchange_time("GetStatus"), last)
                 interval = max(least, takes / _MAX_LOAD)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(self._later(number * interval), self._read, of_line)
@@ -120,25 +124,9 @@ class Clocks:
                 self._readings[each] = each.read_status(Priority.READING)
 
 
-def _takes(amplifier: Amplifier) -> float:
-    """Return how long a reading of an amplifier keeps its line [s], as its last exchange shows."""
-    return max(amplifier.exchange_time("GetStatus"), amplifier.counts.last_round_trip or 0.0)
-
-
-def _mark(line: Line) -> None:
-    """Have all amplifiers of a line keep their clocks, for their next statuses."""
-    line.submit(None, Priority.HEARTBEAT, "Mark", {})
-
-
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
     """Return what amplifiers and lines have in common whose requests are as late at the least."""
     line, of = amplifier.line, amplifier.identity
+    device = re.match(r"/.*/(\D*)", line.name)  # without its number; none for a network
     made = of.get("vendor"), of.get("product"), of.get("firmware")
-    return type(line.wire), _device(line.name), made
-
-
-@cache
-def _device(line: str) -> str:
-    """Return the name of the device of a line without its number; empty for a network."""
-    device = re.match(r"/.*/(\D*)", line)
-    return device[1] if device else ""
+    return type(line.wire), device and device[1], made

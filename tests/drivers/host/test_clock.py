@@ -283,7 +283,7 @@ def test_only_marks_count_once_they_are_used() -> None:
             talk.now += 2e-3
             talk.held.sent("GetStatus", {}, talk.now, talk.now)
             status = {"state": OFF, "clock": marked}
-            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3, bits=1e-3)
+            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
     for talk in talks:
         talk.counter.go(talk.now)
     seen = talks[0].held.lead(talks[0].now) - talks[1].held.lead(talks[1].now)

@@ -10,7 +10,6 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
 from statistics import median
 from typing import Any
 
@@ -81,8 +80,8 @@ class Clocks:
         now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
             if of_line[0].clock.marked_from < now:
-                mark = partial(line.submit, None, Priority.HEARTBEAT, "Mark", {})
-                loop.call_later(self._later(_INTERVAL), mark)  # they keep their clocks
+                later = self.later(_INTERVAL)
+                loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
             unmarked.append((line, of_line))
             for each in of_line:
@@ -96,19 +95,13 @@ class Clocks:
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
-                takes = 0.0  # a reading of each, as its last exchange shows
-                for each in of_line:
-                    last = each.counts.last_round_trip or 0.0
-                    takes += max(each.exchange_time("GetStatus"), last)
-                interval = max(least, takes / _MAX_LOAD)
+                takes = [each.exchange_time("GetStatus") for each in of_line]
+                shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+                interval = max(least, sum(map(max, takes, shown)) / _MAX_LOAD)
                 for number in range(1, int(HEARTBEAT / interval)):
-                    loop.call_later(self._later(number * interval), self._read, of_line)
+                    loop.call_later(self.later(number * interval), self._read, of_line)
 
-    def dither(self) -> float:
-        """Return by how much later [s] an amplifier is fed whose heartbeats alone are readings."""
-        return 0.0 if len(self._amplifiers) == 1 else self._later(0.0)
-
-    def _later(self, duration: float) -> float:
+    def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] and some of a frame."""
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME

@@ -101,8 +101,8 @@ class Heartbeats:
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
                 feed = partial(self._feed_after, each, self._members.epoch, reading)
-            elif is_late and (later := self._clocks.dither()):
-                pause = asyncio.sleep(later)
+            elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
+                pause = asyncio.sleep(self._clocks.later())
                 feed = partial(self._feed_after, each, self._members.epoch, pause)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))

@@ -129,7 +129,6 @@ _RECEIVING = Latency(least=80e-6, median=90e-6, sigma=1.0, stalls=0.03, stall=2e
 _HIGH_SPEED = LineKind(_WRITING, _WAKING, frame=125e-6, usb_byte=8 / 480e6)
 _FULL_SPEED = LineKind(_WRITING, _WAKING, frame=1e-3, usb_byte=8 / 12e6)
 
-
 PROMPT = "prompt"
 """The name of a line that adds nothing."""
 LINE_KINDS: Mapping[str, LineKind] = {

@@ -38,7 +38,9 @@ _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: no
 _FAST = 0.25, 3e-3  # a watchdog, or lost Pings overshoot; within what a Ping can say
 _UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
 _NEAR = 20e-6  # s; or its error: what is led to zero
-_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
+# Of an error, between clocks that were read by the same Marks: once they are `WINDOW` old, and at
+# last, as `python -m benchmarks.clocks` shows beside what is stated.
+_COMMON_AT_FIRST, _COMMON = 0.6, 0.15
 _SURELY = 4.0  # standard errors
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
 
@@ -109,7 +111,11 @@ class HeldClock:
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
-        seen = self.scatter(time) * (1.0 if common is None else _COMMON)
+        share = 1.0
+        if common is not None:
+            age = max(time - self.marked_from, WINDOW)
+            share = max(_COMMON_AT_FIRST * (WINDOW / age) ** 2, _COMMON)
+        seen = self.scatter(time) * share
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:

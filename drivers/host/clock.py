@@ -25,6 +25,8 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
+COMMON_AFTER = WINDOW + 2.0
+"""Seconds of Marks after which clocks agree by them: what was led by single readings is over."""
 _PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
@@ -38,9 +40,7 @@ _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: no
 _FAST = 0.25, 3e-3  # a watchdog, or lost Pings overshoot; within what a Ping can say
 _UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
 _NEAR = 20e-6  # s; or its error: what is led to zero
-# Of an error, between clocks that were read by the same Marks: once they are `WINDOW` old, and at
-# last, as `python -m benchmarks.clocks` shows beside what is stated.
-_COMMON_AT_FIRST, _COMMON = 0.6, 0.15
+_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
 
@@ -111,11 +111,8 @@ class HeldClock:
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
-        share = 1.0
-        if common is not None:
-            age = max(time - self.marked_from, WINDOW)
-            share = max(_COMMON_AT_FIRST * (WINDOW / age) ** 2, _COMMON)
-        seen = self.scatter(time) * share
+        is_common = common is not None and self._is_by_marks(time)
+        seen = self.scatter(time) * (_COMMON if is_common else 1.0)
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
@@ -246,7 +243,9 @@ class HeldClock:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            square, error = middle**2 - breadth / count, off_line / count + _LEAST**2
+            # What Marks share counts for nothing: what is likely would bend each line by its crystal.
+            own = 0.0 if self._is_by_marks(time) else off_line / count
+            square, error = middle**2 - breadth / count, own + _LEAST**2
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
             tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
             warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
@@ -262,6 +261,11 @@ class HeldClock:
         if off > _FAR + _FAR_ERRORS * error:
             del lowest[:-_RECENT]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
+
+    def _is_by_marks(self, time: float) -> bool:
+        """Whether all that is kept was read by Marks, for as long as readings count."""
+        known = time - self._lowest[0][0] if self._lowest else 0.0
+        return self.marked_from < math.inf and known > WINDOW - 2 * _MAX_PART
 
     def _unsteered(self, time: float) -> float:
         line = self._line

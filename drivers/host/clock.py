@@ -243,7 +243,7 @@ class HeldClock:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            # What Marks share counts for nothing: what is likely would bend each line by its crystal.
+            # Marks share what scatters; what is likely would bend each line as its crystal is not.
             own = 0.0 if self._is_by_marks(time) else off_line / count
             square, error = middle**2 - breadth / count, own + _LEAST**2
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2

@@ -1,14 +1,17 @@
 """Print how far apart clocks, clicks and sets of three amplifiers are, for each kind of line.
 
 clocks: rms of one clock, from the differences of each two, over a second from 1 s, 30 s and 10 min
-after arming on; a finger rests from 0.5 s on. click: the longest of 40 from the first amplifier's
-start to the last one's. set: median from a touch until all play, of three amplifiers and of one.
+after arming on, and what the host says of them then; a finger rests from 0.5 s on. click: the
+longest of 40 from the first amplifier's start to the last one's. set: median from a touch until all
+play, of three amplifiers and of one.
 """
 
 import argparse
 import asyncio
+import math
 import statistics
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from benchmarks.clocks.firmware import firmware_skew
 from benchmarks.clocks.session import NAMES, Arrangement, Session, armed, run_virtual
@@ -25,14 +28,19 @@ ARRANGEMENTS = {
     "CAN by USB, one bus": Arrangement("slcan", "can-usb", is_bus=True),
     "USB high speed, one bus": Arrangement("serial", "usb-high-speed", is_bus=True),
     "USB full speed, one bus": Arrangement("serial", "usb-full-speed", is_bus=True),
+    "The same without Mark": Arrangement("serial", "usb-full-speed", is_bus=True, has_mark=False),
     "Modbus RTU, USB high speed": Arrangement("modbus-rtu", "usb-high-speed", is_bus=True),
 }
 _WINDOW, _STEP = 1.0, 0.05  # s
 _TAPS, _HELD, _APART = 40, 0.05, 0.25  # s
 
 
-async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list[list[float]]:
-    """Return the differences of clocks [s] in a second from each moment after arming on."""
+Skews: TypeAlias = tuple[list[float], list[float]]
+"""Differences of clocks, and errors that are stated of them [s]."""
+
+
+async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list[Skews]:
+    """Return those in a second from each moment after arming on."""
     found = []
     async with armed(lines, seed) as session:
         begin = clock.now()
@@ -40,11 +48,12 @@ async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list
         for moment in moments:
             session.touch((0.3, 0.4))
             await asyncio.sleep(max(0.0, begin + moment - clock.now()))
-            differences: list[float] = []
+            differences, stated = list[float](), list[float]()
             while clock.now() < begin + moment + _WINDOW:
                 differences += session.differences()
+                stated += session.controller.group.clock_errors.values()
                 await asyncio.sleep(_STEP)
-            found.append(differences)
+            found.append((differences, stated))
             session.touch()
     return found
 
@@ -84,6 +93,10 @@ def _starts(session: Session, since: float) -> list[float]:
     ]
 
 
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(statistics.mean(each**2 for each in values))
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -98,7 +111,7 @@ def main() -> None:
         rms, uncertain = asyncio.run(firmware_skew(options.firmware))
         print(f"firmware: rms of one clock {1e6 * rms:.1f} us, known to {1e6 * uncertain:.0f} us")
         return
-    heads = "".join(f"{moment:>7g} s" for moment in options.moments)
+    heads = "".join(f"{moment:>8g} s, said" for moment in options.moments)
     print(f"{'rms of one clock [us]':<30}{heads}{'click [us]':>12}{'set [ms]':>10}{'of one':>10}")
     for name, lines in ARRANGEMENTS.items():
         if options.only not in name:
@@ -106,8 +119,8 @@ def main() -> None:
         runs = [run_virtual(skews(lines, n, options.moments)) for n in range(options.seeds)]
         row = ""
         for window in zip(*runs, strict=True):
-            square = statistics.mean(each**2 for run in window for each in run)
-            row += f"{1e6 * (square / 2) ** 0.5:>9.1f}"
+            off, stated = ([each for run in window for each in run[n]] for n in (0, 1))
+            row += f"{1e6 * _rms(off) / 2**0.5:>10.1f} /{1e6 * _rms(stated):>6.1f}"
         apart, late = zip(*run_virtual(taps(lines, 0, NAMES)), strict=True)
         _, alone = zip(*run_virtual(taps(lines, 0, NAMES[:1])), strict=True)
         row += f"{1e6 * max(apart):>12.1f}"

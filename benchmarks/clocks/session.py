@@ -17,7 +17,7 @@ from typing import Any
 from controller.play.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.table import CLOCK_TURN, FEATURES
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 from registry import clock
@@ -37,11 +37,15 @@ SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcan
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How three amplifiers are connected: wire and kind of line; is_bus: all on one line."""
+    """How three amplifiers are connected: wire and kind of line; is_bus: all on one line.
+
+    has_mark: whether they know Mark.
+    """
 
     wire: str
     line_kind: str
     is_bus: bool = False
+    has_mark: bool = True
 
     def wires(self, names: tuple[str, ...], seed: int) -> Mapping[str, Wire]:
         """The wires by amplifier."""
@@ -102,6 +106,8 @@ async def armed(
     drawn = draw_imperfections(rig, seed=seed)
     async with _rig_on_wire.far_side(lines.wires(names, seed), rig, imperfections=drawn) as far:
         far.machine.be_prompt()
+        for amplifier in () if lines.has_mark else far.bench.amplifiers.values():
+            amplifier.capabilities["features"] &= ~(1 << FEATURES["mark"])
         controller = make_controller(rig, far.urls)
         await controller.open()
         running = asyncio.create_task(controller.cycle.run())

@@ -156,7 +156,7 @@ class Cycle:
                 sent_at = await self.group.silence(sets.silence)
                 planner.layers.may_play = frozenset()
                 return sent_at
-            if self.group.sets.is_incomplete:
+            if self.group.sets.is_in_doubt:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
             is_preempted = self._wake.is_set if sets.endings else None
             played = await self.group.apply(sets.by_amplifier, is_preempted)

@@ -103,7 +103,7 @@ class Planner:
         self.clocks = CountedClocks(rig, clock_errors)
         """Their clocks, as answers count them."""
         self._selector = Selector(
-            Chooser(self.clocks.counted_by(table), self.layers.builder.shape),
+            Chooser(table, self.layers.builder.shape),
             arrived=self._note_answer,
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
@@ -139,11 +139,13 @@ class Planner:
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; seconds, of a large rig.
 
-        Raises InputError for a table that has no pattern for these amplifiers.
+        Of the table as it is, by which statuses say what leaks; all of it is shared by that of the
+        clocks. Raises InputError for a table that has no pattern for these amplifiers.
         """
-        table, timing = self._selector.chooser.table, self.timing
-        mode = self.capabilities.drive_mode
-        prepare_answers(table, mode)
+        mode, timing = self.capabilities.drive_mode, self.timing
+        prepare_answers(self._selector.chooser.table, mode)
+        self._count_clocks(is_one_lost=False)
+        table = self._selector.chooser.table
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
         placed = Placement(((plate.length / 2, plate.width / 2),), ((0.0, 0.0),))

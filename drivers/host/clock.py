@@ -24,6 +24,8 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
+COMMON_AFTER = WINDOW + 2.0
+"""Seconds of Marks after which clocks agree by them: what was led by single readings is over."""
 _PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
@@ -34,7 +36,7 @@ _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it w
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.1, 3e-3  # longer than a Ping is late; with a crystal's, within what a Ping can say
+_FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
 _UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _COMMON = 0.1  # of an error, between clocks that were read by the same Marks
@@ -107,7 +109,8 @@ class HeldClock:
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
-        seen = self.scatter(time) * (1.0 if common is None else _COMMON)
+        is_common = common is not None and self._is_by_marks(time)
+        seen = self.scatter(time) * (_COMMON if is_common else 1.0)
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
@@ -235,7 +238,9 @@ class HeldClock:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            square, error = middle**2 - breadth / count, off_line / count + _LEAST**2
+            # Marks share what scatters; what is likely would bend each line as its crystal is not.
+            own = 0.0 if self._is_by_marks(time) else off_line / count
+            square, error = middle**2 - breadth / count, own + _LEAST**2
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
             tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
             warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
@@ -251,3 +256,8 @@ class HeldClock:
         if off > _FAR + _FAR_ERRORS * error:
             del self._lowest[:-_RECENT]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
+
+    def _is_by_marks(self, time: float) -> bool:
+        """Whether all that is kept was read by Marks, for as long as readings count."""
+        known = time - self._lowest[0][0] if self._lowest else 0.0
+        return self.marked_from < math.inf and known > WINDOW - 2 * _MAX_PART

@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any
 
 from drivers.host.amplifier import Amplifier
-from drivers.host.clock import WINDOW
+from drivers.host.clock import COMMON_AFTER
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members
@@ -58,7 +58,7 @@ class Clocks:
         amplifiers, common = [*every.values()], None
         now = amplifiers[0].line.time()
         marked_from = max([each.clock.marked_from for each in amplifiers])
-        if len({each.line for each in amplifiers}) == 1 and now - marked_from > WINDOW:
+        if len({each.line for each in amplifiers}) == 1 and now - marked_from > COMMON_AFTER:
             held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
             common = median([each.lead(now) for each in held] or [0.0])
         return {

@@ -147,6 +147,11 @@ class Dialogue:
             raise CommandError(f"amplifier {self.name} must be opened first")
         return self._ledger
 
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether a set was sent to it that it has not confirmed, so that it may play."""
+        return self._ledger is not None and self._ledger.doubt is not None
+
     def exchange_time(self, name: str) -> float:
         """Return how long the longest request of a name and its reply take on the wire [s]."""
         if name not in self._times:

@@ -56,12 +56,19 @@ class JointSets:
         self.is_incomplete = False
         """Whether possibly only some amplifiers have committed the last set."""
 
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether it is unknown if the last set plays, on all amplifiers: it is silenced first."""
+        return self.is_incomplete or any(
+            each.is_in_doubt for each in self._members.amplifiers.values()
+        )
+
     def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
 
-        Not while a set is incomplete, which is silenced first.
+        Not while a set is in doubt, which is silenced first.
         """
-        if self.is_incomplete:
+        if self.is_in_doubt:
             return None
         refusals: dict[str, CommandRefused] = {}
         for name, each in layers.items():

@@ -21,6 +21,7 @@ _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
 _LASTING = 3.0  # s; what ends after it is not awaited
+_AMBIGUOUS = "a request came as a layer ended by itself, or its onset"
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
 _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
 _ALL_LAYERS = {*range(_LAYERS)}
@@ -84,18 +85,6 @@ class ExpectedOutputs:
 
     # What happens
 
-    def _begins(
-        self, when: Interval, layers: Sequence[LayerSet] | None, ramp: float = 0.0
-    ) -> Interval:
-        """Return between which times begins what is carried out between two.
-
-        It is unclear where something ends or starts by itself just then.
-        """
-        begins = when[0], when[1] + LATE
-        if self._unclear is not None and self._plays.is_ambiguous(begins, layers, ramp):
-            self._unclear("a request came as a layer ended by itself, or its onset")
-        return begins
-
     def _may_end(self, layer: int, start: float, end: float) -> bool:
         """Whether a layer may end by itself between two times."""
         half = self._plays.half[layer]
@@ -116,7 +105,9 @@ class ExpectedOutputs:
         self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
     ) -> None:
         """Play a set from some time between two on; is_exact: every command to the word."""
-        start, end = self._begins(when, layers)
+        start, end = when[0], when[1] + LATE
+        if self._unclear is not None and self._plays.is_ambiguous((start, end), layers):
+            self._unclear(_AMBIGUOUS)
         channels = range(self.playback.channels)
         self._before = [*map(self.playback.settled, channels)]
         for one in layers:
@@ -141,9 +132,11 @@ class ExpectedOutputs:
         self, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
     ) -> Interval:
         """Silence all along a ramp [s] from some time between two on; return when it is silent."""
-        start, end = self._begins(when, None, ramp)
-        for layer in filter(lambda each: self._may_end(each, start, end), _ALL_LAYERS):
-            self._unknown[layer] = math.inf  # it fades, or has fallen silent by its ending
+        start, end = when[0], when[1] + LATE
+        if self._plays.is_ambiguous((start, end), None, ramp):
+            self._unknown = [math.inf] * _LAYERS  # it fades, or falls silent by its ending
+            if self._unclear is not None:
+                self._unclear(_AMBIGUOUS)
         self._plays.silence((start, end), ramp)
         is_known = max(self._unknown) < start
         self._unknown = [min(until, end + ramp) for until in self._unknown]

@@ -82,7 +82,10 @@ WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
 def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., Path]) -> None:
     """Half of the requests are whole, so that it plays; damaged ones have a good checksum mostly.
 
-    Its states, levels, watchdog and high voltage keep what the protocol says of them.
+    Its states, levels, watchdog and high voltage keep what the protocol says of them. It plays: a
+    set for at least 500 damaged frames, and for 30 to 50 of them where a request is one frame. On
+    CAN a request is five frames, so that there are five times fewer requests, and nearly none of
+    those that may be damaged is whole: of the three or four of a set 0.5 each, not 0.65.
     """
     draw, firmware = random.Random(wire), MovedFirmware(moved())
     host = RandomHost(draw, values_of(firmware, hand.GET_CAPS))
@@ -117,4 +120,4 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
         assert (status["watchdog_left"] > 0) <= is_armed
         latch, clock = status["latch"], status["clock"]
         tokens.add(status["token"])
-    assert len(tokens) > COUNT / 1000  # sets were played; on CAN each is dozens of frames
+    assert len(tokens) > COUNT / 500

@@ -11,10 +11,13 @@ import pytest
 
 from chain import FarEnd
 from controller.effects.player import EffectPlayer
+from controller.play.content import leaks_db_sl
 from controller.play.counted_clocks import CountedClocks
+from controller.sources.contacts import Contact, ContactKey
 from drivers.host.group import Group
 from drivers.protocol.table import CLOCK_UNKNOWN
 from model.answer.timing import Timing
+from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
@@ -115,3 +118,26 @@ def played(end: FarEnd) -> set[float]:
 def shared(fingers: Fingers) -> set[float]:
     """Frequencies [Hz] that both amplifiers play."""
     return set.intersection(*map(played, fingers.far_ends))
+
+
+@in_virtual_time
+async def test_status_of_several_amplifiers_eliminates_no_plate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of 16 ERAs that takes 0.2 s, in which no heartbeat goes out: it is done before touches."""
+    eliminated: list[object] = []
+    eliminate = PlateOnEras.of
+
+    def noted(plate: AttachedPlate, *counts: int) -> PlateOnEras:
+        eliminated.append(plate)
+        return eliminate(plate, *counts)
+
+    monkeypatch.setattr(PlateOnEras, "of", noted)
+    rig, fresh = halves(), replace(table())
+    options = {"intent_source": EffectPlayer(LAYOUT), "timing": Timing(table())}
+    async with Fingers.on(WIRE, rig, fresh, **options) as fingers:
+        await fingers.open()
+        assert eliminated
+        eliminated.clear()
+        leaks_db_sl(fresh, (), (Contact(ContactKey("panel", 1), *LEFT, since=0.0),))
+        assert not eliminated

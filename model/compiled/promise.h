@@ -11,6 +11,7 @@ typedef struct {
     const question *of;
     const int *rows;
     const lanes *powers;
+    const lanes *harmonics; /* (contents, k, groups) over fingertips */
     const float *gains;
     size_t groups, plates;
 } felt;
@@ -59,6 +60,10 @@ SHARED lanes foreign_power(const felt *of, size_t without, size_t group, size_t 
         }
         loudest = larger(loudest, total);
     }
+    for (size_t content = 0; content < contents; content++)
+        if (content != without)
+            loudest += of->gains[content] * of->gains[content] *
+                       of->harmonics[(content * of->on->k + finger) * of->groups + group];
     return loudest;
 }
 
@@ -144,6 +149,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
             sense(powers + (content * groups + group) * points, &drawn, content, group, found, force);
     felt now = {.on = on, .by = by, .of = of, .rows = to->rows, .powers = powers, .gains = to->gains, .groups = groups,
                 .plates = plates};
+    now.harmonics = find_harmonics(&of->harmonics, of->promise, k, contents, to->rows, to->weights, memory);
 
     float *own = floats(memory, contents * plates), *some = floats(memory, plates), *worst = floats(memory, plates);
     float *loudest = floats(memory, plates);

@@ -4,9 +4,12 @@ Plates of several thicknesses have their ERAs and masses eliminated, once for ea
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
 s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (as in `model.reduction.free_plate`): of one h times as thick
+and frequencies higher by it (as in `model.reduction.free_plate`); another modulus moves frequencies
+alone. Of one h times as thick, whose frequencies are q times as high
 
-    g = 1 / (h (h² s lambda - w²)),    dg / d ln loss = -i h³ Im(s lambda) g².
+    g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
+
+Plates are drawn along one axis, of q; h is what is likely of a plate of that q.
 
 Elimination. Attachments b, the ERAs first, of dynamic stiffness Z:
 
@@ -22,7 +25,7 @@ uncertainty the other parameters change the response nearly in proportion.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from statistics import NormalDist
 
@@ -113,13 +116,18 @@ class AttachedPlate(Mounts):
     ) -> tuple[Complex64Array, Complex64Array]:
         """g of plates of known thicknesses at a frequency by its row, (d, r) [s²/kg].
 
-        And its change by one standard deviation of the loss factor. deviations (d,): in standard
-        deviations.
+        And its change by one standard deviation of the loss factor. deviations (d,): of the
+        frequencies, in standard deviations.
         """
-        factor = np.maximum(1 + self.uncertainty.thickness * deviations, LEAST_THICKNESS)
-        receptance = modal_receptance(self.modal[[row]], self.omega[[row]], factor)[:, 0]
-        lost = -1j * math.log(self.uncertainty.damping) * self.modal[row].imag
-        by_loss = lost * factor[:, None] ** 3 * receptance**2
+        known = self.uncertainty
+        share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
+        off = known.frequency * deviations
+        higher = np.maximum(1 + off, LEAST_THICKNESS)
+        factor = np.maximum(1 + share * off, LEAST_THICKNESS)
+        stiffness = (higher / factor)[:, None, None] ** 2 * self.modal[[row]]
+        receptance = modal_receptance(stiffness, self.omega[[row]], factor)[:, 0]
+        lost = -1j * math.log(known.damping) * self.modal[row].imag
+        by_loss = lost * (factor * higher**2)[:, None] * receptance**2
         return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
@@ -166,7 +174,7 @@ def attach(
     frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
     that is not known by one thickness, and does not scale with it.
     """
-    check_scales(plate, 1 + uncertainty.thickness)
+    check_scales(plate, 1 + uncertainty.thickness, 1 + uncertainty.modulus)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     return AttachedPlate(
@@ -178,6 +186,12 @@ def attach(
         uncertainty=uncertainty,
         clocks=clocks,
     )
+
+
+def at_harmonics(plate: AttachedPlate, twice: AttachedPlate) -> AttachedPlate:
+    """A plate at twice the frequencies of one, whose bases move as far as they do there."""
+    forces = twice.forces * (plate.strokes / twice.strokes)
+    return replace(twice, forces=forces, strokes=plate.strokes)
 
 
 MODELLED = 0
@@ -228,7 +242,7 @@ class PlateOnEras:
         Where its thickness is certain there is the nominal one alone.
         """
         deviations, first = [np.zeros(1)], {}
-        if plate.uncertainty.thickness > 0:
+        if plate.uncertainty.frequency > 0:
             deviations.append(np.array([1.0, -1.0]))
             for count in node_counts:
                 first[count] = sum(map(len, deviations))
@@ -265,3 +279,21 @@ def _eliminated(
     moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
+
+
+def moved_fields(on: PlateOnEras, row: int, shifts: Float32Array) -> Complex64Array:
+    """By how much fields change as ERAs move along x or y, (2 n, n, r) [m/s²].
+
+    Accelerations of the coordinates by each ERA at full stroke, at a row of the frequencies, of the
+    modelled plate without fingers. shifts (n, 2, r): of the shapes at the ERAs, dphi. An ERA that
+    moves acts with its force F elsewhere and is moved otherwise: a force F dphi - phi Z dphi u.
+    """
+    plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
+    g, T = on.receptance[row, MODELLED], on.by_force[row, MODELLED]
+    Z = plate.stiffness[row]
+    held = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
+    along = shifts.swapaxes(0, 1)  # (2, n, r)
+    reaction = Z[:n, None] * (along @ (on.fields[row] / w2).T)  # (2, n, n)
+    acting = held[..., None] * along[:, :, None] - reaction[..., None] * plate.shapes[:n, None]
+    free = (g * acting).reshape(2 * n, n, -1)
+    return np.asarray(w2 * free - ((free @ plate.shapes.T) * Z) @ T, dtype=np.complex64)

@@ -259,6 +259,22 @@ class PlateOnEras:
                 to[row] = part
         return cls(plate, first, *found)
 
+    def with_places(self, shifts: FloatArray) -> "PlateOnEras":
+        """Let the ERAs' places be off, which counts as a further error of their stiffnesses.
+
+        shifts (n, 2, r): change of the shapes at the ERAs, by one standard deviation along x and y.
+        An error of a stiffness that changes the fields of all ERAs by as much, mean square over the
+        plate, of the modelled plate without fingers.
+        """
+        plate, n = self.plate, self.plate.era_count
+        deformed = np.eye(n) * plate.strokes[:, None] - self.moved[:, MODELLED, :n]
+        by_one = np.linalg.norm(self.by_force[:, MODELLED, :n], axis=2)
+        by_one = by_one * np.linalg.norm(deformed, axis=2)
+        changed = [_by_places(self, row, shifts) for row in range(len(by_one))]
+        by_stiffness = np.hypot(plate.by_stiffness.real, changed / by_one)
+        found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
+        return replace(self, plate=found)
+
     @property
     def fields(self) -> Complex64Array:
         """Accelerations of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
@@ -281,19 +297,19 @@ def _eliminated(
     return by_force, np.asarray(-coupling / w2**2), moved
 
 
-def moved_fields(on: PlateOnEras, row: int, shifts: Float32Array) -> Complex64Array:
-    """By how much fields change as ERAs move along x or y, (2 n, n, r) [m/s²].
+def _by_places(on: PlateOnEras, row: int, shifts: FloatArray) -> FloatArray:
+    """Size of the change of all ERAs' fields together as each is off, (n,) [m/s²].
 
-    Accelerations of the coordinates by each ERA at full stroke, at a row of the frequencies, of the
-    modelled plate without fingers. shifts (n, 2, r): of the shapes at the ERAs, dphi. An ERA that
-    moves acts with its force F elsewhere and is moved otherwise: a force F dphi - phi Z dphi u.
+    At full stroke, accelerations of the coordinates, at a row of the frequencies, of the modelled
+    plate without fingers. An ERA acts with its force F at other shapes, phi + d, and is moved
+    otherwise: a force F d - phi Z d u.
     """
     plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
-    g, T = on.receptance[row, MODELLED], on.by_force[row, MODELLED]
-    Z = plate.stiffness[row]
-    held = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
-    along = shifts.swapaxes(0, 1)  # (2, n, r)
-    reaction = Z[:n, None] * (along @ (on.fields[row] / w2).T)  # (2, n, n)
-    acting = held[..., None] * along[:, :, None] - reaction[..., None] * plate.shapes[:n, None]
-    free = (g * acting).reshape(2 * n, n, -1)
-    return np.asarray(w2 * free - ((free @ plate.shapes.T) * Z) @ T, dtype=np.complex64)
+    g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
+    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
+    tilted = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
+    acting = forces[:, None, :, None] * shifts[:, :, None]
+    acting = acting - tilted[..., None] * plate.shapes[:n, None, None]
+    free = (g * acting).reshape(2 * n * n, -1)
+    found = w2 * free - ((free @ plate.shapes.T) * Z) @ T
+    return np.asarray(np.linalg.norm(found.reshape(n, -1), axis=1))

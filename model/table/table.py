@@ -26,7 +26,6 @@ from model.ensemble.attached_plate import (
     PlateOnEras,
     at_harmonics,
     attach,
-    moved_fields,
 )
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
@@ -339,7 +338,8 @@ class LocalizationTable:
     def on_eras(self) -> PlateOnEras:
         """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
-        return PlateOnEras.of(self.attached, *sorted(counts))
+        found = PlateOnEras.of(self.attached, *sorted(counts))
+        return found.with_places(self._shifts_of_eras) if self.uncertainty.place > 0 else found
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
@@ -352,19 +352,16 @@ class LocalizationTable:
     def error_power(self) -> Float32Array:
         """Mean square over the plate of the error of each ERA's field, (f, eras).
 
-        Of discretisation, of ERAs' places, and of what else the rig's uncertainty says of fields.
+        Of discretisation, and of what else the rig's uncertainty says of fields.
         """
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
         found = error**2 * self._mean_square(self.on_eras.fields)
-        if self.uncertainty.place > 0:
-            shifts = self.shifts_of_eras(self.uncertainty.place).astype(np.float32)
-            for row in range(len(found)):
-                moved = moved_fields(self.on_eras, row, shifts)
-                found[row] += self._mean_square(moved).sum(axis=0)
         return np.asarray(found, dtype=np.float32)
 
-    def shifts_of_eras(self, distance: float) -> FloatArray:
-        """By how much the shapes at ERAs change over a distance [m] along x and y, (n, 2, r)."""
+    @property
+    def _shifts_of_eras(self) -> FloatArray:
+        """By how much the shapes at ERAs change as these are off along x and y, (n, 2, r)."""
+        distance = self.uncertainty.place
         known, (length, width) = footprints_of(self.eras), self.raster.points[-1]
         ends = np.repeat(known[:, None, None], 4, axis=1).reshape(len(known), 2, 2, -1)
         for axis, side in enumerate((length, width)):

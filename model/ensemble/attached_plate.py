@@ -174,7 +174,7 @@ def attach(
     frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
     that is not known by one thickness, and does not scale with it.
     """
-    check_scales(plate, 1 + uncertainty.thickness, 1 + uncertainty.modulus)
+    check_scales(plate, 1 + uncertainty.thickness)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     return AttachedPlate(

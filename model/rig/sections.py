@@ -317,9 +317,7 @@ class UncertaintySection(Section):
     """
 
     modulus: Annotated[float, _within("modulus")] = Uncertainty.modulus
-    """Of the plate's modulus of elasticity, relative; 0 of an identified plate, whose `thickness`
-    is that of its natural frequencies.
-    """
+    """Of the plate's modulus of elasticity, relative; known where `thickness` is 0."""
 
     place: Annotated[float, _within("place", LENGTH)] = Uncertainty.place
     """Of each ERA, along x and along y."""

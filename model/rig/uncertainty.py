@@ -35,7 +35,7 @@ class Uncertainty:
     plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
     of all channels together, relative; field: of what an ERA alone does at a finger, relative to
     its root mean square over the plate, beside all others; modulus: of the plate's modulus of
-    elasticity, relative; place: of each ERA along x and along y [m]; harmonic: second harmonic of
+    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y [m]; harmonic: second harmonic of
     each ERA's motion, root mean square as a share of its own amplitude, of any phase. The defaults
     are those of a plate as built from its drawing and not measured.
     """
@@ -115,6 +115,17 @@ class Uncertainty:
         return (1 + self.gain**2) * math.exp(math.radians(self.phase_deg) ** 2) - 1
 
     @property
+    def elasticity(self) -> float:
+        """Of the modulus, relative: it is known where the thickness is, as a plate that stays."""
+        return self.modulus if self.thickness > 0 else 0.0
+
+    @property
     def frequency(self) -> float:
-        """Of the plate's natural frequencies, relative: as the thickness, and the modulus' root."""
-        return math.hypot(self.thickness, self.modulus / 2)
+        """Of the plate's natural frequencies, relative: as the thickness and the modulus' root."""
+        return math.hypot(self.thickness, self.elasticity / 2)
+
+    @staticmethod
+    def of_frequency(std: float) -> dict[str, float]:
+        """Thickness and modulus, as uncertain as each other, of that of natural frequencies."""
+        each = std / math.hypot(1.0, 0.5)
+        return {"thickness": each, "modulus": each}

@@ -83,7 +83,7 @@ def draw_plates(
         * (1 + uncertainty.gain * normal(era_count))
         * np.exp(1j * phase * normal(era_count)),
         deviation=deviation,
-        modulus=1 + uncertainty.modulus * normal(),
+        modulus=1 + uncertainty.elasticity * normal(),
         places=uncertainty.place * normal(era_count, 2),
         harmonic=uncertainty.harmonic * complex_normal(era_count),
     )

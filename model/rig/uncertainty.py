@@ -35,9 +35,10 @@ class Uncertainty:
     plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
     of all channels together, relative; field: of what an ERA alone does at a finger, relative to
     its root mean square over the plate, beside all others; modulus: of the plate's modulus of
-    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y [m]; harmonic: second harmonic of
-    each ERA's motion, root mean square as a share of its own amplitude, of any phase. The defaults
-    are those of a plate as built from its drawing and not measured.
+    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
+    [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
+    amplitude, of any phase. The defaults are those of a plate as built from its drawing and not
+    measured.
     """
 
     gain: float = 0.05

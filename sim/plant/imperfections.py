@@ -65,8 +65,8 @@ class ChannelErrors:
 class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
-    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; masses: on the plate beside the rig's; mesh: on
-    which it is solved, None for the rig's.
+    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; masses:
+    on the plate beside the rig's; mesh: on which it is solved, None for the rig's.
     """
 
     thickness: float = 1.0

@@ -25,7 +25,7 @@ from paper_table import contact_sets, forms_of, smooth_rig
 
 RNG = np.random.default_rng(5)
 PLACES = [(float(x), float(y)) for x, y in RNG.uniform([0.02, 0.02], [0.29, 0.21], (8, 2))]
-IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.002, place=0.0002)
 FLAT = Uncertainty(0.02, 1.0, 0.0, 0.02, 1.2, 0.3)  # of a thickness that is certain
 
 

@@ -43,7 +43,7 @@ UNEQUAL = replace(
 POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
 
 
-def solved(uncertainty, loads=(), *, rig=RIG, count=3):
+def solved(uncertainty, loads=(), *, rig=RIG, count=3, modulus=0.0):
     """The plate with its first fingers on it; reduced for them too, so that nothing is left out."""
     fixed = footprints_of(rig.eras, rig.masses)
     fingers = np.column_stack([PLACES, np.zeros(3)])
@@ -56,7 +56,7 @@ def solved(uncertainty, loads=(), *, rig=RIG, count=3):
         eras=rig.eras,
         masses=rig.masses,
         fingertip=rig.fingertip,
-        uncertainty=uncertainty,
+        uncertainty=replace(uncertainty, modulus=modulus),
         frequencies=FREQUENCIES,
     )
     shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)

@@ -16,7 +16,7 @@ from model.answer.search_in_c import choose_tones
 from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
-from model.study.exact_plates import Plates, draw_plates, powers_on
+from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
 from model.table.file import save_table
 from model.table.table import read_fingertips
 from only import drives, only, wants
@@ -38,6 +38,7 @@ def given(table, found, quiet, plates):
         rows, power = powers_on(table, placed, layer.excitation, plates)
         frequency = table.frequencies[rows]
         sensed = power[0] / detection_threshold(frequency) ** 2
+        sensed = sensed + harmonics_on(table, placed, layer.excitation, plates)
         powers.append(sensed.reshape(count, points, -1))
     power = np.array(powers)
     own = [tips.fine_weights[j] @ np.sqrt(power[j, j]) for j in range(len(layers))]

@@ -23,6 +23,7 @@ from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
 from paper_table import contact_sets, smooth_rig
 
+CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0}
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 ERAS = tuple(era.name for era in smooth_rig().eras)
 WIRING = {name: Channel("ab"[number % 2], number) for number, name in enumerate(ERAS)}

@@ -99,7 +99,7 @@ def test_felt_on_agrees_with_the_direct_solve(targets, mode):
     found = 20 * np.log10(contrast)
     solved = [directly(smooth_rig(), layer, number, targets=targets) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
-    assert np.ptp(solved) > 0.3  # the plates do differ
+    assert np.ptp(solved) > 0.15  # the plates do differ
 
 
 def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve():
@@ -117,7 +117,7 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     np.testing.assert_allclose(found, solved, atol=0.15)
     assert predicted.contrast_db == pytest.approx(solved[0], abs=0.15)
     alike = [directly(smooth_rig(), layer, number) for number in range(3)]
-    assert np.abs(np.subtract(alike, solved)).max() > 0.4
+    assert np.abs(np.subtract(alike, solved)).max() > 0.2
 
 
 def test_discretisation_error_enters_the_contrast_of_plates():

@@ -1,4 +1,4 @@
-"""Places of ERAs that are off, as errors of their stiffnesses, by differences of the direct solve."""
+"""Places of ERAs that are off, as errors of their stiffnesses, by the direct solve."""
 
 from dataclasses import replace
 

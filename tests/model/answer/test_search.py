@@ -90,7 +90,7 @@ SETS: dict[str, tuple[int, int, dict[str, Any]]] = {
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", SETS)
 def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
-    """Frequencies, weights and all figures, on random rigs: within 0.02 dB."""
+    """Frequencies, weights and all figures, on random rigs: within 0.03 dB."""
     count, quiet, given = SETS[name]
     of = random_table(seed)
     fingers = count + quiet
@@ -120,7 +120,7 @@ def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
         np.testing.assert_allclose(getattr(found, key), getattr(expected, key), rtol=2e-3)
     for key in ("contrast_db", "level_db_sl", "foreign_db_sl", "worst_db", "loudest_db_sl"):
         one, other = getattr(found, key), getattr(expected, key)
-        np.testing.assert_allclose(one, other, rtol=0, atol=0.02, err_msg=key)
+        np.testing.assert_allclose(one, other, rtol=0, atol=0.03, err_msg=key)
 
 
 GRID = [

@@ -44,7 +44,8 @@ class Case:
     without; may_swap: in any order. modulation_hz: of the last content. events: what the last
     finger with a content does, one after the other, once all have been felt together. line: kind of
     the line, prompt without; is_one_bus: or a line for each amplifier; resting [s]: while the
-    fingers rest, before it is measured; without: keys of the uncertainty that are none.
+    fingers rest, before it is measured; without: keys of the uncertainty that are none;
+    with_errors: whether it is one of several that differ by these alone.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Case:
     is_one_bus: bool = True
     resting: float = 0.0
     without: tuple[str, ...] = ()
+    with_errors: bool = False
 
     @property
     def title(self) -> str:
@@ -132,7 +134,7 @@ def _two_contents(errors: str) -> list[Case]:
     """Two contents on plates of some errors, on each kind of rig."""
     name, without = f"two contents, {errors}", _ERRORS[errors]
     return [
-        Case(name, None, rig, is_identified=known, without=without)
+        Case(name, None, rig, is_identified=known, without=without, with_errors=True)
         for known in (False, True)
         for rig in ("paper_plate", "car_display")
     ]

@@ -76,7 +76,7 @@ def draw(
     n, k = era_count, finger_count
     numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
-    parameters, sizes, phases, *errors, common, harmonics, quadrature = np.split(
+    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature = np.split(
         numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n])
     )
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
@@ -86,7 +86,7 @@ def draw(
         damping=parameters[2].astype(np.float32),
         own=own.astype(np.float32),
         gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64)[None],
-        errors=_complex(*errors),
+        errors=_complex(real, imaginary),
         harmonics=_complex(harmonics, quadrature, harmonic),
         node=np.arange(count) * thicknesses // count,
     )

@@ -40,7 +40,7 @@ def dense_score(
     With errors of the gains and of the thickness only, whose plates are solved anew, and one quiet
     finger; the best weights are an eigenvector. ERAs at places (n, 2) [m] are like the first.
     """
-    plate, std = rig.plate, rig.uncertainty.thickness
+    plate, std = rig.plate, rig.uncertainty.frequency
     plates = [
         solve_free_plate(
             replace(plate, thickness=h * plate.thickness),

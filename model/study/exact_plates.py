@@ -208,7 +208,8 @@ def accelerations_on(
     stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
     nominal = attached.modal[rows]
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
-    modal = modal_receptance(plates.modulus[:, None, None] * lossy, w, plates.thickness)[:, :, None]
+    stiffer = np.asarray(plates.modulus[:, None, None] * lossy, dtype=complex)
+    modal = modal_receptance(stiffer, w, plates.thickness)[:, :, None]
     shapes = np.vstack([table.attachment_shapes, discs[: len(fingers), 0]])
     shapes = np.repeat(shapes[None], len(plates.places), axis=0)
     shapes[:, : len(eras)] += _shifts(table, plates.places)

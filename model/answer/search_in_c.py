@@ -58,7 +58,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     plates, raster, rules, by_count = kept
     judging, promise, *stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
     if contents.loads.count(1.0) < len(contents.loads):
-        stiffness = _stiffness(table, k, contents.loads)
+        stiffness = [*_stiffness(table, k, contents.loads)]
     # Not arrays of numpy, of which each takes as long to make and to read as all of these.
     numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
     at = array("d", [coordinate for place in places for coordinate in place])

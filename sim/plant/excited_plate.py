@@ -291,10 +291,9 @@ def play(
             duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(points)
         )
         records = _records(rig, fingers, times, felt)
-        harmonics = 2 * frequencies if any(shares.values()) else []
-        vibrations.append(
-            Vibration(tuple(frequencies.tolist()), layer.fingers, records, tuple(harmonics))
-        )
+        driven_at = tuple(frequencies.tolist())
+        harmonics = tuple([2 * each for each in driven_at]) if any(shares.values()) else ()
+        vibrations.append(Vibration(driven_at, layer.fingers, records, harmonics))
     return Playback(tuple(vibrations), settled, rig.threshold)
 
 

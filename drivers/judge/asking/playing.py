@@ -15,7 +15,7 @@ from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 2.0  # s; in which errors of a phase add up
+_LONG = 1.5  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
 _BIT_15 = 1 << 15  # ms
@@ -93,8 +93,11 @@ def after(subject: Subject) -> Rows:
 def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
     long, short = subject.long_onset, subject.envelope(0.02, 0.5)
-    last = len(subject.channels) - 1
-    both = [subject.tone(0, 0.5, onset=long), subject.tone(last, 0.5, onset=short)]
+    last, one_knot = len(subject.channels) - 1, subject.envelope(0.1 * subject.slowness, 1.0)
+    both, exchanged = (
+        [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
+        for each, other in ((long, short), (short, one_knot))
+    )
     waiting = layer(0, subject.tone(last, 0.25), after=True, ramp=20)
     rising = subject.one(level=0.5, ramp=subject.ramp)
     unshaped = subject.one(subject.tone(0, 0.5, onset=replace(subject.envelope(0.1), knots=())))
@@ -103,7 +106,9 @@ def after_the_last_onset(subject: Subject) -> Rows:
     return [
         # A channel that is not named falls silent with what waited.
         (layer(0, *both[: last + 1]), waiting),
-        (layer(0, *reversed(both[: last + 1])), waiting),
+        (layer(0, *exchanged[1 - min(last, 1) :]), waiting),
+        # One that is released is not waited for.
+        (subject.one(subject.tone(0, 0.5, ending=long)), layer(0), waiting),
         (play(subject.one(level=0.5), shaped), waiting),
         (rising, waiting),
         (unshaped, waiting),
@@ -114,6 +119,7 @@ def after_the_last_onset(subject: Subject) -> Rows:
 def what_waits_for_an_onset(subject: Subject) -> Rows:
     """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
     long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(120)
+    one_knot = subject.envelope(0.05 * subject.slowness, 1.0)
     half = subject.one(subject.tone(0, 0.5, onset=long))
     other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
     kept = layer(0, subject.tone(0, 0.25, keep=True, onset=short), after=True)
@@ -121,11 +127,17 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     beside = layer(1, subject.beside(1, 0.25), after=True)
     ends = replace(half, valid_for=subject.lasting(60), ramp=20)
     renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
+    # Its end comes with that of its onset, by whole samples and binary fractions.
+    quarter = subject.envelope(0.0625, *[1.0] * 3)
+    is_quarter = (quarter.step, len(quarter.knots)) == (625, 3) and subject.slowness == 1
+    together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
+    sooner = replace(other, commands=(replace(other.commands[0], onset=one_knot),))
     return [
         (half, timed),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
-        (play(half, other), play(timed, beside)),
+        (play(half, sooner), play(timed, beside)),
+        *([(together, timed)] if is_quarter else []),
         (ends, timed, 0.25 * subject.slowness),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
     ]
@@ -136,7 +148,7 @@ def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
     whole, times = subject.whole(), {subject.ramp, 20, subject.can["ramp_max"]}
     rises = [[replace(whole, ramp=time)] for time in times]
-    return [*rises, *([whole, layer(0, ramp=time)] for time in times)]
+    return [*rises, *([whole, layer(0, ramp=time)] for time in (subject.ramp, 20))]
 
 
 @driving(_PLACE)
@@ -320,10 +332,15 @@ async def voices(subject: Subject) -> None:
     await subject.follow()
 
 
+def _fading(subject: Subject) -> int:
+    """Return a ramp [ms] that is longer than the sets of as many voices as are tried."""
+    return min(subject.lasting(600), int(subject.can["ramp_max"]))
+
+
 @driving(_PLACE)
 def voices_of_layers(subject: Subject) -> Rows:
     """It cuts fades only: what lasts on all layers plays on while others fade."""
-    ramp, share = subject.can["ramp_max"], 1 / (2 * len(subject.layers))
+    ramp, share = _fading(subject), 1 / (2 * len(subject.layers))
     others = subject.layers[1:]
     count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
     near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
@@ -342,7 +359,7 @@ def voices_of_layers(subject: Subject) -> Rows:
 def voices_of_channels(subject: Subject) -> Rows:
     """It counts the voices of each channel by itself: fades of others cut none of it."""
     require(len(subject.channels) > 1, "it has one channel")
-    ramp, count = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES)
+    ramp, count = _fading(subject), min(subject.can["voices"], _MAX_VOICES)
     onset = subject.envelope(0.0001)  # at its level at once
     tones = [
         [

@@ -7,7 +7,6 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.judge.outputs import LATE
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
 from drivers.protocol.table import COMMAND, LAYER
 from registry import clock
@@ -113,7 +112,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     while clock.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
         since = ahead(shown["clock"], at * HIGH_STEPS)
-        if is_ahead and not -_NEAR < since < LATE + _NEAR:
+        if is_ahead and abs(since) > _NEAR:
             what = f"whether it plays {1e3 * since:.1f} ms behind its moment, by its clock"
             expect_equal(shown["levels"][0] > 0, since > 0, what)
         await asyncio.sleep(_NEAR)
@@ -132,7 +131,7 @@ async def _commit(subject: Subject, duration: float) -> int:
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
-    left = min(0.2 * subject.slowness, 0.4)
+    left = min(0.1 * subject.slowness, 0.4)
     waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     ends: list[Rows] = [

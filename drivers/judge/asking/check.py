@@ -177,16 +177,18 @@ async def greeted(client: Client) -> Values:
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
     expect(bool(versions >> VERSION & 1), "versions", expected=f"bit {VERSION} set", seen=versions)
-    client.identity = identity
     return identity
 
 
 async def identified(client: Client, level: float) -> Subject:
     """Identify the amplifier at the far end of a client; raises Violation."""
-    identity = client.identity or await greeted(client)
-    answer = await client.exchange(MESSAGES["GetCaps"].number, ())
-    expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
-    can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
+    if client.known is None:
+        identity = await greeted(client)
+        answer = await client.exchange(MESSAGES["GetCaps"].number, ())
+        expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
+        can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
+        client.known = identity, can
+    identity, can = client.known
     return Subject(client, identity, Capabilities(can), level)
 
 

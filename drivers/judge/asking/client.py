@@ -157,7 +157,7 @@ class Client(ABC):
     """One amplifier at an address of a line.
 
     heard: messages that no request was waiting for, but Events; order: all, as they came.
-    identity: once it was read.
+    known: its identity and capabilities, once they were read.
     reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
     in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
     request and a reply by their words; transit: of the longest reply; pace: how much of that it
@@ -190,7 +190,7 @@ class Client(ABC):
         self.address = address
         self.heard: list[Heard] = []
         self.order: list[Heard] = []
-        self.identity: Values = {}
+        self.known: tuple[Values, Values] | None = None
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit, self.pace = 0.0, 1.0

@@ -15,7 +15,7 @@ from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 1.5  # s; in which errors of a phase add up
+_LONG = 1.2  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
 _BIT_15 = 1 << 15  # ms
@@ -81,11 +81,11 @@ def after(subject: Subject) -> Rows:
         require_in_time(subject.shown.outputs.waits(answer.when), "the onset may have ended")
 
     return [
-        (first, newer, waiting, achieved),
+        (first, newer, waiting, send("Arm", watchdog=subject.can["watchdog_max"]), achieved),
         (subject.one(), waiting),
-        (first, waiting, layer(0), 0.25),
-        (first, waiting, subject.one(level=0.75), 0.25),
-        (first, waiting, send("Silence", ramp=0), 0.25),
+        (first, waiting, layer(0), 0.2),
+        (first, waiting, subject.one(level=0.75), 0.2),
+        (first, waiting, send("Silence", ramp=0), 0.2),
     ]
 
 
@@ -93,11 +93,12 @@ def after(subject: Subject) -> Rows:
 def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
     long, short = subject.long_onset, subject.envelope(0.02, 0.5)
-    last, one_knot = len(subject.channels) - 1, subject.envelope(0.1 * subject.slowness, 1.0)
+    last = len(subject.channels) - 1
     both, exchanged = (
         [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
-        for each, other in ((long, short), (short, one_knot))
+        for each, other in ((long, short), (short, subject.short_onset))
     )
+    named = tuple(subject.tone(each, 0.25) for each in sorted({0, last}))
     waiting = layer(0, subject.tone(last, 0.25), after=True, ramp=20)
     rising = subject.one(level=0.5, ramp=subject.ramp)
     unshaped = subject.one(subject.tone(0, 0.5, onset=replace(subject.envelope(0.1), knots=())))
@@ -106,7 +107,7 @@ def after_the_last_onset(subject: Subject) -> Rows:
     return [
         # A channel that is not named falls silent with what waited.
         (layer(0, *both[: last + 1]), waiting),
-        (layer(0, *exchanged[1 - min(last, 1) :]), waiting),
+        (layer(0, *exchanged[1 - min(last, 1) :]), replace(waiting, commands=named)),
         # One that is released is not waited for.
         (subject.one(subject.tone(0, 0.5, ending=long)), layer(0), waiting),
         (play(subject.one(level=0.5), shaped), waiting),
@@ -119,7 +120,6 @@ def after_the_last_onset(subject: Subject) -> Rows:
 def what_waits_for_an_onset(subject: Subject) -> Rows:
     """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
     long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(120)
-    one_knot = subject.envelope(0.05 * subject.slowness, 1.0)
     half = subject.one(subject.tone(0, 0.5, onset=long))
     other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
     kept = layer(0, subject.tone(0, 0.25, keep=True, onset=short), after=True)
@@ -131,7 +131,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     quarter = subject.envelope(0.0625, *[1.0] * 3)
     is_quarter = (quarter.step, len(quarter.knots)) == (625, 3) and subject.slowness == 1
     together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
-    sooner = replace(other, commands=(replace(other.commands[0], onset=one_knot),))
+    sooner = replace(other, commands=(replace(other.commands[0], onset=subject.short_onset),))
     return [
         (half, timed),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
@@ -214,7 +214,7 @@ def endings(subject: Subject) -> Rows:
     replaced = replace(quiet, onset=subject.envelope(0.1))
     return [
         (first, layer(0)),
-        (first, layer(0, quiet)),
+        (first, layer(0, replace(quiet, ending=subject.envelope(0.02, 1.0)))),  # its own counts
         (first, layer(0, subject.tone(0, 0.0))),
         (layer(0, tone, valid_for=100),),
         (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
@@ -237,8 +237,9 @@ def endings_amid(subject: Subject) -> Rows:
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
         (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
-        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp)),
-        (subject.one(subject.tone(ending=ending)), layer(0), part, layer(0, ramp=long)),
+        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 20)),
+        (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
+        (layer(0, towards_0), half, send("Silence", ramp=long)),
     ]
 
 
@@ -301,7 +302,7 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 @driving(_PLACE)
 async def voices(subject: Subject) -> None:
     """It refuses no set for its fades: the oldest fade ends within 2 ms, and what lasts stays."""
-    ramp, sets = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES) + 4
+    ramp, sets = _fading(subject), min(subject.can["voices"], _MAX_VOICES) + 4
     # Each tone is at its level at once, and falls along the ramp of the next set.
     onset = subject.envelope(0.0001)
     tones = [
@@ -334,7 +335,7 @@ async def voices(subject: Subject) -> None:
 
 def _fading(subject: Subject) -> int:
     """Return a ramp [ms] that is longer than the sets of as many voices as are tried."""
-    return min(subject.lasting(600), int(subject.can["ramp_max"]))
+    return min(subject.lasting(450), int(subject.can["ramp_max"]))
 
 
 @driving(_PLACE)

@@ -31,7 +31,9 @@ def stage_and_commit(subject: Subject) -> Rows:
         subject.follow,
         *again,
         *again,
-        play(subject.one(), token=2, code=("", _OLD)),
+        *(stage(subject.one(level=0.75), token=3), send("Commit", token=2)),
+        send("Commit", token=3),
+        play(subject.one(), token=2, code=_OLD),
     ]
 
 
@@ -92,8 +94,9 @@ def committed_together(subject: Subject) -> Rows:
 @driving(_PLACE)
 async def starts_at_its_moment(subject: Subject) -> None:
     """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
-    soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * MAX_AHEAD
-    for duration in (soon, 0.95 * MAX_AHEAD, beyond, -0.1, 0.0):
+    soon = min(0.1 * subject.slowness, 0.4)
+    beyond = 1.01 * MAX_AHEAD + 2 * min(subject.exchange_time, 1.0)
+    for duration in (soon, 0.99 * MAX_AHEAD, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
     present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
@@ -134,13 +137,20 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
     left = min(0.1 * subject.slowness, 0.4)
     waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
+    first, *_ = subject.parts(half, token=2, now=0, count=3)
     ends: list[Rows] = [
-        *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
+        *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
         [play(half)],
-        [stage(half), send("Commit", token=2)],
+        # It starts before what comes for its own layer.
+        [stage(subject.one(level=0.5)), send("Commit", token=2)],
+        [send("Set", **first)],
         [stage(half), partial(_commit, subject, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
-    return [[*waits, *each, 1.25 * left] for each in ends]
+    trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
+    later = [waits[0], partial(_commit, subject, min(3 * left, 0.45)), *trips, 2 * left]
+    # No status is read as it starts.
+    unseen = stage(subject.one(ramp=subject.ramp)), partial(_commit, subject, left)
+    return [*([*waits, *each, 1.25 * left] for each in ends), later, [*unseen, 1.25 * left]]

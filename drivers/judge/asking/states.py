@@ -321,7 +321,9 @@ def what_does_not_feed(subject: Subject) -> Rows:
     ]
     collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
-    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected]
+    # A part of a set that is staged is dropped.
+    staged = stage(subject.one(), token=8), 0.02, send("Set", **{**first, "token": 8})
+    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected, *staged]
 
 
 @driving(_SESSIONS)

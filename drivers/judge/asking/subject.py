@@ -206,6 +206,8 @@ class Subject(Material):
         """Read the reply to a request, and compare it with what must be shown."""
         record = STATED if name == "GetCaps" else MESSAGES[name].reply
         shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
+        if name == "GetCaps":
+            expect_equal(shown, self.can, "capabilities, read again")
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
@@ -408,6 +410,11 @@ class Subject(Material):
         self.require_knots()
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
         return self.envelope(duration / (count + 1), *([0.5, 1.0] * count)[:count])
+
+    @property
+    def short_onset(self) -> Envelope:
+        """An onset with one knot, shorter than the long one where the line is quick enough."""
+        return self.envelope(0.05, 1.0) if self.slowness == 1 else self.long_onset
 
     async def pause(self, duration: float) -> None:
         """Wait for a time [s], feeding the watchdog."""

@@ -209,7 +209,8 @@ def endings(subject: Subject) -> Rows:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
-    tone = subject.tone(last, ending=subject.envelope(0.05, 0.25, 0.75j))
+    tone = subject.tone(last, ending=subject.envelope(0.04, 0.25, 0.75j, 0.5))
+    unshaped = replace(tone, ending=subject.envelope(0.1))
     first, quiet = layer(0, tone), subject.tone(last, 0.0)
     replaced = replace(quiet, onset=subject.envelope(0.1))
     return [
@@ -217,6 +218,7 @@ def endings(subject: Subject) -> Rows:
         (first, layer(0, replace(quiet, ending=subject.envelope(0.02, 1.0)))),  # its own counts
         (first, layer(0, subject.tone(0, 0.0))),
         (layer(0, tone, valid_for=100),),
+        (layer(0, unshaped), layer(0)),
         (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
         (first, layer(0, replaced, ramp=ramp)),
         (first, layer(0, subject.tone(last, keep=True), ramp=ramp), layer(0, ramp=ramp)),

@@ -304,7 +304,7 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 @driving(_PLACE)
 async def voices(subject: Subject) -> None:
     """It refuses no set for its fades: the oldest fade ends within 2 ms, and what lasts stays."""
-    ramp, sets = _fading(subject), min(subject.can["voices"], _MAX_VOICES) + 4
+    ramp, sets = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES) + 4
     # Each tone is at its level at once, and falls along the ramp of the next set.
     onset = subject.envelope(0.0001)
     tones = [

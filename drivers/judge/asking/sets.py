@@ -142,10 +142,10 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         *([layer(layers, tone)] if layers < 16 else []),
     ):
         yield _part(pack_layers([good, layer_set]))
-    beyond = {"ramp": ramp + 1, "valid_for": QUANTITIES["valid_for"].maximum + 1}
-    for one in (layer(0, tone, tone), layer(0), layer(0, renew=True)):
-        for name, number in beyond.items():
-            start = pack_layers([good, one])
+    above = {"ramp": ramp + 1, "valid_for": QUANTITIES["valid_for"].maximum + 1}
+    for headed in (layer(0, tone, tone), layer(0), layer(0, renew=True)):
+        for name, number in above.items():
+            start = pack_layers([good, headed])
             start[len(pack_layers([good])) + LAYER.places[name]] = number
             yield _part(start)
     words = pack_layers([layer(0, tone)])

@@ -7,12 +7,12 @@ from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require, require_in_time
-from drivers.judge.asking.material import Rows, layer, play, send, stage
+from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.judge.states import FADE
 from drivers.protocol.clock import ahead
-from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED, QUANTITIES
 from registry import clock
 
@@ -198,7 +198,7 @@ def silence(subject: Subject) -> Rows:
     ]
 
 
-async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
+async def _trips(subject: Subject, time: float, *sets: Row) -> None:
     """Play sets and starve it: it trips at its time [s], is silent 5 ms later, and lists it."""
     await subject.run(
         [
@@ -214,7 +214,7 @@ async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
 
 async def _trips_for_good(subject: Subject, time: int) -> None:
     """Have it trip after a time [ms]: it plays and arms no more until it is cleared."""
-    await _trips(subject, time / 1000, subject.whole())
+    await _trips(subject, time / 1000, subject.whole(), stage(subject.one(level=0.5)))
     arm = partial(send, "Arm", watchdog=time)
     await subject.run(
         [
@@ -300,7 +300,8 @@ def what_does_not_feed(subject: Subject) -> Rows:
     """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
-    first, *_ = subject.parts(*long_set(subject), token=7, now=0, count=3)
+    made = long_set(subject)
+    first, *_ = subject.parts(*made, token=7, now=0, count=3)
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
     idle: Rows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
@@ -315,14 +316,15 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
         send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
+        send("GetAchieved", raw=[16], code="BAD_VALUE"),
         partial(subject.client.exchange, 63, ()),
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
     collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
-    # A part of a set that is staged is dropped.
-    staged = stage(subject.one(), token=8), 0.02, send("Set", **{**first, "token": 8})
+    whole = [send("Set", **each) for each in subject.parts(*made, token=8, now=0, count=3)]
+    staged: Rows = (*whole, 0.02, whole[0])  # which is dropped
     return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected, *staged]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.identification.answers import Answer, answer, known_table, table_of
 from benchmarks.identification.coverage import fields_held, parameters_held
-from benchmarks.identification.hidden import LOAD_STD
+from benchmarks.identification.hidden import INSIDE, LOAD_STD
 from benchmarks.identification.server import HiddenPlates
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
@@ -44,6 +44,7 @@ class Outcome:
     errors: dict[str, Reals] = field(default_factory=dict)
     fields: Reals = field(default_factory=lambda: np.zeros(0))
     refusal: str = ""
+    sensors: int = 4
 
 
 def outcome(
@@ -55,16 +56,18 @@ def outcome(
     *,
     sets: int,
     rounds: int = 4,
+    sensors: int = 4,
 ) -> Outcome:
     """Identify a hidden plate and judge answers on it.
 
     written: tables of the rig as it is written, by whether fingers load it; rounds: of interleaved
-    tones, four for every ERA at each tone.
+    tones, four for every ERA at each tone; sensors: at the first ERAs, then INSIDE.
     """
-    found = Outcome(kind, {})
+    found = Outcome(kind, {}, sensors=sensors)
     started = time.process_time()
     try:
-        identified = identify(rig, _measurement(plates, rig, kind, seed, rounds), seed=seed)
+        measured = _measurement(plates, rig, kind, seed, rounds, sensors)
+        identified = identify(rig, measured, seed=seed)
     except InputError as refusal:
         found.refusal = str(refusal)
         return found
@@ -110,11 +113,14 @@ def _table(identified: Identification, loaded: bool) -> LocalizationTable:
     return table_of(identified.rig, FREQUENCIES, loaded=loaded)
 
 
-def _measurement(plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int) -> Measurement:
-    values = plates.measured(kind, seed, FREQUENCIES)
+def _measurement(
+    plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int, count: int
+) -> Measurement:
+    values = plates.measured(kind, seed, FREQUENCIES, count)
     played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    return Measurement.of(sensors, FREQUENCIES, np.where(played[:, None], values, np.nan))
+    sensors += [Sensor(f"inside {n}", x=x, y=y) for n, (x, y) in enumerate(INSIDE.tolist())]
+    return Measurement.of(sensors[:count], FREQUENCIES, np.where(played[:, None], values, np.nan))
 
 
 def _felt(

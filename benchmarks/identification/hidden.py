@@ -11,6 +11,7 @@ MODULUS, DENSITY, RATIO = 70e9, 2700.0, 0.33
 STIFFNESS, DAMPING_RATIO, LOSS = 17_000.0, 0.05, 0.01
 CORNERS = np.array([(0, 0), (LENGTH, 0), (LENGTH, WIDTH), (0, WIDTH)])
 SETS = ("plain", "form", "hard", "uneven", "wedge", "bumps", "frame", "loose", "heavy", "two")
+PLAIN = ("plain", "frame")  # no form errors
 TAPER = {"uneven": 0.015, "wedge": 0.03}  # of the thickness, from the middle to the ends
 BUMPS, BUMP = (5, 4), 0.03  # of the thickness, standard deviation of each of so many fields
 FRAME, FRAME_STIFFER, FRAME_HEAVIER = 12e-3, 0.8, 0.35
@@ -49,8 +50,8 @@ def draw(kind: str, seed: int) -> Hidden:
     """Draw a plate of a set.
 
     Plain, form (places and a hidden mass), hard (all else, too), or form with what the model has
-    not: uneven and wedge (tapered), bumps (of thickness), frame (bonded along the edges), loose
-    (one ERA) or with other masses: heavy (10 g) and two (of 5 g).
+    not: uneven and wedge (tapered), bumps (of thickness), loose (one ERA) or with other masses:
+    heavy (10 g) and two (of 5 g); or frame (plain but for one bonded along the edges).
     """
     rng = np.random.default_rng([seed, SETS.index(kind)])
     normal = rng.standard_normal
@@ -61,7 +62,7 @@ def draw(kind: str, seed: int) -> Hidden:
     each = np.exp(0.2 * normal(n))
     gain = (1 + 0.05 * normal(n)) * np.exp(1j * np.radians(5) * normal(n))
     sensor = (1 + 0.05 * normal(n)) * np.exp(1j * np.radians(5) * normal(n))
-    inwards = np.abs(1.5e-3 * normal((n, 2))) * (kind != "plain")
+    inwards = np.abs(1.5e-3 * normal((n, 2))) * (kind not in PLAIN)
     mass = np.array([[*(rng.uniform(0.03, 0.97, 2) * (LENGTH, WIDTH)), 3e-3]])
     sides = np.array([LENGTH, WIDTH]) + hard * 0.5e-3 * normal(2)
     ratio, modulus = RATIO + hard * 0.015 * normal(), MODULUS * (1 + hard * 0.02 * normal())
@@ -99,7 +100,7 @@ def draw(kind: str, seed: int) -> Hidden:
         damping * damped * each,
         bolt,
         gain,
-        mass if kind != "plain" else mass[:0],
+        mass if kind not in PLAIN else mass[:0],
         LOSS * lossy,
         exponent,
     )

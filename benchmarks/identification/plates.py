@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.identification.answers import Answer, answer, known_table, table_of
 from benchmarks.identification.coverage import fields_held, parameters_held
-from benchmarks.identification.hidden import INSIDE, LOAD_STD
+from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD
 from benchmarks.identification.server import HiddenPlates
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
@@ -30,7 +30,8 @@ _MARGIN = 0.013
 class Outcome:
     """Of one plate: contrasts [dB] by way, load and number of quiet fingers, and its fit.
 
-    kept: by what is promised and load, whether the plate as identified gives it; seconds: of
+    kept: by what is promised and load, whether the plate as identified gives it; is_explained:
+    whether anything is promised of it; seconds: of
     processor time of the identification; errors, fields: see `coverage`.
     """
 
@@ -44,6 +45,7 @@ class Outcome:
     errors: dict[str, Reals] = field(default_factory=dict)
     fields: Reals = field(default_factory=lambda: np.zeros(0))
     refusal: str = ""
+    is_explained: bool = False
     sensors: int = 4
 
 
@@ -72,7 +74,7 @@ def outcome(
         found.refusal = str(refusal)
         return found
     found.seconds = time.process_time() - started
-    found.chi2 = identified.chi2
+    found.chi2, found.is_explained = identified.chi2, identified.is_explained
     if identified.held_out:
         found.held_out = identified.held_out.total
         found.unexplained = identified.held_out.unexplained
@@ -80,7 +82,8 @@ def outcome(
     truth = plates.truth(kind, seed, FREQUENCIES, raster)
     found.errors = parameters_held(identified, truth)
     found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
-    for loaded in (False, True) if sets else ():
+    is_judged = identified.is_explained or kind in FAMILY
+    for loaded in (False, True) if sets and is_judged else ():
         tables = {"written": written[loaded], "identified": _table(identified, loaded)}
         for quiet in QUIET:
             rng = np.random.default_rng([seed, quiet])

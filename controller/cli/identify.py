@@ -174,7 +174,11 @@ def identify(
         report if as_json else None,
         files=files,
         elapsed=time.perf_counter() - started,
-        refusal=None if found.is_explained else _NOT_EXPLAINED if found.is_known_well else _NOT_KNOWN,
+        refusal=None
+        if found.is_explained
+        else _NOT_EXPLAINED
+        if found.is_known_well
+        else _NOT_KNOWN,
     )
 
 

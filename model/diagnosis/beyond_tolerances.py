@@ -1,10 +1,11 @@
-"""What of a plate is beyond the tolerances of its building: a mass, a finger, or something unnamed.
+"""What of a plate is beyond tolerances: a mass, a finger, its thickness, or something unnamed.
 
 A plate is matched once more with form errors, each held by its tolerance (`KINDS` in
 `model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
 sides, Poisson's ratio, single modes. They explain what builders and rulers do. What lies on the
 plate is sought where it would explain most beside all of them, and named if it then explains it; of
-the rest each kind of form error is judged by its sum of squares.
+the rest each kind of form error is judged by its sum of squares. A plate that is thinner at one end
+moves more there, by as much as it is thinner: scales of sensors rise along it.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from model.calibration.variable_projection import (
     responses_of,
     row_rms,
 )
+from model.choice import best_by
 from model.diagnosis.plate_match import Match, match_plate
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
@@ -38,8 +40,9 @@ _SCANNED = Grid(16, 12)
 _HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
 _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _CLEAR = 40.0  # of half the sum of squares
-_UNLIKELY = 0.0027  # three standard deviations
+_UNLIKELY = 0.01
 
+_THICKNESS = "thickness"
 _WORDS = {
     "place": "places of ERAs",
     "mode_shifts": "natural frequencies",
@@ -55,15 +58,17 @@ _WORDS = {
 class BeyondTolerances:
     """What is not as written.
 
-    load: what lies on the plate, None for what has no name; farthest: the form error that would
-    have to be largest, in words, and its rms in standard deviations, 0 where none is too large;
-    error: of the response, unexplained.
+    load: what lies on the plate, None for nothing; farthest: the form error that would have to be
+    largest, in words, and its rms in standard deviations, 0 where none is too large; error: of the
+    response, unexplained; taper: how much thicker the plate is at the ends of x and of y than in
+    the middle, relative, None where that is not what is farthest.
     """
 
     load: PointLoad | FingertipLoad | None
     farthest: str
     deviation: float
     error: float
+    taper: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,21 +99,38 @@ def match_with_form(
             best, load = found, each
     if load is not None:
         return FormMatch(best, BeyondTolerances(load, "", 0.0, best.error))
-    farthest, deviation = _farthest(best)
+    rises, slopes = _along_plate(best, observation.points)
+    farthest, deviation = _farthest(best, rises)
     if best.error <= MAX_ERROR and not deviation:
         return FormMatch(best, None)
-    return FormMatch(best, BeyondTolerances(None, farthest, deviation, best.error))
+    taper = slopes if farthest == _THICKNESS else None
+    return FormMatch(best, BeyondTolerances(None, farthest, deviation, best.error, taper))
 
 
-def _farthest(match: Match) -> tuple[str, float]:
+def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:
     """The kind of form error that is least likely, and its rms in standard deviations."""
-    space, found = match.plate.model.space, ("", 0.0)
-    for kind, words in _WORDS.items():
-        own = match.x[space.of(kind)]
+    space = match.plate.model.space
+    kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
+    found = [("", 0.0)]
+    for words, own in (kinds | {_THICKNESS: rises}).items():
         squares = float(own @ own)
-        if len(own) and squares > chdtri(len(own), _UNLIKELY):
-            found = max(found, (words, float(np.sqrt(squares / len(own)))), key=lambda each: each[1])
-    return found
+        if squares > chdtri(len(own), _UNLIKELY):
+            found.append((words, float(np.sqrt(squares / len(own)))))
+    return best_by(found, lambda each: each[1])
+
+
+def _along_plate(match: Match, points: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
+    """What of the scales of sensors rises along the sides (2,), in standard deviations.
+
+    And the thickness that does this, relative, at the ends of x and of y.
+    """
+    space, plate = match.plate.model.space, match.plate.rig.plate
+    scales = match.x[space.groups["sensor_scale"]]
+    along = 2 * points / [plate.length, plate.width] - 1
+    basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
+    off = along - along.mean(axis=0)
+    x, y = -np.linalg.lstsq(off, scales * space.std[space.groups["sensor_scale"]])[0]
+    return basis.T @ scales, (float(x), float(y))
 
 
 def _loads(

@@ -93,6 +93,12 @@ def difference_rows(verdict: Verdict) -> list[str]:
 def _beyond_row(beyond: BeyondTolerances) -> str:
     """Line on what lies on a plate, or is beyond tolerances without a name."""
     load = beyond.load
+    if beyond.taper is not None:
+        x, y = (f"{100 * each:+.1f} %" for each in beyond.taper)
+        return (
+            f"THICKNESS: the plate is {x} thicker at the end of x and {y} at that of y than in its "
+            "middle, by what its sensors read: check it, or the sensors' scales"
+        )
     if load is None:
         what = (
             f"{beyond.farthest} are off by {beyond.deviation:.1f} standard deviations of their "
@@ -230,12 +236,17 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
     load = beyond.load
-    kind = "unnamed" if load is None else "mass" if isinstance(load, PointLoad) else "finger"
+    x, y = beyond.taper or (None, None)
+    kind = "unnamed" if x is None else "thickness"
+    if load is not None:
+        kind = "mass" if isinstance(load, PointLoad) else "finger"
     return {
         "kind": kind,
         "x_m": None if load is None else load.x,
         "y_m": None if load is None else load.y,
         "mass_kg": load.mass if isinstance(load, PointLoad) else None,
+        "thicker_at_end_of_x": x,
+        "thicker_at_end_of_y": y,
         "farthest": beyond.farthest or None,
         "standard_deviations": beyond.deviation or None,
         "unexplained": beyond.error,

@@ -34,10 +34,11 @@ class Match:
     """The best fit of a plate.
 
     plate: of the rig; x (p,): all its parameters; z (n,): deviation of each of its fitted values in
-    standard deviations of its prior; gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of
-    robust residuals and of z; error, median_error: rms and median of residuals relative to the rms
-    of their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
-    drive, with gains; outliers (f, e, s): mask of values that no error counts.
+    standard deviations of its prior; gains (e,): magnitude of each channel, NaN if not used; cost:
+    half the sum of squares of robust residuals and of z; error, median_error: rms and median of
+    residuals relative to the rms of their row; responses (f, e, s) of the ERAs; predicted (f, e,
+    s): of those that the channels drive, with gains; outliers (f, e, s): mask of values that no
+    error counts.
     """
 
     rig: Rig

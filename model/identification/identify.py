@@ -43,8 +43,9 @@ class Identification:
     before: the rig as written; rig: with identified values and, where the model explains the
     measurement, their uncertainty; values: of the parameters, gains of sensors among them;
     posterior: their distribution, wider by what paths disagree in; chi2: squared residuals per
-    value; mode_shift: rms by which the lowest modes had to shift, in standard deviations; held_out: how well unseen paths are predicted, None where there are too few; seed: of the
-    contacts that a promise draws.
+    value; mode_shift: rms by which the lowest modes had to shift, in standard deviations; held_out:
+    how well unseen paths are predicted, None where there are too few; seed: of the contacts that a
+    promise draws.
     """
 
     before: Rig

@@ -57,7 +57,11 @@ def main() -> None:
                     sensors=int(sensors),
                 )
                 found.append(one)
-                print(f"plate {seed} {kind}: chi² {one.chi2:.2f} {one.refusal}", flush=True)
+                print(
+                    f"plate {seed} {kind}, {sensors} sensors: chi² {one.chi2:.2f}, modes shifted "
+                    f"by {one.mode_shift:.2f} {one.refusal}",
+                    flush=True,
+                )
     is_outside = options.sensors != "4" or not {*options.kinds.split(",")} <= {*FAMILY}
     texts = {"outside": kept_or_refused(found)} if is_outside else {}
     if not is_outside:

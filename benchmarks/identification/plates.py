@@ -39,6 +39,7 @@ class Outcome:
     contrasts: dict[tuple[str, bool, int], list[float]]
     kept: dict[tuple[str, bool], list[bool]] = field(default_factory=dict)
     chi2: float = np.nan
+    mode_shift: float = np.nan
     held_out: float = np.nan
     unexplained: float = np.nan
     seconds: float = np.nan
@@ -74,7 +75,8 @@ def outcome(
         found.refusal = str(refusal)
         return found
     found.seconds = time.process_time() - started
-    found.chi2, found.is_explained = identified.chi2, identified.is_explained
+    found.chi2, found.mode_shift = identified.chi2, identified.mode_shift
+    found.is_explained = identified.is_explained
     if identified.held_out:
         found.held_out = identified.held_out.total
         found.unexplained = identified.held_out.unexplained

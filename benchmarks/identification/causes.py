@@ -97,8 +97,8 @@ def measured(fault: Fault, seed: int, *, noise: float = 0.01) -> Responses:
     true[3] += fault.shift * np.array([np.cos(angle), np.sin(angle)])
     true = np.clip(true, 0, [mounted.plate.length, mounted.plate.width])
     fingers = at[None] if fault.has_finger else None
-    values = np.array([_heard(mounted, float(f), true, fingers) for f in FREQUENCIES])
-    values = fault.change(values * (1 + _SCALE * rng.standard_normal(len(SENSORS))))
+    clean = np.array([_heard(mounted, float(f), true, fingers) for f in FREQUENCIES])
+    values = fault.change(clean * (1 + _SCALE * rng.standard_normal(len(SENSORS))))
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
     white = rng.standard_normal((2, *values.shape))
     values = values + noise * rms * (white[0] + 1j * white[1]) / np.sqrt(2)
@@ -108,7 +108,7 @@ def measured(fault: Fault, seed: int, *, noise: float = 0.01) -> Responses:
 
 def _heard(mounted: Mounted, frequency: float, points: Reals, fingers: Reals | None) -> Complexes:
     """Responses (e, s) at a frequency, without the gains of the plate's drives."""
-    loads = np.array([finger_stiffness(frequency, np.ones(4))])
+    loads = np.array([finger_stiffness(frequency, np.ones(4))], dtype=complex)
     own = replace(mounted, gain=np.ones(len(mounted.gain), dtype=complex))
     return own.accelerations(frequency, points, fingers=fingers, loads=loads).T
 

@@ -98,7 +98,8 @@ def measured(fault: Fault, seed: int, *, noise: float = 0.01) -> Responses:
     true = np.clip(true, 0, [mounted.plate.length, mounted.plate.width])
     fingers = at[None] if fault.has_finger else None
     clean = np.array([_heard(mounted, float(f), true, fingers) for f in FREQUENCIES])
-    values = fault.change(clean * (1 + _SCALE * rng.standard_normal(len(SENSORS))))
+    heard = clean * (1 + _SCALE * rng.standard_normal(len(SENSORS)))
+    values = fault.change(np.asarray(heard, dtype=complex))
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
     white = rng.standard_normal((2, *values.shape))
     values = values + noise * rms * (white[0] + 1j * white[1]) / np.sqrt(2)

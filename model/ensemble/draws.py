@@ -32,6 +32,9 @@ JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
 """Drawn plates that judge candidates, and those of the promise."""
 
+COMMON = 2.0
+"""Standard deviations by which the gain of all ERAs together is off on drawn plates."""
+
 
 @dataclass(frozen=True, eq=False)
 class Draws:
@@ -70,7 +73,9 @@ def draw(
     """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
     gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together; harmonic:
-    root mean square of each ERA's. Of each thickness as many plates, or one less.
+    root mean square of each ERA's. Of each thickness as many plates, or one less. All answers of a
+    plate share its common gain: half of the plates have it COMMON standard deviations low, the
+    others high, so that a plate whose own is no farther off keeps nine of ten levels.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
@@ -79,6 +84,7 @@ def draw(
     parameters, sizes, phases, real, imaginary, common, harmonics, quadrature = np.split(
         numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n])
     )
+    common = np.where(common > np.median(common), COMMON, -COMMON)
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
     own = np.insert(parameters[3:], [n] * masses, 0.0, axis=0)
     drawn = Draws(

@@ -1,8 +1,7 @@
 """Contents of fingers from one answer of the table, a layer for each.
 
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
-one promises 3 dB more to the worst finger, or serves more of them. While a finger moves, only the
-latter counts: another frequency begins with an onset, for which the next place does not wait.
+one serves more fingers. What promises more is led over to once all rest (`crossfades`).
 """
 
 import cmath
@@ -28,13 +27,10 @@ from model.answer.answer import (
     Sensation,
 )
 from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
-from model.answer.plan import answer, worst_of
+from model.answer.plan import answer
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
-
-KEPT_WITHIN = 3.0
-"""How much more [dB] another frequency must promise to take the place of one that is felt."""
 
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
@@ -60,12 +56,12 @@ def answered(
     *,
     before: Mapping[tuple[ContactKey, int], Content],
     protected: frozenset[ContactKey] = frozenset(),
-    kept_within: float | None = KEPT_WITHIN,
+    keeps: bool = True,
 ) -> Answer:
     """Answer the fingers of targets and of quiet contacts.
 
-    before: what fingers feel now, whose frequencies are kept unless others promise so much more
-    [dB]; None to keep none. Raises InputError for fingers that are too close.
+    before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
+    fingers, or more strongly. Raises InputError for fingers that are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
@@ -78,18 +74,16 @@ def answered(
         shaped=is_shaped and not targets[0][1].is_short,  # all or none
         limits=capabilities.limits,
     )
-    kept = fingers if kept_within is None else _kept(fingers, targets, before)
+    kept = _kept(fingers, targets, before) if keeps else fingers
     if kept == fingers:
         return request(fingers)
-    found, within = request(kept), kept_within or 0.0
-    worst, served, lowered = found.promised_worst_db, len(found.layers), _lowered_db(found)
-    least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
+    found = request(kept)
+    served, lowered = len(found.layers), _lowered_db(found)
     is_loud = lowered < _SHORT_OF
-    if is_loud and served == len(targets) and (worst is None or worst >= least):
+    if is_loud and served == len(targets):
         return found
     other = request(fingers)
-    gain = worst_of(other) - worst_of(found)
-    is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
+    is_better = not is_loud and _lowered_db(other) < lowered
     return other if (len(other.layers), is_better) > (served, False) else found
 
 

@@ -25,8 +25,8 @@ from model.drive_modes import UNRESTRICTED
 from model.table.table import LocalizationTable
 from model.vibration.excitation import base_amplitudes
 
-WORTH = 2.0
-"""How much more [dB] other frequencies must promise to the worst finger to be led to."""
+WORTH, WORTH_OF_WEIGHTS = 2.0, 0.5
+"""How much more [dB] the worst finger must be promised for other frequencies, or weights alone."""
 
 _SHORT_OF = 1.0  # dB; by which a finger may feel less of its own then
 _SAME = 0.01  # of the largest amplitude of two drives: nobody feels the difference
@@ -54,8 +54,8 @@ class Crossfades:
     def steps(self) -> tuple[Selection, ...]:
         """What plays after each step, the content that is led to marked; none if none is better.
 
-        Other frequencies must promise 2 dB more to the worst finger, other weights alone more than
-        they do; either to the same fingers, and not more weakly.
+        Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5;
+        either to the same fingers, and not more weakly. It ends where a step promises no more.
         """
         if self.capabilities.drive_mode != UNRESTRICTED:
             return ()
@@ -77,18 +77,25 @@ class Crossfades:
             led = {key: each for key, each in found.items() if _differ(each, playing[key])}
             is_tuned = any(_is_tuned(playing[key], each) for key, each in led.items())
             gain = worst_of(goal) - worst_of(now)
-            if gain < (WORTH if is_tuned else SAME_LEVEL) or _is_weaker(goal, now):
+            if gain < (WORTH if is_tuned else WORTH_OF_WEIGHTS) or _is_weaker(goal, now):
                 continue
             if (steps := self._in_order(goal, playing, led)) is not None:
-                return steps
+                while (
+                    len(steps) > 1 and worst_of(steps[-1][0]) < worst_of(steps[-2][0]) + SAME_LEVEL
+                ):
+                    steps.pop()
+                return tuple([self._felt(*each) for each in steps])
         return ()
 
     def _in_order(
         self, goal: Answer, playing: _Voices, led: _Voices
-    ) -> tuple[Selection, ...] | None:
-        """The steps to contents in an order in which each may follow, the best first; or None."""
+    ) -> list[tuple[Answer, _Voices]] | None:
+        """What plays after each step to contents, the best first, each where it may follow.
+
+        None where there is no such order.
+        """
         if not led:
-            return ()
+            return []
         options = []
         for key, voices in led.items():
             if self._may_follow(playing, key, voices):
@@ -97,7 +104,7 @@ class Crossfades:
         for mixed, key, after in sorted(options, key=lambda each: -worst_of(each[0])):
             left = {other: each for other, each in led.items() if other != key}
             if (steps := self._in_order(goal, after, left)) is not None:
-                return (self._felt(mixed, after), *steps)
+                return [(mixed, after), *steps]
         return None
 
     def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
@@ -142,9 +149,7 @@ class Crossfades:
 
     def _selection(self, found: Answer, *, shape: Shape | None = None) -> Selection:
         given = self.table, found, self.targets, self.quiet
-        chosen = selection_of(
-            *given, before=self.playing, shape=shape, protected=self.protected
-        )
+        chosen = selection_of(*given, before=self.playing, shape=shape, protected=self.protected)
         led = [replace(each, is_led=True) for each in chosen.contents]
         return replace(chosen, contents=tuple(led))
 

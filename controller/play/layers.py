@@ -195,8 +195,11 @@ class Layers:
     def may_lead(self, contents: Sequence[Content], now: float) -> bool:
         """Whether contents may be led to from what plays at a time [s].
 
-        Each other frequency needs a free layer, and the ledgers must admit both together.
+        All of their fingers must feel theirs. Each other frequency needs a free layer, and the
+        ledgers must admit both together.
         """
+        if {each.key for each in contents} - {one.content.key for one in self.contents.values()}:
+            return False
         before = [(self._led_from(each), each.frequency) for each in contents]
         tuned = [each for each, new in before if each and each.content.frequency != new]
         if len(self.may_play) + len(tuned) > self._count:
@@ -448,9 +451,7 @@ class Layers:
             return None
         return None if one.content.targets[0][1].is_short else one
 
-    def _falling(
-        self, number: int, contents: Sequence[Content], now: float
-    ) -> LayerContent | None:
+    def _falling(self, number: int, contents: Sequence[Content], now: float) -> LayerContent | None:
         """What a layer plays, if it gives way to one of these contents; None if it ends at once."""
         if (one := self.contents.get(number)) is None:
             return None

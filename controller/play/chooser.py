@@ -59,7 +59,7 @@ class ChoiceRequest:
 
     before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
     whether what lasts takes longer than the control loop may wait; is_rested: whether what plays
-    would do, too, but may be led to what promises more.
+    would do, too, but may be led to what promises more; now [s].
     """
 
     intended: Intention
@@ -67,6 +67,7 @@ class ChoiceRequest:
     kept: tuple[Selection, ...]
     takes_long: bool = False
     is_rested: bool = False
+    now: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -174,6 +175,7 @@ class Chooser:
                 before=before,
                 protected=protected,
                 keeps=is_long or _is_step(targets, before),
+                now=requested.now if is_long else math.inf,
             )
             if not is_long:
                 answer = _alike(answer, targets[0][1])

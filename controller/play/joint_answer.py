@@ -12,6 +12,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from controller.play.ahead import felt_on_ways, with_ways
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Prediction, Selection, not_served
 from controller.play.intent import Target, band_of_table
@@ -57,16 +58,21 @@ def answered(
     before: Mapping[tuple[ContactKey, int], Content],
     protected: frozenset[ContactKey] = frozenset(),
     keeps: bool = True,
+    now: float = math.inf,
 ) -> Answer:
-    """Answer the fingers of targets and of quiet contacts.
+    """Answer the fingers of targets and of quiet contacts, those that move on their ways.
 
     before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
-    fingers, or more strongly. Raises InputError for fingers that are too close.
+    fingers, or more strongly; now [s]: infinite where all rest. Raises InputError for fingers that
+    are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
+    if math.isfinite(now):
+        contacts = [*[contact for contact, _ in targets], *quiet]
+        fingers = with_ways(fingers, contacts, now, table.plate)
     request = partial(
         answer,
         table,
@@ -103,14 +109,18 @@ def selection_of(
     before: what fingers feel now, whose phases are kept if is_in_phase.
     """
 
+    count = len(targets) + len(quiet)
+    sensed = felt_on_ways(found, count)
+    here = replace(found, asked=found.asked[:count])  # without the ends of ways
+
     @cache
     def fields() -> Complex64Array:
-        places = [each.finger.at for each in found.fingers[: len(targets)]]
+        places = [each.finger.at for each in sensed[: len(targets)]]
         return table.unit_fields(np.array(places), contacts=places)
 
     contents: list[Content] = []
     skipped: list[Prediction] = []
-    felt, unfelt = [*zip(targets, found.fingers, strict=False)], set[ContactKey]()
+    felt, unfelt = [*zip(targets, sensed, strict=False)], set[ContactKey]()
     for (contact, _), each in felt:
         if each.verdict == HELD_BACK:
             skipped.append(_held_back(contact, each))
@@ -118,6 +128,7 @@ def selection_of(
             unfelt.add(contact.key)
             skipped.append(not_served(contact, reason))
     for layer in found.layers:
+        layer = replace(layer, fingers=tuple([each for each in layer.fingers if each < count]))
         own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
         for number in layer.fingers:
             finger, sensation = felt[number]
@@ -126,7 +137,7 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        contact, placed, voices = own[0][0], found.placement(layer), layer.voices
+        contact, placed, voices = own[0][0], here.placement(layer), layer.voices
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
@@ -147,8 +158,9 @@ def selection_of(
                 )
             )
     quiet_levels: dict[ContactKey, float] = {}
-    for contact, level in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True):
-        quiet_levels[contact.key] = -math.inf if math.isnan(level) else level
+    for contact, each in zip(quiet, sensed[len(targets) :], strict=True):
+        level = each.foreign_level_db_sl
+        quiet_levels[contact.key] = -math.inf if level is None else level
     return Selection(
         tuple(targets),
         tuple(quiet),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 
+from controller.play.ahead import STRETCH
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.chooser import (
@@ -36,8 +37,9 @@ from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
-# radius is still within the disc that the pattern was chosen for.
-MOVE_TOLERANCE = 0.008
+# radius is still within the disc that the pattern was chosen for. One that moves is answered for
+# this way ahead.
+MOVE_TOLERANCE = STRETCH
 
 # s; fingers of which none has come, left or moved further for so long rest.
 _RESTS_AFTER = 0.1
@@ -262,7 +264,8 @@ class Selector:
         if lasting:
             takes_long = not is_alone(lasting, intended.protected)
         is_rested = is_due and is_kept and takes_long
-        if is_rested and (new or self._playing(now)):
+        velocities = [each.motion.velocity(now) for each in intended.contacts]
+        if is_rested and (new or self._playing(now) or any(map(any, velocities))):
             self._rest_again(now)
             is_rested = False
         if is_rested and self._steps:
@@ -288,6 +291,7 @@ class Selector:
             self._playing(now),
             takes_long,
             is_rested,
+            now,
         )
 
     def _playing(self, now: float) -> tuple[Selection, ...]:

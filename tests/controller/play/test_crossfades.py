@@ -176,7 +176,7 @@ async def test_after_a_leave_weights_are_led_within_their_layers() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_every_step_keeps_30_hz_between_all_that_sounds(seed: int) -> None:
-    """Four sets of three fingers each, anywhere, the third the last to come, or the one to leave."""
+    """Four sets of three fingers anywhere, of whom the third has come last, or has left."""
     rng, found = np.random.default_rng([seed, 5]), 0
     for number in range(4):
         places = random_contacts(rng, 3, table().plate, margin=0.013)

@@ -97,7 +97,11 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
     for way in [*(0.012 + 0.001 * step for step in range(9)), -0.018]:
         at = (MOVER[0] + way, MOVER[1])
         own, foreign = (
-            max(abs(table().amplitudes(layer.excitation, np.array([at]), contacts=[at, OTHER])[1]).ravel())
+            max(
+                abs(
+                    table().amplitudes(layer.excitation, np.array([at]), contacts=[at, OTHER])[1]
+                ).ravel()
+            )
             / float(table().thresholds[found.tones.rows[number]])
             for number, layer in enumerate(found.layers)
         )

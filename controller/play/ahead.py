@@ -7,7 +7,7 @@ Weights that change have side bands, which a steady promise does not count: a ma
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -65,14 +65,11 @@ def with_ways(
 
 def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
     """Return what the first fingers of an answer get on their ways, the rest being these."""
-    felt, moving = [*found.fingers[:count]], set[int]()
+    ways = [[each] for each in found.fingers[:count]]
     for end in found.fingers[count:]:
-        owner = min(range(count), key=lambda n: math.dist(found.asked[n].at, end.finger.at))
-        felt[owner] = _least(felt[owner], end)
-        moving.add(owner)
-    for owner in moving:
-        felt[owner] = _with_margin(felt[owner])
-    return felt
+        near = [math.dist(found.asked[number].at, end.finger.at) for number in range(count)]
+        ways[near.index(min(near))].append(end)
+    return [_on_way(each) if len(each) > 1 else each[0] for each in ways]
 
 
 def _on_plate(at: Point, plate: Plate) -> Point:
@@ -88,33 +85,27 @@ def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
     return finger.stimulus.modulation_hz is None and not may_share
 
 
-def _least(one: Sensation, other: Sensation) -> Sensation:
-    """What a finger gets at least, of two places."""
-    if one.verdict == HELD_BACK:
-        return one
-    worse = dict[str, Any]()
-    for name, worst in _WORST.items():
-        values = [each for each in (getattr(one, name), getattr(other, name)) if each is not None]
+def _on_way(places: Sequence[Sensation]) -> Sensation:
+    """What a finger gets at least on its way, of several places, while it moves."""
+    first = places[0]
+    if first.verdict == HELD_BACK:
+        return first
+    least = dict[str, Any]()
+    for name, (sign, margin) in _WORST.items():
+        values = [each for one in places if (each := getattr(one, name)) is not None]
         if values:
-            worse[name] = worst(values)
-    return replace(one, **worse)
+            least[name] = sign * min(sign * each for each in values) - sign * margin
+    found: Sensation = replace(first, **least)
+    is_own = found.verdict in (OWN, MIXED)
+    return replace(found, verdict=verdict_of(found.promised_contrast_db)) if is_own else found
 
 
-def _with_margin(one: Sensation) -> Sensation:
-    """What is promised of a finger while it moves."""
-    contrast, foreign = one.promised_contrast_db, one.foreign_level_db_sl
-    if one.verdict == HELD_BACK or contrast is None or foreign is None:
-        return one
-    contrast, foreign = contrast - MARGIN_DB, foreign + MARGIN_DB
-    verdict = verdict_of(contrast) if one.verdict in (OWN, MIXED) else one.verdict
-    return replace(one, verdict=verdict, promised_contrast_db=contrast, foreign_level_db_sl=foreign)
-
-
-_WORST: Mapping[str, Callable[[Iterable[float]], float]] = {
-    "level_db_sl": min,
-    "promised_level_db_sl": min,
-    "contrast_db": min,
-    "median_contrast_db": min,
-    "promised_contrast_db": min,
-    "foreign_level_db_sl": max,
+_WORST = {
+    "level_db_sl": (1, 0.0),
+    "promised_level_db_sl": (1, 0.0),
+    "contrast_db": (1, 0.0),
+    "median_contrast_db": (1, 0.0),
+    "promised_contrast_db": (1, MARGIN_DB),
+    "foreign_level_db_sl": (-1, MARGIN_DB),
 }
+"""Figures of a sensation: whether less of it is worse or more (-1), and the margin on it [dB]."""

@@ -7,6 +7,7 @@ step keeps 30 Hz between all that sounds at once, the old tone included; where n
 contents does, what plays is left. Between the steps the promise is that of what plays then.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -40,7 +41,7 @@ class Crossfades:
     """Finds the way from what plays to a better answer for the same fingers.
 
     targets, quiet: contacts where they rest; playing: what they feel, by finger and voice; shape:
-    adds endings.
+    adds envelopes.
     """
 
     table: LocalizationTable
@@ -70,7 +71,7 @@ class Crossfades:
                 protected=self.protected,
                 keeps=keeps,
             )
-            found = _by_finger(self._selection(goal, shape=self._with_ending).contents)
+            found = _by_finger(self._selection(goal, shape=self.shape).contents)
             if _served(found) != _served(playing) or len(goal.layers) != len(playing):
                 continue
             now = self._mixed(goal, playing)
@@ -79,33 +80,30 @@ class Crossfades:
             gain = worst_of(goal) - worst_of(now)
             if gain < (WORTH if is_tuned else WORTH_OF_WEIGHTS) or _is_weaker(goal, now):
                 continue
-            if (steps := self._in_order(goal, playing, led)) is not None:
-                while (
-                    len(steps) > 1 and worst_of(steps[-1][0]) < worst_of(steps[-2][0]) + SAME_LEVEL
-                ):
-                    steps.pop()
-                return tuple([self._felt(*each) for each in steps])
+            if steps := self._in_order(goal, playing, led):
+                return steps
         return ()
 
-    def _in_order(
-        self, goal: Answer, playing: _Voices, led: _Voices
-    ) -> list[tuple[Answer, _Voices]] | None:
-        """What plays after each step to contents, the best first, each where it may follow.
+    def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:
+        """What plays after each step to contents, the best first; none where none may follow.
 
-        None where there is no such order.
+        One that may follow is in nobody's way after: no other order goes on where this one ends.
         """
-        if not led:
-            return []
-        options = []
-        for key, voices in led.items():
-            if self._may_follow(playing, key, voices):
-                after = {**playing, key: voices}
-                options.append((self._mixed(goal, after), key, after))
-        for mixed, key, after in sorted(options, key=lambda each: -worst_of(each[0])):
-            left = {other: each for other, each in led.items() if other != key}
-            if (steps := self._in_order(goal, after, left)) is not None:
-                return [(mixed, after), *steps]
-        return None
+        left, steps, before = {**led}, list[Selection](), -math.inf
+        while left:
+            options = []
+            for key, voices in left.items():
+                if self._may_follow(playing, key, voices):
+                    after = {**playing, key: voices}
+                    options.append((self._mixed(goal, after), key, after))
+            if not options:
+                return ()
+            mixed, key, playing = max(options, key=lambda each: worst_of(each[0]))
+            del left[key]
+            if left or not steps or worst_of(mixed) >= before + SAME_LEVEL:
+                steps.append(self._felt(mixed, playing))
+            before = worst_of(mixed)
+        return tuple(steps)
 
     def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
         """Whether a finger's content may be led to another beside all that plays.
@@ -152,12 +150,6 @@ class Crossfades:
         chosen = selection_of(*given, before=self.playing, shape=shape, protected=self.protected)
         led = [replace(each, is_led=True) for each in chosen.contents]
         return replace(chosen, contents=tuple(led))
-
-    @property
-    def _with_ending(self) -> Shape | None:
-        """Adds the ending of a layer alone: it begins along the cross-fade."""
-        shape = self.shape
-        return shape and (lambda placed, layer, is_continued: shape(placed, layer, True))
 
 
 def _by_finger(contents: Iterable[Content]) -> _Voices:

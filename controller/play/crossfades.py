@@ -111,15 +111,15 @@ class Crossfades:
         While both sound they are 30 Hz from all others and each other, and within the limits of the
         amplifiers.
         """
-        sounding = [one for each in playing.values() for one in each]
+        beside = [one for each in playing.values() for one in each]
         if not _is_tuned(playing[key], voices):
-            sounding = [one for one in sounding if one not in playing[key]]
+            beside = [one for one in beside if one not in playing[key]]
         elif any(
             abs((voices[0].frequency or 0.0) - (each[0].frequency or 0.0)) < APART_HZ
             for each in playing.values()
         ):
             return False
-        total = amplitudes_of([one.layer.excitation for one in (*sounding, *voices)])
+        total = amplitudes_of([one.layer.excitation for one in (*beside, *voices)])
         return self.capabilities.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:

@@ -72,7 +72,7 @@ class LayerContent:
     ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its
     first target would have been lifted, as known when it was sent; between renewal_due and
     renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
-    ended by itself unless it was renewed. gives_way: whether another content takes its place along
+    ended by itself unless it was renewed. is_falling: whether another content takes its place along
     a cross-fade: it falls at ending_due, and is not renewed.
     """
 
@@ -86,7 +86,7 @@ class LayerContent:
     renewal_due: float = math.inf
     renewable_until: float = math.inf
     ends_at: float = math.inf
-    gives_way: bool = False
+    is_falling: bool = False
 
     @property
     def settled_after(self) -> float:
@@ -223,7 +223,7 @@ class Layers:
         layers: dict[int, PlateLayer] = {}
         endings: dict[int, answer.Layer] = {}
         for number, one in self.contents.items():
-            if one.ending_due <= now and one.gives_way:
+            if one.ending_due <= now and one.is_falling:
                 layers[number] = self.builder.build_fall(
                     number, one.layer.excitation, ramp=CROSSFADE, playing=self._drive_of(number)
                 )
@@ -315,7 +315,7 @@ class Layers:
     def ended(self, now: float) -> tuple[Content, ...]:
         """Return the contents that have ended by themselves by a time [s], once."""
         over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
-        fallen = {number for number in over if self.contents[number].gives_way}
+        fallen = {number for number in over if self.contents[number].is_falling}
         self.may_play -= fallen
         self._replace({n: one for n, one in self.contents.items() if n not in fallen})
         over = [number for number in over if number not in fallen]
@@ -356,7 +356,7 @@ class Layers:
                 new.append(content)
             else:
                 numbers[known] = content
-        falling = {n for n, one in self.contents.items() if one.gives_way}
+        falling = {n for n, one in self.contents.items() if one.is_falling}
         for number in (*sorted(self.may_play - falling), *range(self._count)):
             if new and number not in numbers:
                 numbers[number] = new.pop(0)
@@ -389,7 +389,7 @@ class Layers:
         self.is_silent = False
         layer_of: dict[tuple[ContactKey, int], int] = {}
         for number, one in playing.items():
-            if not one.gives_way:
+            if not one.is_falling:
                 layer_of.setdefault(one.content.key, number)
         self._layer_of = layer_of
         self.may_play |= sets.started
@@ -456,11 +456,11 @@ class Layers:
         if (one := self.contents.get(number)) is None:
             return None
         for content in contents:
-            if one.gives_way and content.is_led and content.key == one.content.key:
+            if one.is_falling and content.is_led and content.key == one.content.key:
                 return one
             if self._led_from(content) is one:
                 due = now + FALL_AFTER
-                return replace(one, gives_way=True, ending_due=due, renewal_due=math.inf)
+                return replace(one, is_falling=True, ending_due=due, renewal_due=math.inf)
         return None
 
     def _fades(self, sets: Sets) -> bool:

@@ -30,9 +30,9 @@ class Motion:
         if not places or places[-1][0] - places[0][0] < _LEAST_TIME:
             return 0.0, 0.0
         mean = [sum(values) / len(places) for values in zip(*places, strict=True)]
-        spread = sum((time - mean[0]) ** 2 for time, _, _ in places)
-        vx = sum((time - mean[0]) * (x - mean[1]) for time, x, _ in places) / spread
-        vy = sum((time - mean[0]) * (y - mean[2]) for time, _, y in places) / spread
+        variance = sum((time - mean[0]) ** 2 for time, _, _ in places)
+        vx = sum((time - mean[0]) * (x - mean[1]) for time, x, _ in places) / variance
+        vy = sum((time - mean[0]) * (y - mean[2]) for time, _, y in places) / variance
         is_moving = math.hypot(vx, vy) * (places[-1][0] - places[0][0]) >= _LEAST_WAY
         return (vx, vy) if is_moving else (0.0, 0.0)
 

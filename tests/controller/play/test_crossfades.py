@@ -189,16 +189,16 @@ def test_every_step_keeps_30_hz_between_all_that_sounds(seed: int) -> None:
         felt = {each.key: each for each in landed.contents if each.key[0] in keys}
         if {key for key, _ in felt} != keys:
             continue
-        sounding = {each.contact.key: each.frequency or 0.0 for each in landed.predictions}
-        sounding = {key: sounding[key] for key in keys}
+        beside = {each.contact.key: each.frequency or 0.0 for each in landed.predictions}
+        beside = {key: beside[key] for key in keys}
         for step in Crossfades(table(), resting, (), playable(), felt).steps():
             after = {each.contact.key: each.frequency or 0.0 for each in step.predictions}
-            changed = [key for key in keys if after[key] != sounding[key]]
+            changed = [key for key in keys if after[key] != beside[key]]
             assert len(changed) <= 1
             for key in changed:
-                assert all(abs(after[key] - each) >= 30 for each in sounding.values())
+                assert all(abs(after[key] - each) >= 30 for each in beside.values())
                 found += 1
-            sounding = after
+            beside = after
     assert found
 
 

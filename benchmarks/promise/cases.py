@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,7 @@ class Case:
     bands: tuple[Band, ...] = ()
     may_swap: bool = False
     modulation_hz: float | None = None
+    apart: float = 0.0
     events: tuple[str, ...] = ()
     line: str | None = None
     is_one_bus: bool = True
@@ -140,6 +142,15 @@ def _two_contents(errors: str) -> list[Case]:
     ]
 
 
+def _landing(contents: int, rig_name: str, apart: float) -> Case:
+    """Contents that fingers feel who land together, or one after the other."""
+    name = f"{'two' if contents == 2 else 'three'} contents, landing"
+    name = f"{name} {apart:g} s apart" if apart else f"{name} together"
+    return Case(name, None, rig_name, contents, is_identified=True, apart=apart)
+
+
+APART = 0.35  # s; between fingers that land one after the other
+
 HELD, RESTING = 3.0, 5.0  # s
 """While clocks are read before any finger comes, and while fingers rest after."""
 
@@ -172,4 +183,6 @@ CASES = (
     _resting("lines of USB, high speed", "usb-high-speed"),
     _resting("lines of USB, full speed", "usb-full-speed"),
     *(case for errors in _ERRORS for case in _two_contents(errors)),
+    *[_landing(*each) for each in product((2, 3), ("paper_plate", "car_display"), (0.0, APART))],
+    Case("two contents", None, "car_display", is_identified=True, events=(*_EVENTS, MOVES)),
 )

@@ -1,8 +1,9 @@
 """What is chosen for fingers: one answer for all contents that last, and one for each short pulse.
 
 A pulse is chosen beside what lasts: with the stroke and the power that this leaves, all other
-fingers quiet. It is over before an answer for all would help, and never changed. What lasts and
-does not fit beside a pulse that plays has what that leaves, until it has ended.
+fingers quiet, 30 Hz from all that plays where its band allows it. What lasts at its own finger goes
+on. It is over before an answer for all would help, and never changed. What lasts and does not fit
+beside a pulse that plays has what that leaves, until it has ended.
 """
 
 import logging
@@ -21,11 +22,12 @@ from controller.play.joint_answer import (
     selection_of,
 )
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import Answer, amplitudes_of, verdict_of
+from model.answer.answer import MIXED, Answer, amplitudes_of
+from model.answer.search import APART_HZ
 from model.answer.strength import scaled
 from model.choice import NEARLY
 from model.errors import InputError
-from model.table.table import LocalizationTable
+from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
 
 _USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
@@ -117,7 +119,11 @@ class Chooser:
         pulses = _contents(requested.kept) if requested.kept else []
         if not pulses:
             return free, False
-        fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
+        fading = [
+            one
+            for (finger, _), one in requested.before.items()
+            if finger in free.target_keys and one not in pulses
+        ]
         left = self._left_by([*pulses, *fading], capabilities)
         total = amplitudes_of([each.layer.excitation for each in free.contents])
         if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
@@ -148,6 +154,13 @@ class Chooser:
         beside: what a pulse is felt beside; None for what lasts.
         """
         table, intended, before = self.table, requested.intended, requested.before
+        avoided, asked = list[float](), targets
+        if beside is not None:
+            asked = tuple(
+                [(contact, _over(target, contact, beside)) for contact, target in targets]
+            )
+            for content in _contents(beside):
+                avoided += {tone.frequency for tone in content.layer.excitation.values()}
         quiet, protected = intended.quiet_beside(targets), intended.protected
         is_long = requested.takes_long and beside is None
         kept_within: float | None = KEPT_WITHIN
@@ -158,15 +171,16 @@ class Chooser:
         try:
             answer = answered(
                 table,
-                targets,
+                asked,
                 quiet,
                 capabilities,
                 before=before,
                 protected=protected,
                 kept_within=kept_within,
+                avoided_hz=avoided,
             )
             if not is_long:
-                answer = _alike(answer, targets[0][1])
+                answer = _alike(answer, asked[0][1])
             found = selection_of(
                 table,
                 answer,
@@ -177,8 +191,8 @@ class Chooser:
                 protected=protected,
                 is_in_phase=is_long,
             )
-            if beside:
-                found = _beside(intended, found, beside)
+            if avoided:
+                found = _among(intended, found, avoided)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -187,12 +201,6 @@ class Chooser:
                 reason = failure_text(error)
             found = silent(intended, targets, reason)
         return found
-
-
-def sum_db(levels: Iterable[float]) -> float:
-    """Return the level of powers that add up [dB]."""
-    power = sum([10 ** (level / 10) for level in levels])
-    return 10 * math.log10(power) if power else -math.inf
 
 
 def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
@@ -206,7 +214,7 @@ def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
 def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
     """Whether only the level of a target changes, which is not raised."""
     ((contact, new),) = targets
-    then = before.get((contact.key, 0))
+    then = before.get((contact.key, new.voice))
     if then is None or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
         return False
     old = then.targets[0][1]
@@ -225,27 +233,32 @@ def _alike(found: Answer, target: Target) -> Answer:
     return scaled(found, -excess) if excess > 0 else found
 
 
-def _beside(intended: Intention, found: Selection, beside: Sequence[Selection]) -> Selection:
-    """Return what was chosen for a pulse with what its finger feels of others besides."""
-    ((contact, _),) = found.targets
-    heard = [each.quiet_levels[contact.key] for each in beside if contact.key in each.quiet_levels]
+def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Target:
+    """Return the target of a short pulse as strong as it is to be above what lasts there."""
+    level, above = target.level_db_sl, target.above_db
+    if level is None or above is None:
+        return target
+    for each in _contents(beside):
+        for felt in each.predictions:
+            if felt.contact.key == contact.key and felt.nominal_db_sl is not None:
+                level = max(level, felt.nominal_db_sl + above)
+    return replace(target, level_db_sl=level)
+
+
+def _among(intended: Intention, found: Selection, frequencies: Sequence[float]) -> Selection:
+    """Return what was chosen for a pulse among vibrations, by their frequencies [Hz].
+
+    Nearer than 30 Hz to one of them it is mixed.
+    """
     if not found.contents:
-        is_used_up = bool(_contents(beside)) and found.reason == LIMITS_LEAVE_NOTHING
+        is_used_up = found.reason == LIMITS_LEAVE_NOTHING
         return silent(intended, found.targets, _USED_UP) if is_used_up else found
-    if not heard:
+    (content,) = found.contents
+    gap = min([abs((content.frequency or 0.0) - each) for each in frequencies])
+    if gap >= APART_HZ - SAME_FREQUENCY:
         return found
-    (content,), others = found.contents, sum_db(heard)
-    (felt,) = content.predictions
-    promised = felt.promised_contrast_db
-    level = -math.inf if felt.level_db_sl is None else felt.level_db_sl
-    promised = min(math.inf if promised is None else promised, level - others)
-    felt = replace(
-        felt,
-        promised_contrast_db=promised,
-        foreign_level_db_sl=others,
-        verdict=verdict_of(promised),
-    )
-    return replace(found, contents=(replace(content, predictions=(felt,)),))
+    mixed = tuple([replace(each, verdict=MIXED) for each in content.predictions])
+    return replace(found, contents=(replace(content, predictions=mixed),))
 
 
 def _contents(parts: Iterable[Selection]) -> list[Content]:

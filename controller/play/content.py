@@ -1,7 +1,7 @@
 """What layers play: one content each, for its own finger and those that share it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -45,6 +45,30 @@ class Prediction:
     content: str | None = None
     nominal_db_sl: float | None = None
 
+    def beside(self, others: Sequence[float]) -> "Prediction":
+        """Return it with other contents besides, of levels [dB SL] here, whose powers add."""
+        level, contrast, foreign = (
+            -math.inf if each is None else each
+            for each in (self.level_db_sl, self.promised_contrast_db, self.foreign_level_db_sl)
+        )
+        total = sum_db([foreign, *others])
+        if total == foreign:
+            return self
+        if self.foreign_level_db_sl is not None:
+            contrast = level - sum_db([level - contrast, *others])
+        elif self.promised_contrast_db is None:
+            contrast = level - total
+        else:  # to its own at the loudest quiet finger
+            contrast = min(contrast, level - total)
+        if self.verdict not in (OWN, MIXED):
+            return replace(self, foreign_level_db_sl=total)
+        return replace(
+            self,
+            promised_contrast_db=contrast,
+            foreign_level_db_sl=total,
+            verdict=verdict_of(contrast) if self.verdict == OWN else MIXED,
+        )
+
     def weakened(self, gain_db: float, others_db: float) -> "Prediction":
         """Return it with a gain [dB]; others_db: at most on others' contents.
 
@@ -80,10 +104,10 @@ class Prediction:
 class Content:
     """What one layer plays, with the contacts as they were when it was chosen.
 
-    key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
-    predictions; targets: that finger, then those that share it; placement: where they are, and all
-    others; predictions: one per target, which also depend on others; gain_db: that the layer has,
-    its fingers' strength.
+    key: of the finger whose content it is, and CLICK for a short pulse, 0 for what lasts, or the
+    number of a side band of that, which has no predictions; targets: that finger, then those that
+    share it; placement: where they are, and all others; predictions: one per target, which also
+    depend on others; gain_db: that the layer has, its fingers' strength.
     """
 
     key: tuple[ContactKey, int]
@@ -144,20 +168,13 @@ class Selection:
         return bool(self.contents) and is_each_alone and not self.not_served
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return it with the strengths of fingers; what several share has the lowest.
-
-        Also that of one whose short pulse is felt above it meanwhile.
-        """
+        """Return it with the strengths of fingers; what several share has the lowest."""
         if not (self.contents and any(gains_db.values())):
             return self
-        every = {key: gain for (key, _), gain in gains_db.items()}
         gains = {
             each.targets: min(
                 0.0,
-                *[
-                    gains_db.get((at.key, to.is_short), every.get(at.key, 0.0))
-                    for at, to in each.targets
-                ],
+                *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets],
             )
             for each in self.contents
         }
@@ -191,14 +208,49 @@ class Selection:
             ),
         )
 
+    def beside(self, others: Sequence["Selection"]) -> "Selection":
+        """Return it with what its fingers feel of others that play beside it."""
+
+        def together(each: Prediction) -> Prediction:
+            return each.beside([other.foreign_at(each.contact.key) for other in others])
+
+        return replace(
+            self,
+            contents=tuple(
+                [
+                    replace(each, predictions=tuple(map(together, each.predictions)))
+                    for each in self.contents
+                ]
+            ),
+            not_served=tuple(map(together, self.not_served)),
+        )
+
+    def foreign_at(self, key: ContactKey) -> float:
+        """Return what a contact feels of the others' contents at most [dB SL]."""
+        for each in self.predictions:
+            if each.contact.key == key and each.foreign_level_db_sl is not None:
+                return each.foreign_level_db_sl
+        return self.quiet_levels.get(key, -math.inf)
+
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """What each target feels, those that are not served at the end.
+        """What each finger feels, those that feel nothing at the end.
 
-        Of several contents the last: a pulse goes on in one that others share.
+        Of a short pulse beside what lasts; where that is not served, why, of the other.
         """
-        served = {each.contact.key: each for one in self.contents for each in one.predictions}
-        return (*served.values(), *self.not_served)
+        found = {each.contact.key: each for one in self.contents for each in one.predictions}
+        for each in self.not_served:
+            felt = found.get(each.contact.key)
+            found[each.contact.key] = (
+                each if felt is None else replace(felt, held_back=each.held_back)
+            )
+        return tuple(found.values())
+
+
+def sum_db(levels: Iterable[float]) -> float:
+    """Return the level of powers that add up [dB]."""
+    power = sum([10 ** (level / 10) for level in levels])
+    return 10 * math.log10(power) if power else -math.inf
 
 
 def no_layer_free(count: int) -> str:

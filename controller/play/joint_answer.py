@@ -61,11 +61,13 @@ def answered(
     before: Mapping[tuple[ContactKey, int], Content],
     protected: frozenset[ContactKey] = frozenset(),
     kept_within: float | None = KEPT_WITHIN,
+    avoided_hz: Sequence[float] = (),
 ) -> Answer:
     """Answer the fingers of targets and of quiet contacts.
 
     before: what fingers feel now, whose frequencies are kept unless others promise so much more
-    [dB]; None to keep none. Raises InputError for fingers that are too close.
+    [dB]; None to keep none. avoided_hz: frequencies that play beside it. Raises InputError for
+    fingers that are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
@@ -77,6 +79,7 @@ def answered(
         drive_mode=capabilities.drive_mode,
         shaped=is_shaped and not targets[0][1].is_short,  # all or none
         limits=capabilities.limits,
+        avoided_hz=avoided_hz,
     )
     kept = fingers if kept_within is None else _kept(fingers, targets, before)
     if kept == fingers:
@@ -132,8 +135,8 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        contact, placed, voices = own[0][0], found.placement(layer), layer.voices
-        carrier = before.get((contact.key, 0))
+        (contact, target), placed, voices = own[0], found.placement(layer), layer.voices
+        carrier = before.get((contact.key, target.voice))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
             and then.frequency == played.frequency
@@ -145,7 +148,7 @@ def selection_of(
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
-                    (contact.key, voice),
+                    (contact.key, target.voice + voice),
                     tuple(own),
                     placed,
                     shape(placed, played, is_continued) if shape else played,
@@ -252,8 +255,8 @@ def _kept(
 ) -> list[Finger]:
     """The fingers with the frequencies that they feel now, where their bands allow it."""
     kept = [*fingers]
-    for number, (contact, _) in enumerate(targets):
-        then, stimulus = before.get((contact.key, 0)), fingers[number].stimulus
+    for number, (contact, target) in enumerate(targets):
+        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
         frequency = None if then is None else then.frequency
         if stimulus is None or frequency is None:
             continue

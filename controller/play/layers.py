@@ -17,6 +17,8 @@ from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
 from controller.play.intent import FADED_AFTER
 from controller.play.routing import (
+    BESIDE_CLICK,
+    FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
@@ -310,7 +312,7 @@ class Layers:
             if content in kept:
                 continue
             known = self._layer_of.get(content.key)
-            if known is None or known in numbers:  # a pulse beside what others share
+            if known is None:
                 new.append(content)
             else:
                 numbers[known] = content
@@ -344,10 +346,7 @@ class Layers:
             self._fades_until = now + FADED_AFTER
         self._replace(playing)
         self.is_silent = False
-        layer_of: dict[tuple[ContactKey, int], int] = {}
-        for number, one in playing.items():
-            layer_of.setdefault(one.content.key, number)
-        self._layer_of = layer_of
+        self._layer_of = {one.content.key: number for number, one in playing.items()}
         self.may_play |= sets.started
 
     def _sets(
@@ -380,10 +379,12 @@ class Layers:
             may_end = is_shaped and not content.targets[0][1].is_short
             playing[number] = LayerContent(content, played, is_shaped=may_end)
             settled.append(playing[number].settled_after)
+        is_clicking = any(content.targets[0][1].is_short for content in contents)
+        ramp = min(BESIDE_CLICK if is_clicking else FADE_RAMP, self.builder.ramp_max)
         for number in self.may_play - numbers.keys():
             has_endings = is_shaped and self._may_end_shaped(number, now)
-            layers[number] = self.builder.build_end(number, has_endings=has_endings)
-            settled.append(self.builder.end_ramp)
+            layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
+            settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
 
     def _is_led(self, number: int, content: Content) -> bool:

@@ -137,7 +137,7 @@ def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceR
         contacts=plan.contacts,
         targets=tuple(
             known.get(contact.key) or not_served(contact, reason)
-            for contact, _ in selection.targets
+            for contact in dict.fromkeys(contact for contact, _ in selection.targets)
         ),
         reason=reason,
         latency=None if sent_at is None else sent_at - plan.since,

@@ -4,7 +4,7 @@ One question is answered at a time, with the fingers as they are when the one be
 """
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,6 @@ from controller.play.chooser import (
     Chooser,
     Intention,
     is_alone,
-    sum_db,
     unanswered,
 )
 from controller.play.content import (
@@ -29,6 +28,7 @@ from controller.play.content import (
     Targets,
     no_layer_free,
     not_served,
+    sum_db,
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
@@ -82,15 +82,9 @@ def _is_among(intended: Intention, chosen: Selection) -> bool:
 def _is_part_of(
     intended: Intention, chosen: Selection, kinds: Callable[[Targets], set[Target]]
 ) -> bool:
-    """Whether what lasts was chosen, and no more that would leave others more if it ended.
-
-    The content of a finger that feels a short pulse meanwhile has not ended.
-    """
+    """Whether what lasts was chosen, and no more that would leave others more if it ended."""
     now, had = kinds(intended.lasting), kinds(chosen.targets)
-    if not now <= had:
-        return False
-    pulsing = {contact.key for contact, _ in intended.short}
-    return chosen.is_whole or all(target.key in pulsing for target in had - now)
+    return now == had or (now < had and chosen.is_whole)
 
 
 def _targets_of(targets: Targets) -> set[Target]:
@@ -153,9 +147,11 @@ class Selector:
         While the thread computes, what played and is still to be felt stays. now [s]: infinite
         where fingers do not move.
         """
-        by_key = {target.key: target for target in intent.targets}
+        by_key = defaultdict[ContactKey, list[Target]](list)
+        for target in intent.targets:
+            by_key[target.key].append(target)
         # Lists: a generator would be a call for each.
-        targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
+        targets = tuple([(one, each) for one in contacts for each in by_key.get(one.key, ())])
         served, skipped = _within_layers(targets, capabilities)
         lasting, short = list[tuple[Contact, Target]](), list[tuple[Contact, Target]]()
         before, self._fingers, came = self._fingers, {}, set[ContactKey]()
@@ -202,7 +198,7 @@ class Selector:
                     )
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
-        if self._thread.is_busy and len(found.predictions) < len(targets):
+        if self._thread.is_busy and len(found.predictions) < len(by_key):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
         return found
@@ -238,9 +234,7 @@ class Selector:
         if is_kept and not is_rested and not new:
             return
         felt = _felt(self._lasting, self._fingers.keys())
-        before = {each.key: each for each in felt.contents}
-        for contact, _ in intended.short:
-            before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
+        before = {each.key: each for part in (felt, *pulses.values()) for each in part.contents}
         if new and (has_waited or is_kept):
             pulses_alone = replace(intended, lasting=(), short=new)
             yield ChoiceRequest(pulses_alone, before, (felt, *self._playing(now)))
@@ -308,11 +302,12 @@ def _together(
             chosen.append(part)
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
+    levels = [part.quiet_levels for part in chosen]
+    chosen = [part.beside([each for each in chosen if each is not part]) for part in chosen]
     then = {key: each for part in chosen for key, each in part.contacts.items()}
     keys = {contact.key for contact, _ in targets}
     quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
     reasons = [part.reason for part in chosen if part.reason is not None]
-    levels = [part.quiet_levels for part in chosen]
     return Selection(
         tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
         tuple(quiet),
@@ -341,10 +336,12 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
             if contact.key in keys:
                 contents.append(content)
                 break
+    left = {contact.key: chosen.foreign_at(contact.key) for contact in quiet}
     return replace(
         chosen,
         targets=tuple(targets),
         quiet=tuple(quiet),
+        quiet_levels={**left, **chosen.quiet_levels},
         contents=tuple(contents),
         not_served=tuple([each for each in chosen.not_served if each.contact.key in keys]),
     )
@@ -355,7 +352,8 @@ def _within_layers(
 ) -> tuple[Targets, tuple[Prediction, ...]]:
     """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
 
-    Many that may share have one layer together.
+    Before these short pulses of fingers that feel what lasts. Many that may share have one layer
+    together.
     """
     mode = capabilities.drive_mode
     count = capabilities.layers if mode == UNRESTRICTED else 1
@@ -366,8 +364,13 @@ def _within_layers(
         reason = no_layer_free(count)
     sharing = Counter([target.shared_as for _, target in targets])
     layers: list[str | bool | None] = []
-    served = set[int]()
-    for at in sorted(range(len(targets)), key=lambda n: (targets[n][1].priority, n), reverse=True):
+    served, lasting = set[int](), {target.key for _, target in targets if not target.is_short}
+
+    def rank(number: int) -> tuple[bool, int, int]:
+        _, target = targets[number]
+        return not (target.is_short and target.key in lasting), target.priority, number
+
+    for at in sorted(range(len(targets)), key=rank, reverse=True):
         name = targets[at][1].shared_as
         is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
         if is_one and name in layers:

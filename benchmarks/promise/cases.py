@@ -33,7 +33,7 @@ class Case:
     without; may_swap: in any order. modulation_hz: of the last content. events: what the last
     finger with a content does, one after the other, once all have been felt together. line: kind of
     the line, prompt without; is_one_bus: or a line for each amplifier; resting [s]: while the
-    fingers rest, before it is measured.
+    fingers rest, before it is measured. clicks: fingers that click, one after the other.
     """
 
     name: str
@@ -49,6 +49,7 @@ class Case:
     line: str | None = None
     is_one_bus: bool = True
     resting: float = 0.0
+    clicks: tuple[int, ...] = ()
 
     @property
     def title(self) -> str:
@@ -107,6 +108,15 @@ def _resting(name: str, line: str, *, is_one_bus: bool = False) -> Case:
     )
 
 
+def _clicks(name: str, clicks: tuple[int, ...], *, contents: int = 2, quiet: int = 0) -> list[Case]:
+    """Clicks of the same fingers on three rigs."""
+    rigs = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
+    return [
+        Case(f"click {name}", None, rig, contents, quiet, is_known, clicks=clicks)
+        for rig, is_known in rigs
+    ]
+
+
 HELD, RESTING = 3.0, 5.0  # s
 """While clocks are read before any finger comes, and while fingers rest after."""
 
@@ -130,4 +140,7 @@ CASES = (
     _resting("one bus, USB of full speed", "usb-full-speed", is_one_bus=True),
     _resting("lines of USB, high speed", "usb-high-speed"),
     _resting("lines of USB, full speed", "usb-full-speed"),
+    *_clicks("where nothing else is felt", (0,), contents=0, quiet=2),
+    *_clicks("beside another's content", (1,), contents=1, quiet=1),
+    *_clicks("at a finger with its own buzz, beside another", (0, 1)),
 )

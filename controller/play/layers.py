@@ -15,7 +15,7 @@ from typing import Any
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
-from controller.play.intent import FADED_AFTER
+from controller.play.intent import CLICK, FADED_AFTER
 from controller.play.routing import (
     BESIDE_CLICK,
     FADE_RAMP,
@@ -302,7 +302,10 @@ class Layers:
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
+        """Contents by layer: what plays in its own, else a finger's, new ones in those that end.
+
+        A short pulse rather in a free one: in its own what ends would fade along its short ramp.
+        """
         numbers: dict[int, Content] = {}
         for number, one in self.contents.items():
             if one.content in contents:  # what is predicted of it may differ
@@ -316,9 +319,12 @@ class Layers:
                 new.append(content)
             else:
                 numbers[known] = content
-        for number in (*sorted(self.may_play), *range(self._count)):
-            if new and number not in numbers:
-                numbers[number] = new.pop(0)
+        ending = sorted(self.may_play - numbers.keys())
+        free = [n for n in range(self._count) if n not in self.may_play and n not in numbers]
+        for content in new:
+            first, second = (free, ending) if content.key[1] == CLICK else (ending, free)
+            if some := first or second:
+                numbers[some.pop(0)] = content
         return numbers
 
     def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:

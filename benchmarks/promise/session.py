@@ -116,7 +116,7 @@ class _Wanted:
             for each in contacts
             if each.key.id in self.targets
         ]
-        pulse = self.click and self.click.pulse
+        pulse = None if self.click is None else self.click.pulse
         if self.click is None or pulse is None or now >= pulse.end:
             return HapticIntent(tuple(targets))
         return HapticIntent((*targets, self.click), until=pulse.end)

@@ -47,26 +47,20 @@ class Prediction:
 
     def beside(self, others: Sequence[float]) -> "Prediction":
         """Return it with other contents besides, of levels [dB SL] here, whose powers add."""
-        level, contrast, foreign = (
-            -math.inf if each is None else each
-            for each in (self.level_db_sl, self.promised_contrast_db, self.foreign_level_db_sl)
-        )
-        total = sum_db([foreign, *others])
-        if total == foreign:
-            return self
-        if self.foreign_level_db_sl is not None:
+        level, contrast = self.level_db_sl, self.promised_contrast_db
+        foreign = self.foreign_level_db_sl
+        total = sum_db([*others] if foreign is None else [foreign, *others])
+        if level is None or max(others, default=-math.inf) == -math.inf:
+            return replace(self, foreign_level_db_sl=foreign if total == -math.inf else total)
+        if contrast is None or foreign is None:  # it is to its own at quiet fingers
+            contrast = min(math.inf if contrast is None else contrast, level - total)
+        else:
             contrast = level - sum_db([level - contrast, *others])
-        elif self.promised_contrast_db is None:
-            contrast = level - total
-        else:  # to its own at the loudest quiet finger
-            contrast = min(contrast, level - total)
-        if self.verdict not in (OWN, MIXED):
-            return replace(self, foreign_level_db_sl=total)
         return replace(
             self,
             promised_contrast_db=contrast,
             foreign_level_db_sl=total,
-            verdict=verdict_of(contrast) if self.verdict == OWN else MIXED,
+            verdict=verdict_of(contrast) if self.verdict == OWN else self.verdict,
         )
 
     def weakened(self, gain_db: float, others_db: float) -> "Prediction":

@@ -177,7 +177,7 @@ class _Session:
             for id, band in enumerate(case.bands_for(contents)):
                 self._wanted.targets[id] = {"band": band}
             self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
-            await asyncio.sleep(HELD if case.resting else 0)
+            await asyncio.sleep(HELD if case.resting or case.clicks else 0)
             on.at = dict(enumerate(self._places))
             if case.resting:
                 await on.hold(case.resting)

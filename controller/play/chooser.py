@@ -154,9 +154,9 @@ class Chooser:
         beside: what a pulse is felt beside; None for what lasts.
         """
         table, intended, before = self.table, requested.intended, requested.before
-        avoided, asked = list[float](), targets
+        avoided, raised = list[float](), targets
         if beside is not None:
-            asked = tuple(
+            raised = tuple(
                 [(contact, _over(target, contact, beside)) for contact, target in targets]
             )
             for content in _contents(beside):
@@ -171,7 +171,7 @@ class Chooser:
         try:
             answer = answered(
                 table,
-                asked,
+                raised,
                 quiet,
                 capabilities,
                 before=before,
@@ -180,7 +180,7 @@ class Chooser:
                 avoided_hz=avoided,
             )
             if not is_long:
-                answer = _alike(answer, asked[0][1])
+                answer = _alike(answer, raised[0][1])
             found = selection_of(
                 table,
                 answer,

@@ -48,11 +48,11 @@ class Prediction:
     def beside(self, others: Sequence[float]) -> "Prediction":
         """Return it with other contents besides, of levels [dB SL] here, whose powers add."""
         level, contrast = self.level_db_sl, self.promised_contrast_db
-        foreign = self.foreign_level_db_sl
-        total = sum_db([*others] if foreign is None else [foreign, *others])
+        already = self.foreign_level_db_sl
+        total = sum_db([*others] if already is None else [already, *others])
         if level is None or max(others, default=-math.inf) == -math.inf:
-            return replace(self, foreign_level_db_sl=foreign if total == -math.inf else total)
-        if contrast is None or foreign is None:  # it is to its own at quiet fingers
+            return replace(self, foreign_level_db_sl=already if total == -math.inf else total)
+        if contrast is None or already is None:  # it is to its own at quiet fingers
             contrast = min(math.inf if contrast is None else contrast, level - total)
         else:
             contrast = level - sum_db([level - contrast, *others])

@@ -70,7 +70,13 @@ class SetTable:
         self.prepared.append(drive_mode)
 
     def answer(
-        self, fingers: Sequence[Finger], *, drive_mode: str, shaped: bool, limits: Limits
+        self,
+        fingers: Sequence[Finger],
+        *,
+        drive_mode: str,
+        shaped: bool,
+        limits: Limits,
+        avoided_hz: Sequence[float],
     ) -> Answer:
         """The same for every target, 12 dB above others at 20 dB SL."""
         self.asked.append([*fingers])

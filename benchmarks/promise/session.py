@@ -175,8 +175,8 @@ class _Session:
             case = self._case
             contents = self._places[: case.contents]
             for id, band in enumerate(case.bands_for(contents)):
-                self._wanted.targets[id] = {"band": band}
-            self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
+                of_last = case.modulation_hz if id == self._last else None
+                self._wanted.targets[id] = {"band": band, "modulation_hz": of_last}
             await asyncio.sleep(HELD if case.resting or case.clicks else 0)
             on.at = dict(enumerate(self._places))
             if case.resting:

@@ -46,7 +46,8 @@ class Case:
     finger with a content does, one after the other, once all have been felt together. line: kind of
     the line, prompt without; is_one_bus: or a line for each amplifier; resting [s]: while the
     fingers rest, before it is measured; without: keys of the uncertainty that are none;
-    with_errors: whether it is one of several that differ by these alone.
+    with_errors: whether it is one of several that differ by these alone. clicks: fingers
+    that click, one after the other.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Case:
     resting: float = 0.0
     without: tuple[str, ...] = ()
     with_errors: bool = False
+    clicks: tuple[int, ...] = ()
 
     @property
     def title(self) -> str:
@@ -151,6 +153,16 @@ def _landing(contents: int, rig_name: str, apart: float) -> Case:
 
 APART = 0.35  # s; between fingers that land one after the other
 
+
+def _clicks(name: str, clicks: tuple[int, ...], *, contents: int = 2, quiet: int = 0) -> list[Case]:
+    """Clicks of the same fingers on three rigs."""
+    rigs = (("paper_plate", False), ("paper_plate", True), ("car_display", True))
+    return [
+        Case(f"click {name}", None, rig, contents, quiet, is_known, clicks=clicks)
+        for rig, is_known in rigs
+    ]
+
+
 HELD, RESTING = 3.0, 5.0  # s
 """While clocks are read before any finger comes, and while fingers rest after."""
 
@@ -185,4 +197,7 @@ CASES = (
     *(case for errors in _ERRORS for case in _two_contents(errors)),
     *[_landing(*each) for each in product((2, 3), ("paper_plate", "car_display"), (0.0, APART))],
     Case("two contents", None, "car_display", is_identified=True, events=(*_EVENTS, MOVES)),
+    *_clicks("where nothing else is felt", (0,), contents=0, quiet=2),
+    *_clicks("beside another's content", (1,), contents=1, quiet=1),
+    *_clicks("at a finger with its own buzz, beside another", (0, 1)),
 )

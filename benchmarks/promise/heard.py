@@ -112,9 +112,9 @@ class Heard:
 
     @classmethod
     def by(cls, finger: int, log: Log, until: float) -> "Heard":
-        """By a finger up to a time [s]."""
+        """By a finger up to a time [s]; its clicks, of the complement, are neither."""
         own = log.replayed(lambda owner: owner == finger, until)
-        return cls(finger, own, log.replayed(lambda owner: owner != finger, until))
+        return cls(finger, own, log.replayed(lambda o: o not in (finger, ~finger), until))
 
     def own_db_sl(self, *spans: Span, strongest: bool = False) -> FloatArray:
         """Levels of its own content, mean over the fingertip, in spans of time [s] together."""

@@ -29,6 +29,7 @@ from benchmarks.promise.cases import (
     Case,
     Point,
 )
+from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
 from benchmarks.promise.heard import Heard, Log
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
@@ -61,13 +62,14 @@ class Outcome:
 
     worst: promise and contrast of the worst finger when all contents are felt; fingers: promise and
     contrast of each finger that is served, after every event, too; served: share of the contents.
-    events: figures by name.
+    events: figures by name; clicked: figures of clicks, without any other.
     """
 
     worst: tuple[float, float]
     served: float
     fingers: list[tuple[float, float]] = field(default_factory=list)
     events: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    clicked: Clicked | None = None
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,11 @@ class _Event:
 
 
 class _Wanted:
-    """Contents that fingers are to feel."""
+    """Contents that fingers are to feel, and the last click."""
 
     def __init__(self) -> None:
         self.targets: dict[int, dict[str, Any]] = {}
+        self.click: Target | None = None
 
     def intent(self, contacts: Any, now: float) -> HapticIntent:
         """Return the intent for contacts."""
@@ -116,7 +119,10 @@ class _Wanted:
             for each in contacts
             if each.key.id in self.targets
         ]
-        return HapticIntent(tuple(targets))
+        pulse = None if self.click is None else self.click.pulse
+        if self.click is None or pulse is None or now >= pulse.end:
+            return HapticIntent(tuple(targets))
+        return HapticIntent((*targets, self.click), until=pulse.end)
 
 
 @cache
@@ -172,25 +178,36 @@ class _Session:
             case = self._case
             contents = self._places[: case.contents]
             for id, band in enumerate(case.bands_for(contents)):
-                self._wanted.targets[id] = {"band": band}
-            self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
+                of_last = case.modulation_hz if id == self._last else None
+                self._wanted.targets[id] = {"band": band, "modulation_hz": of_last}
             await asyncio.sleep(HELD if len(self._rig.amplifiers) > 1 else 0)
             for id, at in enumerate(self._places):
                 on.at[id] = at
                 await on.hold(case.apart)
             if case.resting:
                 await on.hold(case.resting)
+            if case.clicks:
+                await on.hold(SETTLING)
+                clicked = await clicks(on, self._wanted, case.clicks)
+                self._note_owners(log, on)
+                on.far.bench.advance(clock.now())
+                count = case.contents + case.quiet
+                found = measured(log, clicked, count, clock.now())
+                return Outcome((0.0, 0.0), len(clicked) / len(case.clicks), clicked=found)
             before = first = await self._settled(on)
             events = []
             for name in case.events:
                 event = await self._event(on, name, before)
                 events.append(event)
                 before = event.after
-            for applied in on.applied:
-                owners = {n: _id(one) for n, one in applied.contents.items()}
-                log.own(owners, applied.time - FIRST)  # amplifiers start one after another
+            self._note_owners(log, on)
             on.far.bench.advance(before.until)
             return _measured(log, first, events, self._timing, self._case)
+
+    def _note_owners(self, log: Log, on: Any) -> None:
+        for applied in on.applied:
+            owners = {n: owner_of(one) for n, one in applied.contents.items()}
+            log.own(owners, applied.time - FIRST)  # amplifiers start one after another
 
     async def _settled(self, on: Any) -> _Steady:
         await on.hold(SETTLING)
@@ -253,10 +270,6 @@ class _Session:
         yield from along(max(((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)), key=room))
 
 
-def _id(one: Any) -> int:
-    return int(one.content.targets[0][0].key.id)
-
-
 def _measured(
     log: Log, first: _Steady, events: list[_Event], timing: Timing, case: Case
 ) -> Outcome:
@@ -317,7 +330,7 @@ def _note(
         else (event.first, after[last].level_db_sl)
     )
     for one in contents.contents.values():
-        if _id(one) == last:
+        if owner_of(one) == last:
             contrast = timing.transient_contrast_db(one.layer, one.content.placement)
             if contrast is not None and promised_level is not None:
                 level = promised_level - contrast

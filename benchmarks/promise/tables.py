@@ -12,7 +12,12 @@ Found = Mapping[Case, Sequence[Outcome]]
 
 def as_markdown(found: Found) -> str:
     """A table of steady contrasts, with a row of all cases, and one of what happens in events."""
-    lines = [
+    clicked = {case: each for case, each in found.items() if case.clicks}
+    found = {case: each for case, each in found.items() if not case.clicks}
+    lines = _of_clicks(clicked) if clicked else []
+    if not found:
+        return "\n".join(lines)
+    lines += [
         "| | plates | goal | promised [dB] (10 %) | felt [dB] (10 %) | served | promise kept |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -39,6 +44,36 @@ def as_markdown(found: Found) -> str:
     return "\n".join(lines)
 
 
+def _of_clicks(found: Found) -> list[str]:
+    """A table of clicks, with what the others are said to feel meanwhile."""
+    lines = [
+        "| | plates | promised [dB] (10 %) | felt [dB] (10 %) | kept | others' foreign kept | "
+        "others' contrast meanwhile [dB] (10 %) | kept | above own [dB] (10 %) |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for case, each in found.items():
+        clicked = [one.clicked for one in each if one.clicked is not None]
+        contrasts, foreign, restated = (
+            [pair for one in clicked for pair in getattr(one, name)]
+            for name in ("contrasts", "foreign", "restated")
+        )
+        lines.append(
+            f"| {case.title} | {len(each)} | {_shown([a for a, _ in contrasts])} | "
+            f"{_shown([b for _, b in contrasts])} | {_kept(contrasts)} | {_kept(foreign)} | "
+            f"{_shown([a for a, _ in restated])} | {_kept(restated)} | "
+            f"{_shown([a for one in clicked for a in one.over_own])} |"
+        )
+    return [*lines, ""]
+
+
+def _kept(pairs: Sequence[tuple[float, float]]) -> str:
+    """Share of the promises that are kept, of pairs of promised and felt."""
+    if not pairs:
+        return "-"
+    kept = np.mean([felt >= promised for promised, felt in pairs])
+    return f"{100 * kept:.0f} % of {len(pairs)}"
+
+
 _WORST = {ANSWERS: 10, "moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
 """Percentile that is the worst tenth, where that is not the 90th."""
 
@@ -56,7 +91,7 @@ def kept(found: Sequence[Outcome]) -> float:
 
 
 def _shown_kept(found: Sequence[Outcome]) -> str:
-    return f"{100 * kept(found):.0f} % of {sum(len(one.fingers) for one in found)}"
+    return _kept([pair for one in found for pair in one.fingers])
 
 
 def _shown(values: Sequence[float] | np.ndarray, *, worst: float = 10) -> str:

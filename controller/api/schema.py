@@ -216,7 +216,9 @@ class ContactStatus(Message):
         "than promised while it moves; in the status only, null where there are none",
     )
     held_back: str | None = Field(
-        None, description="why it does not feel an effect of its own; null if it does"
+        None,
+        description="why it does not feel an effect of its own, or not its click over what lasts; "
+        "null if it does",
     )
     load: float = Field(
         1.0,

@@ -10,6 +10,7 @@ import numpy as np
 from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
+from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.effects.region import Region
 from controller.play.intent import Target, band_problem
 from model.progress import Progress, unseen
@@ -22,6 +23,7 @@ LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
 MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
+_ON_RELEASE = "on_release"  # felt where the finger goes
 _MIN_STEP = 0.008  # m; nearer touches hardly differ
 _RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
 
@@ -146,6 +148,7 @@ def _check(
     problems = [
         *_silent(target, touches, area),
         *_off_level(target.level_db_sl, touches, area, has_margin=not is_fixed),
+        *_unnoticed(layout, region, on, name, target, at=start),
         *_off_band(target.band, table, touches, must_be_alike=layout.effects[name].is_for_motion),
     ]
     return CheckedEffect(called, name, on, target.level_db_sl, tuple(touches), tuple(problems))
@@ -210,6 +213,32 @@ def _off_level(
             yield (
                 f"level is up to {max(off.values()):.1f} dB {words} {promised:g} dB SL "
                 f"{_where([*off], touches, area)}"
+            )
+
+
+def _unnoticed(
+    layout: SurfaceLayout,
+    region: Region | None,
+    on: str,
+    name: str,
+    click: Target,
+    *,
+    at: Position,
+) -> Iterator[str]:
+    """Short effects whose given level hides below what lasts in the region."""
+    if on == _ON_RELEASE or not click.is_short or not layout.gives_level(name, region):
+        return
+    for other, beside, lasting in layout.uses():
+        if other is not region or beside in (on, _ON_RELEASE):
+            continue
+        felt = strongest_target(layout, lasting, region, at=at)
+        if felt is None or felt.is_short or felt.level_db_sl is None or click.level_db_sl is None:
+            continue
+        if click.level_db_sl < felt.level_db_sl + NOTICED_ABOVE_DB:
+            yield (
+                f"level {click.level_db_sl:g} dB SL is less than {NOTICED_ABOVE_DB:g} dB above "
+                f"{lasting}, {felt.level_db_sl:g} dB SL, beside which it is hardly noticed; raise "
+                f"it, or give {name} no level: it is {CLICK_ABOVE_DB:g} dB above then"
             )
 
 

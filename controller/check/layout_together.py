@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product, zip_longest
+from itertools import combinations, product
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,7 +16,7 @@ from controller.effects.region import Region
 from controller.play.chooser import ChoiceRequest, Intention
 from controller.play.content import Selection
 from controller.play.intent import Target
-from controller.play.joint_answer import fingers_of
+from controller.play.joint_answer import fingers_of, selection_of
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import MIN_CONTRAST_DB, Answer
 from model.answer.plan import answer
@@ -224,23 +224,21 @@ def _felt(
     lasting = [each for each in fingers if not each[1].is_short]
     short = [each for each in fingers if each[1].is_short]
     found: dict[ContactKey, tuple[float, str]] = {}
-    worst, leaks = math.inf, list[Sequence[float]]()
+    worst, beside = math.inf, list[Selection]()
     if lasting:
         quiet = [contact for contact, _ in short]
         together = _answered(simulator, lasting, quiet, protected)
         worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
-        felt = together.fingers
-        leaks = [*together.tones.foreign_db_sl[len(lasting) :]]
-        for (contact, _), each in zip(lasting, felt, strict=False):
+        beside = [selection_of(simulator.table, together, lasting, quiet, before={})]
+        for (contact, _), each in zip(lasting, together.fingers, strict=False):
             found[contact.key] = each.promised_contrast_db or 0.0, each.verdict
     contacts = tuple(contact for contact, _ in fingers)
-    for one, levels in zip_longest(short, leaks):
+    for one in short:
         key = one[0].key
-        beside = Selection((), (), quiet_levels={key: levels} if levels else {})
         intended = Intention(contacts, (), (one,), protected or frozenset())
-        requested = ChoiceRequest(intended, {}, (beside,))
+        requested = ChoiceRequest(intended, {}, tuple(beside))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
-        (predicted,) = chosen.predictions
+        (predicted,) = chosen.beside(beside).predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
         worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]

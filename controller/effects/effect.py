@@ -72,10 +72,11 @@ class EffectStimulus:
         *,
         band: Band | None,
         priority: int,
+        above_db: float | None = None,
     ) -> Target:
         """Return the target of a finger that feels it in a region, or outside of all.
 
-        effect: its name.
+        effect: its name; above_db: that a short pulse has over what lasts there.
         """
         return Target(
             key,
@@ -87,7 +88,13 @@ class EffectStimulus:
             is_own=region is not None and region.is_own,
             may_share=region is not None and region.may_share,
             modulation_hz=self.modulation_hz,
+            above_db=above_db if self.is_short and self.pulse and self.pulse.is_raised else None,
         )
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it is a short pulse, beside which another is felt that lasts."""
+        return self.pulse is not None and self.pulse.is_short
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,8 @@ ELSEWHERE = "elsewhere"
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
     """Return the effects that every layout has without defining them, at a level."""
-    return {each.kind: each(level=level_db_sl) for each in BUILT_IN if not each.needs_entry}
+    effects = [each for each in BUILT_IN if not each.needs_entry]
+    return {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class SurfaceLayout:
         if region is not None and region.has_level:
             return region.level_db_sl
         return self.effects[name].level_db_sl
+
+    def gives_level(self, name: str, region: Region | None) -> bool:
+        """Whether it gives an effect, by name, a level of its own in a region."""
+        is_given = region is not None and region.has_level
+        return is_given or "level" in self.effects[name].model_fields_set
 
     def band_of(self, name: str, region: Region | None) -> Band | None:
         """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""

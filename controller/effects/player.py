@@ -1,7 +1,7 @@
 """From contacts to a haptic intent by a surface layout: which finger feels which effect."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
@@ -22,6 +22,10 @@ REQUESTED_PRIORITY = 1_000_000
 CLICKS_APART = 0.060
 """Pause [s] between the starts of short pulses at two fingers: together they would be one."""
 
+CLICK_ABOVE_DB, NOTICED_ABOVE_DB = 6.0, 3.0
+"""Level [dB] of a short pulse above what lasts at its finger: where a layout gives it none, and
+from which on it is noticed."""
+
 # A short pulse that would have to wait longer [s], two turns with rounding, is left out.
 _MAX_WAIT = 2 * CLICKS_APART + 0.005
 
@@ -30,7 +34,8 @@ _MAX_WAIT = 2 * CLICKS_APART + 0.005
 class _Play:
     """A run of an effect at one finger, numbered in order of start.
 
-    is_elsewhere: whether it is the effect outside of all regions; player: who requested it.
+    is_elsewhere: whether it is the effect outside of all regions; above_db: as of targets; player:
+    who requested it.
     """
 
     name: str
@@ -41,6 +46,7 @@ class _Play:
     band: Band | None
     region: Region | None
     is_elsewhere: bool
+    above_db: float | None
     player: str | None = None
 
     @property
@@ -67,9 +73,10 @@ class _Finger:
 class EffectPlayer:
     """Plays the effects of a layout. Deterministic: times are arguments.
 
-    Every finger feels its newest play; when that is over, the one before continues. Of the fingers
-    that feel the effect outside of all regions only the newest does. Short pulses of two fingers
-    are 60 ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
+    Every finger feels its newest play that lasts; when that is over, the one before continues; and
+    beside it the newest short pulse, 6 dB above it where no level is given. Of the fingers that
+    feel the effect outside of all regions only the newest does. Short pulses of two fingers are 60
+    ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
     stimulus at the moment (no detent passed, no movement) does not count. strengths: of sources and
     clients.
     """
@@ -94,8 +101,7 @@ class EffectPlayer:
             finger = self._fingers[contact.key]
             if finger.region is not None and finger.region.is_protected:
                 protected.add(contact.key)
-            play, stimulus = self._current_stimulus(finger, contact, now, ends)
-            if play is not None and stimulus is not None:
+            for play, stimulus in self._current_stimuli(finger, contact, now, ends):
                 sensed.append((play.number, play, contact.key, stimulus))
                 if play.is_elsewhere:
                     newest_elsewhere = max(newest_elsewhere, play.number)
@@ -108,7 +114,12 @@ class EffectPlayer:
             if play.is_elsewhere and number < newest_elsewhere:
                 continue
             target = stimulus.target(
-                key, play.name, play.region, band=play.band, priority=play.priority
+                key,
+                play.name,
+                play.region,
+                band=play.band,
+                priority=play.priority,
+                above_db=play.above_db,
             )
             targets.append(target)
             self._targets.add(key)
@@ -190,6 +201,8 @@ class EffectPlayer:
         ]
         requested = REQUESTED_PRIORITY
         self._start(finger, finger.region, name, contact, now, level=level, priority=requested)
+        is_given = level_db_sl is not None or self.layout.gives_level(name, None)
+        finger.plays[-1].above_db = None if is_given else CLICK_ABOVE_DB
         finger.plays[-1].player = player
 
     def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
@@ -306,18 +319,20 @@ class EffectPlayer:
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
         is_elsewhere = region is None and priority != REQUESTED_PRIORITY
+        above = None if self.layout.gives_level(name, region) else CLICK_ABOVE_DB
         finger.plays.append(
-            _Play(name, effect, run, self._number, priority, band, region, is_elsewhere)
+            _Play(name, effect, run, self._number, priority, band, region, is_elsewhere, above)
         )
 
-    def _current_stimulus(
+    def _current_stimuli(
         self, finger: _Finger, contact: Contact, now: float, ends: list[float]
-    ) -> tuple[_Play | None, EffectStimulus | None]:
-        """Return the play that a finger feels now and its stimulus; add all `until` to ends.
+    ) -> Collection[tuple[_Play, EffectStimulus]]:
+        """Return the plays that a finger feels now and their stimuli; add all `until` to ends.
 
-        All its plays are called, because those for motion follow the finger.
+        The newest that lasts, and the newest short pulse. All its plays are called, because those
+        for motion follow the finger.
         """
-        felt: tuple[_Play | None, EffectStimulus | None] = (None, None)
+        felt: dict[bool, tuple[_Play, EffectStimulus]] = {}
         lasting: list[_Play] = []
         for play in finger.plays:
             result = play.run.feel(contact, now)
@@ -330,6 +345,6 @@ class EffectPlayer:
             if result.until is not None:
                 ends.append(result.until)
             if isinstance(result, EffectStimulus):
-                felt = (play, result)
+                felt[result.is_short] = play, result
         finger.plays = lasting
-        return felt
+        return felt.values()

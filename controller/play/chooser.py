@@ -1,16 +1,15 @@
 """What is chosen for fingers: one answer for all contents that last, and one for each short pulse.
 
 A pulse is chosen beside what lasts: with the stroke and the power that this leaves, all other
-fingers quiet. It is over before an answer for all would help, and never changed. What lasts and
-does not fit beside a pulse that plays has what that leaves, until it has ended.
+fingers quiet, 30 Hz from all that plays where its band allows it. What lasts at its own finger goes
+on. It is over before an answer for all would help, and never changed. What lasts and does not fit
+beside a pulse that plays has what that leaves, until it has ended.
 """
 
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Selection, Targets, not_served
@@ -24,12 +23,14 @@ from controller.play.joint_answer import (
 )
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, amplitudes_of
+from model.answer.search import APART_HZ
 from model.answer.strength import scaled
 from model.choice import NEARLY
 from model.errors import InputError
-from model.table.table import LocalizationTable
+from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
 
+_NOTHING = Selection((), ())
 _USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
 
 _logger = logging.getLogger(__name__)
@@ -61,7 +62,8 @@ class ChoiceRequest:
 
     before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
     whether what lasts takes longer than the control loop may wait; is_rested: whether what plays
-    would do, too, but may be led to what promises more; now [s].
+    would do, too, but may be led to what promises more; now [s]; fading: what played before a
+    cross-fade that goes on.
     """
 
     intended: Intention
@@ -70,6 +72,7 @@ class ChoiceRequest:
     takes_long: bool = False
     is_rested: bool = False
     now: float = math.inf
+    fading: Selection = _NOTHING
 
 
 @dataclass(frozen=True)
@@ -104,10 +107,11 @@ class Chooser:
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
         for each in requested.intended.short:
-            left = self._left_by(_contents(kept), capabilities)
-            found = self._chosen(requested, (each,), left, kept)
+            beside = [*kept, requested.fading]
+            left = self._left_by(_contents(beside), capabilities)
+            found = self._chosen(requested, (each,), left, beside)
             kept.append(found)
-            short[each[0].key] = found
+            short[each[0].key] = found.beside([requested.fading])
         return Choice(requested, lasting, short, is_limited)
 
     def _lasting(
@@ -122,7 +126,11 @@ class Chooser:
         pulses = _contents(requested.kept) if requested.kept else []
         if not pulses:
             return free, False
-        fading = [one for key, one in requested.before.items() if key[0] in free.target_keys]
+        fading = [
+            one
+            for (finger, _), one in requested.before.items()
+            if finger in free.target_keys and one not in pulses
+        ]
         left = self._left_by([*pulses, *fading], capabilities)
         total = amplitudes_of([each.layer.excitation for each in free.contents])
         if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
@@ -166,21 +174,29 @@ class Chooser:
         beside: what a pulse is felt beside; None for what lasts.
         """
         table, intended, before = self.table, requested.intended, requested.before
+        avoided, raised = list[float](), targets
+        if beside is not None:
+            raised = tuple(
+                [(contact, _over(target, contact, beside)) for contact, target in targets]
+            )
+            for content in _contents(beside):
+                avoided += {tone.frequency for tone in content.layer.excitation.values()}
         quiet, protected = intended.quiet_beside(targets), intended.protected
         is_long = requested.takes_long and beside is None
         try:
             answer = answered(
                 table,
-                targets,
+                raised,
                 quiet,
                 capabilities,
                 before=before,
                 protected=protected,
                 keeps=is_long or _is_step(targets, before),
                 now=requested.now if is_long else math.inf,
+                avoided_hz=avoided,
             )
             if not is_long:
-                answer = _alike(answer, targets[0][1])
+                answer = _alike(answer, raised[0][1])
             found = selection_of(
                 table,
                 answer,
@@ -191,8 +207,8 @@ class Chooser:
                 protected=protected,
                 is_in_phase=is_long,
             )
-            if beside:
-                found = _beside(table, intended, found, beside)
+            if avoided:
+                found = _among(intended, found, avoided)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -201,12 +217,6 @@ class Chooser:
                 reason = failure_text(error)
             found = silent(intended, targets, reason)
         return found
-
-
-def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:
-    """Return the levels of powers that add up [dB], by set of thresholds."""
-    powers = [sum([10 ** (level / 10) for level in each]) for each in zip(*levels, strict=True)]
-    return [10 * math.log10(power) if power else -math.inf for power in powers]
 
 
 def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
@@ -220,7 +230,7 @@ def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
 def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
     """Whether only the level of a target changes, which is not raised."""
     ((contact, new),) = targets
-    then = before.get((contact.key, 0))
+    then = before.get((contact.key, new.voice))
     if then is None or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
         return False
     old = then.targets[0][1]
@@ -239,25 +249,32 @@ def _alike(found: Answer, target: Target) -> Answer:
     return scaled(found, -excess) if excess > 0 else found
 
 
-def _beside(
-    table: LocalizationTable, intended: Intention, found: Selection, beside: Sequence[Selection]
-) -> Selection:
-    """Return what was chosen for a pulse with what its finger feels of others besides."""
-    ((contact, _),) = found.targets
-    heard = [known for each in beside if (known := each.quiet_levels.get(contact.key))]
+def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Target:
+    """Return the target of a short pulse as strong as it is to be above what lasts there."""
+    level, above = target.level_db_sl, target.above_db
+    if level is None or above is None:
+        return target
+    for each in _contents(beside):
+        for felt in each.predictions:
+            if felt.contact.key == contact.key and felt.nominal_db_sl is not None:
+                level = max(level, felt.nominal_db_sl + above)
+    return replace(target, level_db_sl=level)
+
+
+def _among(intended: Intention, found: Selection, frequencies: Sequence[float]) -> Selection:
+    """Return what was chosen for a pulse among vibrations, by their frequencies [Hz].
+
+    Nearer than 30 Hz to one of them it is mixed.
+    """
     if not found.contents:
-        is_used_up = bool(_contents(beside)) and found.reason == LIMITS_LEAVE_NOTHING
+        is_used_up = found.reason == LIMITS_LEAVE_NOTHING
         return silent(intended, found.targets, _USED_UP) if is_used_up else found
-    if not heard:
+    (content,) = found.contents
+    gap = min([abs((content.frequency or 0.0) - each) for each in frequencies])
+    if gap >= APART_HZ - SAME_FREQUENCY:
         return found
-    (content,), others = found.contents, np.array(sums_db(heard))
-    (felt,) = content.predictions
-    promised = felt.promised_contrast_db
-    level = -math.inf if felt.level_db_sl is None else felt.level_db_sl
-    levels = table.levels_by_set(level, content.layer.excitation)
-    promised = min(math.inf if promised is None else promised, float((levels - others).min()))
-    felt = replace(felt, promised_contrast_db=promised, foreign_level_db_sl=float(others.max()))
-    return replace(found, contents=(replace(content, predictions=(felt.judged(),)),))
+    mixed = tuple([replace(each, is_apart=False).judged() for each in content.predictions])
+    return replace(found, contents=(replace(content, predictions=mixed),))
 
 
 def _contents(parts: Iterable[Selection]) -> list[Content]:

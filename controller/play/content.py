@@ -31,7 +31,9 @@ class Prediction:
     of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of
     others' contents here, which nine of ten plates do not exceed. None where there is nothing to
     compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
-    nominal_db_sl: its level on the plate as modelled; pauses: whether it ends, or comes and goes.
+    nominal_db_sl: its level on the plate as modelled; pauses: whether it ends, or comes and goes;
+    by_set: its level by each set of thresholds, above that by the rig's own [dB]; is_apart: whether
+    all that others feel is 30 Hz away.
     """
 
     contact: Contact
@@ -45,6 +47,8 @@ class Prediction:
     content: str | None = None
     nominal_db_sl: float | None = None
     pauses: bool = False
+    by_set: Sequence[float] = (0.0,)
+    is_apart: bool = True
 
     @property
     def is_foreign_felt(self) -> bool:
@@ -58,7 +62,25 @@ class Prediction:
         verdict = verdict_of(
             self.promised_contrast_db, self.foreign_level_db_sl, pauses=self.pauses
         )
-        return replace(self, verdict=verdict)
+        return replace(self, verdict=verdict if self.is_apart else MIXED)
+
+    def beside(self, others: Sequence[float], total: Sequence[float]) -> "Prediction":
+        """Return it with other contents besides, whose powers add, by the set that is worst.
+
+        others: of these alone [dB SL], by each set of thresholds; total: all that is foreign here.
+        """
+        level, contrast = self.level_db_sl, self.promised_contrast_db
+        found = replace(self, foreign_level_db_sl=max(total))
+        if level is None:
+            return found
+        own = [level + above for above in self.by_set]
+        if contrast is None or self.foreign_level_db_sl is None:  # it is to its own at quiet ones
+            least, background = math.inf if contrast is None else contrast, total
+        else:
+            least = math.inf
+            background = sums_db([[each - contrast for each in own], others])
+        contrasts = [one - each for one, each in zip(own, background, strict=True)]
+        return replace(found, promised_contrast_db=min(least, *contrasts)).judged()
 
     def weakened(self, gain_db: float, others_db: float) -> "Prediction":
         """Return it with a gain [dB]; others_db: at most on others' contents.
@@ -91,11 +113,11 @@ class Prediction:
 class Content:
     """What one layer plays, with the contacts as they were when it was chosen.
 
-    key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
-    predictions; targets: that finger, then those that share it; placement: where they are, and all
-    others; predictions: one per target, which also depend on others; gain_db: that the layer has,
-    its fingers' strength. is_led: whether it takes the place of what its finger feels along a
-    cross-fade, which others hardly notice.
+    key: of the finger whose content it is, and CLICK for a short pulse, 0 for what lasts, or the
+    number of a side band of that, which has no predictions; targets: that finger, then those that
+    share it; placement: where they are, and all others; predictions: one per target, which also
+    depend on others; gain_db: that the layer has, its fingers' strength. is_led: whether it
+    takes the place of what its finger feels along a cross-fade, which others hardly notice.
     """
 
     key: tuple[ContactKey, int]
@@ -118,9 +140,9 @@ class Selection:
 
     targets, quiet: contacts as they were when the contents were chosen, targets with their
     intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
-    contents of some targets are still being chosen. quiet_levels [dB SL]: what quiet contacts feel
-    of the contents by each set of thresholds, which nine of ten plates do not exceed; protected:
-    contacts that must not notice those of others.
+    contents of some targets are still being chosen. foreign_levels [dB SL]: what contacts feel
+    of others' contents by each set of thresholds, which nine of ten plates do not exceed;
+    protected: contacts that must not notice those of others.
     """
 
     targets: Targets
@@ -129,7 +151,7 @@ class Selection:
     reason: str | None = None
     not_served: tuple[Prediction, ...] = ()
     is_pending: bool = False
-    quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
+    foreign_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
     protected: frozenset[ContactKey] = frozenset()
 
     @cached_property
@@ -157,20 +179,13 @@ class Selection:
         return bool(self.contents) and is_each_alone and not self.not_served
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return it with the strengths of fingers; what several share has the lowest.
-
-        Also that of one whose short pulse is felt above it meanwhile.
-        """
+        """Return it with the strengths of fingers; what several share has the lowest."""
         if not (self.contents and any(gains_db.values())):
             return self
-        every = {key: gain for (key, _), gain in gains_db.items()}
         gains = {
             each.targets: min(
                 0.0,
-                *[
-                    gains_db.get((at.key, to.is_short), every.get(at.key, 0.0))
-                    for at, to in each.targets
-                ],
+                *[gains_db.get((at.key, to.is_short), 0.0) for at, to in each.targets],
             )
             for each in self.contents
         }
@@ -189,9 +204,10 @@ class Selection:
             )
         loudest = max(gains.values(), default=0.0)
         levels = {
-            key: [level + loudest for level in by_set] for key, by_set in self.quiet_levels.items()
+            key: [level + loudest for level in by_set]
+            for key, by_set in self.foreign_levels.items()
         }
-        return replace(self, contents=tuple(contents), quiet_levels=levels)
+        return replace(self, contents=tuple(contents), foreign_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
         """Return it without some contents, whose targets feel nothing for a reason."""
@@ -207,14 +223,55 @@ class Selection:
             ),
         )
 
+    def beside(self, others: Sequence["Selection"]) -> "Selection":
+        """Return it with what the fingers of its targets feel of others that play beside it."""
+        levels, total = dict[ContactKey, list[float]](), {**self.foreign_levels}
+        for key in self.target_keys:
+            of_others = foreign_at(key, others)
+            if max(of_others, default=-math.inf) > -math.inf:
+                levels[key], total[key] = of_others, foreign_at(key, (self, *others))
+        if not levels:
+            return self
+
+        def together(each: Prediction) -> Prediction:
+            key = each.contact.key
+            return each.beside(levels[key], total[key]) if key in levels else each
+
+        contents = [
+            replace(each, predictions=tuple(map(together, each.predictions)))
+            for each in self.contents
+        ]
+        return replace(
+            self,
+            contents=tuple(contents),
+            not_served=tuple(map(together, self.not_served)),
+            foreign_levels=total,
+        )
+
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """What each target feels, those that are not served at the end.
+        """What each finger feels, those that feel nothing at the end.
 
-        Of several contents the last: a pulse goes on in one that others share.
+        Of a short pulse beside what lasts; where that is not served, why, of the other.
         """
-        served = {each.contact.key: each for one in self.contents for each in one.predictions}
-        return (*served.values(), *self.not_served)
+        found = {each.contact.key: each for one in self.contents for each in one.predictions}
+        for each in self.not_served:
+            felt = found.get(each.contact.key)
+            found[each.contact.key] = (
+                each if felt is None else replace(felt, held_back=each.held_back)
+            )
+        return tuple(found.values())
+
+
+def foreign_at(key: ContactKey, parts: Sequence[Selection]) -> list[float]:
+    """Return what a contact feels of others' contents of several selections, by set [dB SL]."""
+    return sums_db([known for part in parts if (known := part.foreign_levels.get(key))])
+
+
+def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:
+    """Return the levels of powers that add up [dB], by set of thresholds."""
+    powers = [sum([10 ** (level / 10) for level in each]) for each in zip(*levels, strict=True)]
+    return [10 * math.log10(power) if power else -math.inf for power in powers]
 
 
 def no_layer_free(count: int) -> str:

@@ -32,6 +32,9 @@ Band: TypeAlias = tuple[float, float]
 Gains = Mapping[tuple[ContactKey, bool], float]
 """Strengths [dB], 0 at most, of what is felt by a contact, and whether that is a short pulse."""
 
+CLICK = -1
+"""Voice of a short pulse, which plays beside what lasts at its finger: that begins with 0."""
+
 _TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 
 
@@ -65,6 +68,11 @@ class Pulse:
             return self.start + max(self.duration, _MAX_DELAY)
         return self.start + self.duration
 
+    @property
+    def is_short(self) -> bool:
+        """Whether it ends before a shaped onset would have settled."""
+        return self.duration < SHAPED_FROM
+
 
 @dataclass(frozen=True, slots=True)
 class Target:
@@ -75,7 +83,8 @@ class Target:
     fingers of one name may share one vibration where the plate cannot give each its own. None: of
     this one alone. is_own: whether it feels its own content or none; may_share: whether it may also
     feel that of any finger that may share. modulation_hz: how often a second the strength of what
-    lasts comes and goes.
+    lasts comes and goes. above_db: by how much at least a short pulse is above what lasts at its
+    finger; None as strong as its level says.
     """
 
     key: ContactKey
@@ -87,6 +96,12 @@ class Target:
     is_own: bool = False
     may_share: bool = False
     modulation_hz: float | None = None
+    above_db: float | None = None
+
+    @property
+    def voice(self) -> int:
+        """The first of its voices, by which layers tell the contents of one finger apart."""
+        return CLICK if self.is_short else 0
 
     @property
     def shared_as(self) -> str | bool | None:
@@ -97,15 +112,16 @@ class Target:
 
     @property
     def is_short(self) -> bool:
-        """Whether it ends before a shaped onset would have settled."""
-        return self.pulse is not None and self.pulse.duration < SHAPED_FROM
+        """Whether it is a short pulse."""
+        return self.pulse is not None and self.pulse.is_short
 
 
 @dataclass(frozen=True)
 class HapticIntent:
     """Targets and their levels at one moment.
 
-    targets: each contact once; those that are not on the plate are ignored. reason: why there are
+    targets: of each contact one that lasts, a short pulse, or both at once; those that are not on
+    the plate are ignored. reason: why there are
     none. until: when [s] the intent may change though no contact has. protected: contacts that must
     not notice the contents of others. gains_db: by which what is chosen for targets is played
     weaker.

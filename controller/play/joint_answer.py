@@ -59,12 +59,13 @@ def answered(
     protected: frozenset[ContactKey] = frozenset(),
     keeps: bool = True,
     now: float = math.inf,
+    avoided_hz: Sequence[float] = (),
 ) -> Answer:
     """Answer the fingers of targets and of quiet contacts, those that move on their ways.
 
     before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
-    fingers, or more strongly; now [s]: infinite where all rest. Raises InputError for fingers that
-    are too close.
+    fingers, or more strongly; now [s]: infinite where all rest; avoided_hz: frequencies that
+    play beside it. Raises InputError for fingers that are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
@@ -79,6 +80,7 @@ def answered(
         drive_mode=capabilities.drive_mode,
         shaped=is_shaped and not targets[0][1].is_short,  # all or none
         limits=capabilities.limits,
+        avoided_hz=avoided_hz,
     )
     kept = _kept(fingers, targets, before) if keeps else fingers
     if kept == fingers:
@@ -137,8 +139,8 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        contact, placed, voices = own[0][0], here.placement(layer), layer.voices
-        carrier = before.get((contact.key, 0))
+        (contact, target), placed, voices = own[0], here.placement(layer), layer.voices
+        carrier = before.get((contact.key, target.voice))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
             and then.frequency == played.frequency
@@ -150,22 +152,22 @@ def selection_of(
                 played = _in_phase(played, then, fields(), layer.fingers[0], table)
             contents.append(
                 Content(
-                    (contact.key, voice),
+                    (contact.key, target.voice + voice),
                     tuple(own),
                     placed,
                     shape(placed, played, is_continued) if shape else played,
-                    () if voice else _predictions(own, sensations, layer),
+                    () if voice else _predictions(own, sensations, layer, table),
                 )
             )
-    levels = foreign_on_ways(found, count)[len(targets) :]
-    quiet_levels = {contact.key: by_set for contact, by_set in zip(quiet, levels, strict=True)}
+    contacts = [*[contact for contact, _ in targets], *quiet]
+    levels = zip(contacts, foreign_on_ways(found, count), strict=True)
     return Selection(
         tuple(targets),
         tuple(quiet),
         tuple(contents),
         None if contents else skipped[0].held_back,
         tuple(skipped),
-        quiet_levels=quiet_levels,
+        foreign_levels={contact.key: by_set for contact, by_set in levels},
         protected=protected,
     )
 
@@ -256,8 +258,8 @@ def _kept(
 ) -> list[Finger]:
     """The fingers with the frequencies that they feel now, where their bands allow it."""
     kept = [*fingers]
-    for number, (contact, _) in enumerate(targets):
-        then, stimulus = before.get((contact.key, 0)), fingers[number].stimulus
+    for number, (contact, target) in enumerate(targets):
+        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
         frequency = None if then is None else then.frequency
         if stimulus is None or frequency is None:
             continue
@@ -291,7 +293,10 @@ def _why_unfelt(felt: Sensation) -> str | None:
 
 
 def _predictions(
-    targets: Sequence[tuple[Contact, Target]], sensations: Sequence[Sensation], layer: Layer
+    targets: Sequence[tuple[Contact, Target]],
+    sensations: Sequence[Sensation],
+    layer: Layer,
+    table: LocalizationTable,
 ) -> tuple[Prediction, ...]:
     """What is predicted of a layer's finger, and of those that share it."""
     first, own = targets[0]
@@ -299,6 +304,7 @@ def _predictions(
         f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
         "apart"
     )
+    by_set = tuple(table.levels_by_set(0.0, layer.excitation).tolist())
     predictions: list[Prediction] = []
     for (contact, target), felt in zip(targets, sensations, strict=True):
         predictions.append(
@@ -314,6 +320,7 @@ def _predictions(
                 own.content,
                 felt.level_db_sl,
                 pauses=felt.pauses or target.pulse is not None,
+                by_set=by_set,
             ).judged()
         )
     return tuple(predictions)

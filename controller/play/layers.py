@@ -15,8 +15,10 @@ from typing import Any
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
-from controller.play.intent import FADED_AFTER
+from controller.play.intent import CLICK, FADED_AFTER
 from controller.play.routing import (
+    BESIDE_CLICK,
+    FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
@@ -337,7 +339,8 @@ class Layers:
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Contents by layer: what plays in its own, else a finger's, new ones in those that end.
 
-        One that another gives way to has one that is free.
+        One that another gives way to has one that is free, and a short pulse rather, too: along its
+        short ramp would fade what ends there.
         """
         numbers: dict[int, Content] = {}
         for number, one in self.contents.items():
@@ -352,14 +355,17 @@ class Layers:
             if before is not None and before.content.frequency != content.frequency:
                 free = [n for n in range(self._count) if n not in self.may_play | numbers.keys()]
                 known = next(iter(free), known)
-            if known is None or known in numbers:  # a pulse beside what others share
+            if known is None:
                 new.append(content)
             else:
                 numbers[known] = content
-        falling = {n for n, one in self.contents.items() if one.is_falling}
-        for number in (*sorted(self.may_play - falling), *range(self._count)):
-            if new and number not in numbers:
-                numbers[number] = new.pop(0)
+        falling = [n for n in sorted(self.may_play - numbers.keys()) if self._is_falling(n)]
+        ending = sorted(self.may_play - numbers.keys() - {*falling})
+        free = [n for n in range(self._count) if n not in self.may_play and n not in numbers]
+        for content in new:
+            first, second = (free, ending) if content.key[1] == CLICK else (ending, free)
+            if some := first or second or falling:
+                numbers[some.pop(0)] = content
         return numbers
 
     def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:
@@ -387,11 +393,9 @@ class Layers:
             self._fades_until = now + FADED_AFTER
         self._replace(playing)
         self.is_silent = False
-        layer_of: dict[tuple[ContactKey, int], int] = {}
-        for number, one in playing.items():
-            if not one.is_falling:
-                layer_of.setdefault(one.content.key, number)
-        self._layer_of = layer_of
+        self._layer_of = {
+            one.content.key: number for number, one in playing.items() if not one.is_falling
+        }
         self.may_play |= sets.started
 
     def _sets(
@@ -424,13 +428,15 @@ class Layers:
             may_end = is_shaped and not content.targets[0][1].is_short
             playing[number] = LayerContent(content, played, is_shaped=may_end)
             settled.append(playing[number].settled_after)
+        is_clicking = any(content.targets[0][1].is_short for content in contents)
+        ramp = min(BESIDE_CLICK if is_clicking else FADE_RAMP, self.builder.ramp_max)
         for number in self.may_play - numbers.keys():
             if is_shaped and (falling := self._falling(number, contents, now)) is not None:
                 playing[number] = falling
                 continue
             has_endings = is_shaped and self._may_end_shaped(number, now)
-            layers[number] = self.builder.build_end(number, has_endings=has_endings)
-            settled.append(self.builder.end_ramp)
+            layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
+            settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
 
     def _fade_of(self, number: int, content: Content) -> float:
@@ -450,6 +456,9 @@ class Layers:
         if one is None or not content.is_led or one.content == content:
             return None
         return None if one.content.targets[0][1].is_short else one
+
+    def _is_falling(self, number: int) -> bool:
+        return number in self.contents and self.contents[number].is_falling
 
     def _falling(self, number: int, contents: Sequence[Content], now: float) -> LayerContent | None:
         """What a layer plays, if it gives way to one of these contents; None if it ends at once."""

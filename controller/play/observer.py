@@ -19,7 +19,7 @@ class PlayReport:
     """The contents that amplifiers play since their last confirmed set.
 
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts, and
-    what they feel at most (`Selection.quiet_levels`);
+    what they feel at most (`Selection.foreign_levels`);
     contents: as they are played, by layer, the newest one last; latency [s]: from the touch frame
     to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
     of the report; from_rest: whether the plate
@@ -114,7 +114,9 @@ def play_report(
         contacts=plan.contacts,
         targets=selection.predictions,
         quiet=selection.quiet,
-        quiet_levels=selection.quiet_levels,
+        quiet_levels={
+            each.key: selection.foreign_levels.get(each.key, ()) for each in selection.quiet
+        },
         contents={number: playing[number] for number in order},
         latency=None if sent_at is None else sent_at - plan.since,
         time=now if sent_at is None else sent_at,
@@ -137,7 +139,7 @@ def silence_report(plan: Plan, *, sent_at: float | None, now: float) -> SilenceR
         contacts=plan.contacts,
         targets=tuple(
             known.get(contact.key) or not_served(contact, reason)
-            for contact, _ in selection.targets
+            for contact in dict.fromkeys(contact for contact, _ in selection.targets)
         ),
         reason=reason,
         latency=None if sent_at is None else sent_at - plan.since,

@@ -314,10 +314,10 @@ class Planner:
         if over := self.layers.over_of(selection.contents):
             selection = selection.without(over, ENDED)
         count = self.capabilities.layers
-        if len(selection.contents) > count:  # of each finger all voices have one, or none
+        if len(selection.contents) > count:  # of each content all voices have one, or none
             served = [*self.layers.numbered(selection.contents).values()]
-            keys = {each.key[0] for each in selection.contents if each not in served}
-            left = [each for each in selection.contents if each.key[0] in keys]
+            lacking = [each.targets for each in selection.contents if each not in served]
+            left = [each for each in selection.contents if each.targets in lacking]
             selection = selection.without(left, no_layer_free(count))
         return selection
 

@@ -35,6 +35,9 @@ PlateLayer = Mapping[str, Layer]
 FADE_RAMP = 0.020
 """Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
 
+BESIDE_CLICK = 0.100
+"""Fade-out [s] beside a short pulse, below which a shorter one would be felt with it."""
+
 _STEP, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("envelope_step", "level", "phase"))
 _FREQUENCY = QUANTITIES["frequency"]
 _DIGITS = 6  # of a step of the wire
@@ -173,16 +176,11 @@ class SetBuilder:
             valid_for=ramp,
         )
 
-    def build_end(self, number: int, *, has_endings: bool) -> PlateLayer:
-        """Build the set that ends a layer along its endings, or along a ramp."""
+    def build_end(self, number: int, ramp: float, *, has_endings: bool) -> PlateLayer:
+        """Build the set that ends a layer along its endings, or along a ramp [s]."""
         if has_endings:
-            return dict.fromkeys(self.rig.amplifiers, Layer(number, ramp=self.end_ramp))
-        return route({}, self.rig, ramp=self.end_ramp, number=number)
-
-    @property
-    def end_ramp(self) -> float:
-        """The ramp [s] along which a layer ends under fingers that stay."""
-        return min(FADE_RAMP, self.ramp_max)
+            return dict.fromkeys(self.rig.amplifiers, Layer(number, ramp=ramp))
+        return route({}, self.rig, ramp=ramp, number=number)
 
 
 def route(

@@ -4,7 +4,7 @@ One question is answered at a time, with the fingers as they are when the one be
 """
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,6 @@ from controller.play.chooser import (
     Chooser,
     Intention,
     is_alone,
-    sums_db,
     unanswered,
 )
 from controller.play.content import (
@@ -28,10 +27,12 @@ from controller.play.content import (
     Prediction,
     Selection,
     Targets,
+    foreign_at,
     no_layer_free,
     not_served,
 )
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
+from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
@@ -59,6 +60,7 @@ BLOCKED = (
 _UNANSWERED = (GIVEN_UP, BLOCKED)
 
 _NOTHING = Selection((), ())
+_FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
 
 
 def _is_met_by(intended: Intention, chosen: Selection) -> bool:
@@ -85,15 +87,9 @@ def _is_among(intended: Intention, chosen: Selection) -> bool:
 def _is_part_of(
     intended: Intention, chosen: Selection, kinds: Callable[[Targets], set[Target]]
 ) -> bool:
-    """Whether what lasts was chosen, and no more that would leave others more if it ended.
-
-    The content of a finger that feels a short pulse meanwhile has not ended.
-    """
+    """Whether what lasts was chosen, and no more that would leave others more if it ended."""
     now, had = kinds(intended.lasting), kinds(chosen.targets)
-    if not now <= had:
-        return False
-    pulsing = {contact.key for contact, _ in intended.short}
-    return chosen.is_whole or all(target.key in pulsing for target in had - now)
+    return now == had or (now < had and chosen.is_whole)
 
 
 def _targets_of(targets: Targets) -> set[Target]:
@@ -139,6 +135,7 @@ class Selector:
         self._situation: object = None
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; by the last step
+        self._fading = _NOTHING  # what plays until that has been taken
         self.requests = 0
         """How often the thread was asked."""
         self.due = math.inf
@@ -162,9 +159,11 @@ class Selector:
         While the thread computes, what played and is still to be felt stays. now [s]: infinite
         where fingers do not move.
         """
-        by_key = {target.key: target for target in intent.targets}
+        by_key = defaultdict[ContactKey, list[Target]](list)
+        for target in intent.targets:
+            by_key[target.key].append(target)
         # Lists: a generator would be a call for each.
-        targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
+        targets = tuple([(one, each) for one in contacts for each in by_key.get(one.key, ())])
         served, skipped = _within_layers(targets, capabilities)
         lasting, short = list[tuple[Contact, Target]](), list[tuple[Contact, Target]]()
         before, self._fingers, came = self._fingers, {}, set[ContactKey]()
@@ -214,7 +213,7 @@ class Selector:
                     )
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason)
-        if self._thread.is_busy and len(found.predictions) < len(targets):
+        if self._thread.is_busy and len(found.predictions) < len(by_key):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
         return found
@@ -233,6 +232,9 @@ class Selector:
         if not self._may_lead(step.contents, now):
             self._steps = ()
             return
+        new = {(each.key, each.frequency) for each in step.contents}
+        old = [each for each in self._lasting.contents if (each.key, each.frequency) not in new]
+        self._fading = replace(self._lasting, contents=tuple(old))
         self._lasting = step
         self._led_at = now
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
@@ -274,12 +276,13 @@ class Selector:
         if is_kept and not is_rested and not new:
             return
         felt = _felt(self._lasting, self._fingers.keys())
-        before = {each.key: each for each in felt.contents}
-        for contact, _ in intended.short:
-            before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
+        parts = [felt] if is_rested else [felt, *pulses.values()]
+        before = {each.key: each for part in parts for each in part.contents}
         if new and (has_waited or is_kept):
             pulses_alone = replace(intended, lasting=(), short=new)
-            yield ChoiceRequest(pulses_alone, before, (felt, *self._playing(now)))
+            fading = self._fading if now < self._led_at + _FADES_FOR else _NOTHING
+            kept = felt, *self._playing(now)
+            yield ChoiceRequest(pulses_alone, before, kept, fading=fading)
             new = ()
         if is_kept and not is_rested:
             return
@@ -351,21 +354,18 @@ def _together(
             chosen.append(part)
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
+    restated = [part.beside([each for each in chosen if each is not part]) for part in chosen]
     then = {key: each for part in chosen for key, each in part.contacts.items()}
     keys = {contact.key for contact, _ in targets}
     quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
     reasons = [part.reason for part in chosen if part.reason is not None]
-    levels = [part.quiet_levels for part in chosen]
     return Selection(
         tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
         tuple(quiet),
-        tuple([content for part in chosen for content in part.contents]),
+        tuple([content for part in restated for content in part.contents]),
         next(iter(reasons), None) if targets else reason,
-        (*[each for part in chosen for each in part.not_served], *skipped),
-        quiet_levels={
-            each.key: sums_db([known for level in levels if (known := level.get(each.key))])
-            for each in quiet
-        },
+        (*[each for part in restated for each in part.not_served], *skipped),
+        foreign_levels={each.key: foreign_at(each.key, chosen) for each in contacts},
     )
 
 
@@ -398,7 +398,8 @@ def _within_layers(
 ) -> tuple[Targets, tuple[Prediction, ...]]:
     """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
 
-    Many that may share have one layer together.
+    Before these short pulses of fingers that feel what lasts. Many that may share have one layer
+    together.
     """
     mode = capabilities.drive_mode
     count = capabilities.layers if mode == UNRESTRICTED else 1
@@ -409,8 +410,13 @@ def _within_layers(
         reason = no_layer_free(count)
     sharing = Counter([target.shared_as for _, target in targets])
     layers: list[str | bool | None] = []
-    served = set[int]()
-    for at in sorted(range(len(targets)), key=lambda n: (targets[n][1].priority, n), reverse=True):
+    served, lasting = set[int](), {target.key for _, target in targets if not target.is_short}
+
+    def rank(number: int) -> tuple[bool, int, int]:
+        _, target = targets[number]
+        return not (target.is_short and target.key in lasting), target.priority, number
+
+    for at in sorted(range(len(targets)), key=rank, reverse=True):
         name = targets[at][1].shared_as
         is_one = name is not None and sharing[name] > MAX_SEPARATE and mode == UNRESTRICTED
         if is_one and name in layers:

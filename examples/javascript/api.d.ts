@@ -430,7 +430,7 @@ export interface ContactStatus {
   is_foreign_felt?: boolean;
   /** of the contents of others where it is now, on the nominal plate: more than promised while it moves; in the status only, null where there are none */
   leak_db_sl?: number | null;
-  /** why it does not feel an effect of its own; null if it does */
+  /** why it does not feel an effect of its own, or not its click over what lasts; null if it does */
   held_back?: string | null;
   /** on the plate, relative to the rig's fingertip; 1 where none is reported */
   load?: number;

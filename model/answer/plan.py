@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from model.answer.answer import MIN_CONTRAST_DB, NO_LIMITS, SAME_LEVEL, Answer, Limits
 from model.answer.fingers import (
     ANY,
@@ -41,7 +43,7 @@ from model.choice import NEARLY, best_by, best_of
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
-from model.table.table import EFFECT_DURATIONS, LocalizationTable
+from model.table.table import EFFECT_DURATIONS, SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
 """Fingers that may share, up to which each has a vibration of its own at first.
@@ -61,6 +63,7 @@ def answer(
     drive_mode: str | None = None,
     shaped: bool = False,
     apart_hz: float = APART_HZ,
+    avoided_hz: Sequence[float] = (),
     bands_may_swap: bool = False,
     min_contrast_db: float = MIN_CONTRAST_DB,
     limits: Limits = NO_LIMITS,
@@ -69,13 +72,13 @@ def answer(
 
     quiet: more fingers, which are to feel nothing; drive_mode: the table's own if None, which must
     be `phased` for more than one vibration; shaped: whether the amplifiers play shaped onsets and
-    endings, which `Timing` adds; apart_hz: distance of the vibrations' frequencies, where their
-    bands allow it; bands_may_swap: whether a finger may have the band of another one;
-    min_contrast_db: below which the promise at the worst finger is not served as requested;
-    limits: of the amplifiers. A stimulus whose modulation would leave a finger unserved, or whose
-    side bands do not fit, is steady, as is a shared one, and all where clocks are not held.
-    Levels are lowered where stroke and limits do not allow all: of the lower priorities first, of
-    one priority the louder ones first.
+    endings, which `Timing` adds; apart_hz: distance of the vibrations' frequencies, from each other
+    and from avoided_hz, which play already, where their bands allow it; bands_may_swap: whether a
+    finger may have the band of another one; min_contrast_db: below which the promise at the worst
+    finger is not served as requested; limits: of the amplifiers. A stimulus whose modulation would
+    leave a finger unserved, or whose side bands do not fit, is steady, as is a shared one, and all
+    where clocks are not held. Levels are lowered where stroke and limits do not allow all: of the
+    lower priorities first, of one priority the louder ones first.
     Raises InputError for fingers that contradict each other, and a band without frequencies.
     """
     if not 0 <= apart_hz < math.inf:  # False for NaN
@@ -83,7 +86,8 @@ def answer(
     every = (*fingers, *[each if isinstance(each, Finger) else Finger(each) for each in quiet])
     check_fingers(every, table.plate)
     mode = checked_mode(drive_mode or table.drive_mode)
-    answering = _Answering(table, every, mode, shaped, apart_hz, bands_may_swap, limits)
+    avoided = _avoided(table, avoided_hz, apart_hz)
+    answering = _Answering(table, every, mode, shaped, apart_hz, avoided, bands_may_swap, limits)
     found = answering.within_limits(answering.solve(min_contrast_db), min_contrast_db)
     changed = _changed(found)
     return replace(found, applied=(*found.applied, *changed)) if changed else found
@@ -165,6 +169,7 @@ class _Answering:
     drive_mode: str
     is_shaped: bool
     apart_hz: float
+    avoided: frozenset[int]
     bands_may_swap: bool
     limits: Limits
 
@@ -358,7 +363,13 @@ class _Answering:
             background=background,
             drive_mode=self.drive_mode,
             is_shaped=self.is_shaped,
+            avoided=self._avoided_by(streams),
         )
+
+    def _avoided_by(self, streams: Sequence[Stream]) -> tuple[int, ...]:
+        """The rows to be avoided; none where a content would be left without any."""
+        bands = [{*range(*band)} for stream in streams for band in stream.bands]
+        return () if any(band <= self.avoided for band in bands) else tuple(self.avoided)
 
     def _measure(self, plan: _Plan) -> Answer:
         """What fingers feel of a plan's contents."""
@@ -367,10 +378,18 @@ class _Answering:
             tones = choose_tones(table, contents)
         else:
             tones = Tones.none(len(contents.places), len(table.threshold_sets))
-        if not tones.is_apart:
+        if not tones.is_apart or len(contents.avoided) < len(self.avoided):
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         given = self.fingers, contents, tones, plan.held, applied
         return Answer(*given, table.eras, table.frequencies, table.thresholds)
+
+
+def _avoided(
+    table: LocalizationTable, avoided_hz: Sequence[float], apart_hz: float
+) -> frozenset[int]:
+    """The rows of a table's frequencies that are too near to some that play already [Hz]."""
+    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
+    return frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
 
 
 def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:

@@ -86,7 +86,8 @@ class Contents:
     by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
     of the rest of the plate at all of the table's frequencies, for no other finger; drive_mode: any
     but UNRESTRICTED has one content; is_shaped: whether onsets are shaped, along which nothing
-    rings; least_ramp [s]: of short ones, which are a quarter of their duration else.
+    rings; least_ramp [s]: of short ones, which are a quarter of their duration else; avoided: rows
+    of the table's frequencies that no content may have.
     """
 
     places: tuple[Point, ...]
@@ -98,6 +99,7 @@ class Contents:
     drive_mode: str = UNRESTRICTED
     is_shaped: bool = False
     least_ramp: float = 0.0
+    avoided: tuple[int, ...] = ()
 
     @property
     def is_ranked(self) -> bool:
@@ -123,9 +125,9 @@ class Contents:
 
     @property
     def rows(self) -> IntArray:
-        """Rows of the table's frequencies that any band holds, ascending, (f,)."""
+        """Rows of the table's frequencies that contents may have, ascending, (f,)."""
         bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
-        return np.unique(np.concatenate(bands))
+        return np.setdiff1d(np.concatenate(bands), self.avoided)
 
     def others(self, number: int) -> list[int]:
         """Fingers that a content, by its number, is kept from."""

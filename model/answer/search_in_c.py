@@ -42,7 +42,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""
     streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
     starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
-    is_here = contents.drive_mode == UNRESTRICTED
+    is_here = contents.drive_mode == UNRESTRICTED and not contents.avoided
     for stream in streams:
         targets += stream.targets
         starts.append(len(targets))

@@ -70,7 +70,13 @@ class SetTable:
         self.prepared.append(drive_mode)
 
     def answer(
-        self, fingers: Sequence[Finger], *, drive_mode: str, shaped: bool, limits: Limits
+        self,
+        fingers: Sequence[Finger],
+        *,
+        drive_mode: str,
+        shaped: bool,
+        limits: Limits,
+        avoided_hz: Sequence[float],
     ) -> Answer:
         """The same for every target, 12 dB above others at 20 dB SL."""
         self.asked.append([*fingers])
@@ -83,6 +89,10 @@ class SetTable:
     def with_clocks(self, clocks: ClockErrors) -> "SetTable":
         """Itself: its answers count no clocks."""
         return self
+
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> FloatArray:
+        """By its only set of thresholds."""
+        return np.array([level_db_sl])
 
     def amplitudes(
         self, excitation: Excitation, points: FloatArray

@@ -110,6 +110,16 @@ def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
     assert "100 % of the region (1.4 cm²)" in problem
 
 
+@pytest.mark.parametrize(("level", "count"), [(None, 0), (16.9, 1), (17.0, 0)])
+def test_check_wants_notches_noticed_above_what_lasts(level: float | None, count: int) -> None:
+    """3 dB above the 14 of the buzz there; without a level of their own they are."""
+    region = Region("slider", SLIDER, on_press="low", on_move="it", band=(170.0, 230.0))
+    notches = Detents() if level is None else Detents(level=level)
+    layout = SurfaceLayout((region,), {"low": Buzz(level=14.0), "it": notches}, elsewhere=None)
+    (found,) = [each for each in check_layout(layout, table()) if each.on == "on_move"]
+    assert len(found.problems) == count
+
+
 def test_check_wants_a_frequency_for_notches_that_differ() -> None:
     """A slider without a band plays any frequency of the table; with one it stays in it."""
     free = checked(Region("slider", SLIDER, on_move="it"), Detents())

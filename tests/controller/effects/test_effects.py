@@ -452,6 +452,23 @@ def test_requested_effect_restarts_when_requested_again() -> None:
     assert felt == [2.0]
 
 
+def test_a_click_is_felt_beside_what_lasts_at_its_finger() -> None:
+    """6 dB above it where neither the layout nor who plays it gives a level; then alone again."""
+    effects: dict[str, Effect] = {"buzz": Buzz(level=14), "click": Click(), "soft": Click(level=15)}
+    player = EffectPlayer(SurfaceLayout((left(on_press="buzz"),), effects, elsewhere=None))
+    for now, name, asked, level, above in (
+        (0.0, "click", None, 20.0, 6.0),
+        (1.0, "click", 18.0, 18.0, None),
+        (2.0, "soft", None, 15.0, None),
+    ):
+        player.intent([ONE], now)
+        player.play(name, ONE, now, level_db_sl=asked)
+        lasting, short = player.intent([ONE], now).targets
+        assert (lasting.content, lasting.level_db_sl) == ("buzz", 14.0)
+        assert (short.content, short.level_db_sl, short.above_db) == (name, level, above)
+        assert player.intent([ONE], now + 0.2).targets == (lasting,)
+
+
 @given(
     steps=st.lists(
         st.tuples(
@@ -491,7 +508,8 @@ def test_player_invariants_for_any_movement(
         first, again = (player.intent(contacts, now) for player in players)
         assert first == again
         assert {target.key for target in first.targets} <= {each.key for each in contacts}
-        assert len({target.key for target in first.targets}) == len(first.targets)
+        felt = {(target.key, target.is_short) for target in first.targets}
+        assert len(felt) == len(first.targets)
         assert first.until > now
 
 

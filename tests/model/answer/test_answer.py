@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.answer.as_json import query_one
-from model.answer.fingers import Finger, Placement
+from model.answer.fingers import Finger, Placement, Stimulus
 from model.answer.plan import answer as answer_by_table
 from model.answer.plan import prepare_answers
 from model.answer.promised import felt_amplitudes, loudest_power
@@ -135,6 +135,28 @@ def test_frequencies_are_apart_and_within_their_bands():
         assert low <= f <= high
     assert swapped.promised_worst_db > kept.promised_worst_db
     assert np.diff(sorted(frequencies(free))).min() >= 60
+
+
+def test_what_plays_already_is_kept_away_from():
+    """By 30 Hz, short or not: as in the better of the bands that are left; else it is said."""
+    table = smooth_table()
+    for duration in (None, 0.04):
+        own = Finger(NEAR, Stimulus(20, (60, 300), duration))
+        (layer,) = answer(table, [own], [FAR]).layers
+        avoided = layer.frequency
+        (other,) = answer(table, [own], [FAR], avoided_hz=[avoided]).layers
+        assert abs(other.frequency - avoided) >= 30
+        bands = [(60, avoided - 30), (avoided + 30, 300)]
+        parts = [
+            answer(table, [Finger(NEAR, Stimulus(20, band, duration))], [FAR])
+            for band in bands
+            if band[0] < band[1]
+        ]
+        best = max(parts, key=lambda each: each.promised_worst_db)
+        assert other.frequency == best.layers[0].frequency
+        narrow = Finger(NEAR, Stimulus(20, (avoided - 5, avoided + 5), duration))
+        near = answer(table, [narrow], [FAR], avoided_hz=[avoided])
+        assert (near.layers[0].frequency, len(near.applied)) == (avoided, 1)
 
 
 def test_two_contents_of_one_frequency_are_said_to_be_near():

@@ -19,7 +19,7 @@ from model.answer.fingers import Finger, Stimulus
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Tone
+from model.vibration.excitation import Excitation, Tone
 from set_table import set_answer
 from small_table import small_table
 
@@ -44,6 +44,10 @@ class Table:
 
     def prepare(self, mode: str) -> None:
         """Do nothing."""
+
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> list[float]:
+        """The same by its only set of thresholds."""
+        return [level_db_sl]
 
     def answer(self, fingers: Sequence[Finger], **others: Any) -> Answer:
         """One of a frequency that names how often it was asked, at the level asked for."""

@@ -31,7 +31,7 @@ from sim.control.server import control_socket
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line import TwoWayLine
-from sim.transport.line_kinds import LINE_KINDS, PROMPT, LineDelays
+from sim.transport.line_kinds import LINE_NAMES, LineDelays, delays_of
 
 _FORM = (
     "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, &line=KIND, and &seed=N or "
@@ -62,16 +62,15 @@ class SimulationUrl:
         self.control = Path(options["control"]) if options.get("control") else None
         self.amplifier = options.get("amplifier")
         self.line_kind = options.get("line")
-        known = (*LINE_KINDS, PROMPT)
         self._url.require(
-            self.line_kind in (None, *known),
-            f"line must be one of {', '.join(known)}, got {self.line_kind!r}",
+            self.line_kind in (None, *LINE_NAMES),
+            f"line must be one of {', '.join(LINE_NAMES)}, got {self.line_kind!r}",
         )
 
     def delays(self, rig: Rig, amplifier: str) -> LineDelays | None:
         """Those of an amplifier's line; as is usual where the rig has several amplifiers."""
-        kind = self.line_kind or (SIMULATED if len(rig.amplifiers) > 1 else PROMPT)
-        return None if kind == PROMPT else LINE_KINDS[kind].delays((self.seed, amplifier))
+        kind = self.line_kind or (SIMULATED if len(rig.amplifiers) > 1 else None)
+        return delays_of(kind, self.seed, amplifier)
 
     def select(self, names: tuple[str, ...]) -> str:
         """The amplifier that it names, or the only one; raises CommandError."""

@@ -5,7 +5,8 @@
 Fingers anywhere on the plate, 5 cm apart, with contents of 14 dB SL; another plate, ERAs, drives
 and fingertips for each set, drawn within the rig's uncertainty as by `era sim --seed`: the rig's
 own (default), or one as after `era rig identify` (identified). Control loop, serial lines and
-amplifiers run in virtual time, the plate in time under the fingers. With --report, the page
+amplifiers run in virtual time, the plate in time under the fingers; contrast is the least over the
+sets of thresholds by which promises hold. With --report, the page
 docs/measured/promise.md is written as well. Exits with status 1 unless 80 to 98 % of the
 promises are kept, of the default and of the identified rigs each.
 """

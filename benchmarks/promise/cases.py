@@ -126,6 +126,14 @@ CASES = (
     Case("two contents, bands given", 21.2, "car_display", bands=_TWO),
     Case("three contents, bands given", 11.5, "car_display", contents=3, bands=_THREE),
     Case("texture of 20 Hz beside a steady content", 22.0, is_identified=True, modulation_hz=20.0),
+    *(
+        Case("two contents, by every set of thresholds", None, name, is_identified=is_identified)
+        for name, is_identified in (
+            ("paper_plate", False),
+            ("paper_plate", True),
+            ("car_display", True),
+        )
+    ),
     _resting("one bus, USB of high speed", "usb-high-speed", is_one_bus=True),
     _resting("one bus, USB of full speed", "usb-full-speed", is_one_bus=True),
     _resting("lines of USB, high speed", "usb-high-speed"),

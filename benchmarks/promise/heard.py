@@ -2,7 +2,8 @@
 
 Everything that moved the bases in a session is played once more on the same plate under the same
 fingers: only the voices of a finger's own layers, or only those of all others. Voices are divided
-by the threshold at their frequency, so that accelerations are levels of sensation.
+by the threshold at their frequency, by each set of thresholds by which the rig's promises hold, so
+that accelerations are levels of sensation.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,20 +28,29 @@ Span = tuple[float, float]
 
 
 class _Part(Bench):
-    """A bench whose ERAs play only some voices; owners: fingers by layer."""
+    """A bench whose ERAs play only some voices; owners: fingers by layer.
+
+    threshold: name of the set by which voices are divided.
+    """
 
     def __init__(
-        self, rig: Rig, drawn: Imperfections, now: float, is_heard: Callable[[int | None], bool]
+        self,
+        rig: Rig,
+        drawn: Imperfections,
+        now: float,
+        is_heard: Callable[[int | None], bool],
+        threshold: str,
     ) -> None:
         super().__init__(rig, now=now, imperfections=drawn)
-        self.is_heard = is_heard
+        self.is_heard, self.threshold = is_heard, threshold
         self.owners: Mapping[int, int] = {}
 
     def _motion(self, index: int, playing: Sequence[Voice], clock: StraightClock) -> Any:
         errors, terms = self._errors[index], []
         for voice in playing:
             if self.is_heard(self.owners.get(voice.layer)):
-                threshold = float(detection_threshold(np.array([voice.frequency]))[0])
+                at = np.array([voice.frequency])
+                threshold = float(detection_threshold(at, self.threshold)[0])
                 motion = motion_of(
                     [voice],
                     clock,
@@ -78,23 +88,26 @@ class Log:
         """Note whose content each layer has from a time [s] on."""
         self.steps.append((time, lambda part: setattr(part, "owners", {**part.owners, **owners})))
 
-    def replayed(self, is_heard: Callable[[int | None], bool], until: float) -> Bench:
-        """A bench on which some voices have been played up to a time [s]."""
-        part = _Part(self.rig, self.drawn, self.start, is_heard)
-        for time, change in sorted(self.steps, key=lambda each: each[0]):
-            part.advance(time)
-            change(part)
-        part.advance(until)
-        return part
+    def replayed(self, is_heard: Callable[[int | None], bool], until: float) -> list[Bench]:
+        """Benches on which some voices have been played up to a time [s], by set of thresholds."""
+        found: list[Bench] = []
+        for name in dict.fromkeys((self.rig.threshold, *self.rig.promised_thresholds)):
+            part = _Part(self.rig, self.drawn, self.start, is_heard, name)
+            for time, change in sorted(self.steps, key=lambda each: each[0]):
+                part.advance(time)
+                change(part)
+            part.advance(until)
+            found.append(part)
+        return found
 
 
 @dataclass(frozen=True)
 class Heard:
-    """What a finger felt in a session, of its own and of others'."""
+    """What a finger felt in a session, of its own and of others', by set of thresholds."""
 
     finger: int
-    own: Bench
-    foreign: Bench
+    own: list[Bench]
+    foreign: list[Bench]
 
     @classmethod
     def by(cls, finger: int, log: Log, until: float) -> "Heard":
@@ -102,17 +115,21 @@ class Heard:
         own = log.replayed(lambda owner: owner == finger, until)
         return cls(finger, own, log.replayed(lambda owner: owner != finger, until))
 
-    def own_db_sl(self, *spans: Span, strongest: bool = False) -> float:
-        """Level of its own content, mean over the fingertip, in spans of time [s] together."""
-        return self._level(self.own, spans, strongest, is_mean=True)
+    def own_db_sl(self, *spans: Span, strongest: bool = False) -> FloatArray:
+        """Levels of its own content, mean over the fingertip, in spans of time [s] together."""
+        return np.array([self._level(each, spans, strongest, is_mean=True) for each in self.own])
 
-    def foreign_db_sl(self, *spans: Span, strongest: bool = False) -> float:
-        """Level of all others' at the loudest point; strongest: of 40 ms."""
-        return self._level(self.foreign, spans, strongest, is_mean=False)
+    def foreign_db_sl(self, *spans: Span, strongest: bool = False) -> FloatArray:
+        """Levels of all others' at the loudest point; strongest: of 40 ms."""
+        levels = [self._level(each, spans, strongest, is_mean=False) for each in self.foreign]
+        return np.array(levels)
 
-    def contrast_db(self, *spans: Span) -> float:
-        """Own above foreign level in spans of time [s]."""
-        return self.own_db_sl(*spans) - self.foreign_db_sl(*spans)
+    def contrast_db(self, *spans: Span, strongest: bool = False) -> float:
+        """Own above foreign level in spans of time [s], the least over the sets."""
+        own, foreign = (
+            each(*spans, strongest=strongest) for each in (self.own_db_sl, self.foreign_db_sl)
+        )
+        return float((own - foreign).min())
 
     def _level(self, bench: Bench, spans: Sequence[Span], strongest: bool, is_mean: bool) -> float:
         records = [bench.fingers.felt(*span)[str(self.finger)] for span in spans]

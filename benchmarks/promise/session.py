@@ -185,7 +185,7 @@ class _Session:
                 owners = {n: _id(one) for n, one in applied.contents.items()}
                 log.own(owners, applied.time - FIRST)  # amplifiers start one after another
             on.far.bench.advance(before.until)
-            return _measured(log, first, events, self._timing, self._last, case.quiet)
+            return _measured(log, first, events, self._timing, self._case)
 
     async def _settled(self, on: Any) -> _Steady:
         await on.hold(SETTLING)
@@ -251,18 +251,20 @@ def _id(one: Any) -> int:
 
 
 def _measured(
-    log: Log, first: _Steady, events: list[_Event], timing: Timing, last: int, quiet: int
+    log: Log, first: _Steady, events: list[_Event], timing: Timing, case: Case
 ) -> Outcome:
     """What was felt in a session, beside what was promised."""
-    until = events[-1].after.until if events else first.until
-    heard = {id: Heard.by(id, log, until) for id in range(last + 1 + quiet)}
+    until, last = events[-1].after.until if events else first.until, case.contents - 1
+    heard = {id: Heard.by(id, log, until) for id in range(case.contents + case.quiet)}
 
     def felt(steady: _Steady, id: int) -> float | None:
         if len(steady.served) > 1:
             return heard[id].contrast_db(steady.span)
         others = [each.key.id for each in steady.applied.contacts if each.key.id != id]
         leaks = [heard[each].foreign_db_sl(steady.span) for each in others]
-        return heard[id].own_db_sl(steady.span) - max(leaks) if leaks else None
+        if not leaks:
+            return None
+        return float((heard[id].own_db_sl(steady.span) - np.max(leaks, axis=0)).min())
 
     def pairs(steady: _Steady) -> list[tuple[float, float]]:
         both = [
@@ -284,15 +286,15 @@ def _measured(
             resting = [mover.contrast_db(each.span) for each in (event.before, event.after)]
             found.events[MOVES].append(mover.contrast_db(*event.path) - float(np.mean(resting)))
         else:
-            _note(event, found, heard, timing, last)
+            _note(event, found, heard, timing, case)
     return found
 
 
 def _note(
-    event: _Event, found: Outcome, heard: Mapping[int, Heard], timing: Timing, last: int
+    event: _Event, found: Outcome, heard: Mapping[int, Heard], timing: Timing, case: Case
 ) -> None:
     """Note the first 100 ms of an event at every finger, beside what was promised."""
-    span = event.time, event.time + FIRST
+    span, last = (event.time, event.time + FIRST), case.contents - 1
     after, before = event.after.promised, event.before.promised
     onset = -math.inf
     contents, promised_level = (
@@ -304,14 +306,15 @@ def _note(
         if _id(one) == last:
             contrast = timing.transient_contrast_db(one.layer, one.content.placement)
             if contrast is not None and promised_level is not None:
-                onset = promised_level - contrast
+                level = promised_level - contrast
+                onset = float(case.table.levels_by_set(level, one.layer.excitation).max())
     for id in event.after.served:
-        foreign = heard[id].foreign_db_sl(span, strongest=True)
+        foreign = float(heard[id].foreign_db_sl(span, strongest=True).max())
         promised = after[id].promised_contrast_db
-        own = heard[id].own_db_sl(span, strongest=True)
+        contrast = heard[id].contrast_db(span, strongest=True)
         if event.name == JOINS and promised is not None:
             kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"
-            found.events[kind].append(own - foreign - promised)
+            found.events[kind].append(contrast - promised)
         if id != last and id in event.before.served:
             steady = [each[id].foreign_level_db_sl for each in (before, after)]
             levels = [onset, max((each for each in steady if each is not None), default=-math.inf)]

@@ -193,7 +193,8 @@ class ContactStatus(Message):
     verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
         None,
         description="what a target feels: its own, mixed with the contents of others (promised "
-        "contrast below 12 dB), the content of another finger, or none",
+        "contrast below 12 dB, or these are felt beside one that pauses), the content of another "
+        "finger, or none",
     )
     frequency_hz: float | None = Field(
         None,
@@ -201,8 +202,13 @@ class ContactStatus(Message):
     )
     foreign_level_db_sl: float | None = Field(
         None,
-        description="of the contents of others there, which nine of ten plates do not exceed; "
-        "null where there are none",
+        description="of the contents of others there, which nine of ten plates do not exceed, by "
+        "the most sensitive thresholds; null where there are none",
+    )
+    is_foreign_felt: bool = Field(
+        False,
+        description="whether the contents of others may be felt there: foreign_level_db_sl is "
+        "above 0; beside a verdict own these are weaker by 12 dB or more",
     )
     leak_db_sl: float | None = Field(
         None,

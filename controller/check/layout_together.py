@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations, product, zip_longest
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -224,19 +224,19 @@ def _felt(
     lasting = [each for each in fingers if not each[1].is_short]
     short = [each for each in fingers if each[1].is_short]
     found: dict[ContactKey, tuple[float, str]] = {}
-    worst, leaks = math.inf, [-math.inf for _ in short]
+    worst, leaks = math.inf, list[Sequence[float]]()
     if lasting:
         quiet = [contact for contact, _ in short]
         together = _answered(simulator, lasting, quiet, protected)
         worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
         felt = together.fingers
-        leaks = [each.foreign_level_db_sl or -math.inf for each in felt[len(lasting) :]]
+        leaks = [*together.tones.foreign_db_sl[len(lasting) :]]
         for (contact, _), each in zip(lasting, felt, strict=False):
             found[contact.key] = each.promised_contrast_db or 0.0, each.verdict
     contacts = tuple(contact for contact, _ in fingers)
-    for one, level in zip(short, leaks, strict=True):
+    for one, levels in zip_longest(short, leaks):
         key = one[0].key
-        beside = Selection((), (), quiet_levels={key: level})
+        beside = Selection((), (), quiet_levels={key: levels} if levels else {})
         intended = Intention(contacts, (), (one,), protected or frozenset())
         requested = ChoiceRequest(intended, {}, (beside,))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]

@@ -90,6 +90,7 @@ def _loss(status: StatusResult) -> str | None:
 
 def _contact(contact: ContactStatus) -> str:
     """Format a finger and what it feels."""
+    is_own = contact.verdict == "own"
     details = _given(
         (" {:.1f} dB SL", contact.level_db_sl),
         (", at least {:.1f} dB over the others", contact.promised_contrast_db),
@@ -97,7 +98,8 @@ def _contact(contact: ContactStatus) -> str:
         (", effect {}", contact.effect),
         (", feels {}", None if contact.feels == contact.effect else contact.feels),
         (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),
-        (", {}", None if contact.verdict == "own" else contact.verdict),
+        (", {}", None if is_own else contact.verdict),
+        (", {}", "others faintly felt" if is_own and contact.is_foreign_felt else None),
         (": {}", contact.held_back),
         (", load {:.1f}", None if contact.load == 1 else contact.load),
     )

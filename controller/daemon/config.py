@@ -12,7 +12,7 @@ from controller.daemon.config_sections import (
     TouchSection,
 )
 from controller.effects.layout import SurfaceLayout, default_effects
-from controller.effects.layout_file import is_layout_document, load_layout
+from controller.effects.layout_file import is_layout_document, level_problem, load_layout
 from controller.effects.strengths import read_strengths
 from controller.process.socket_lock import check_socket_path
 from controller.sources.touch import (
@@ -194,6 +194,8 @@ def _layouts(
         except InputError as error:
             indented = str(error).replace("\n", "\n  ")
             validation.add(("layouts", name), f"invalid layout:\n    {indented}")
+    if not layouts and (problem := level_problem(level)):
+        validation.add(("level_db_sl",), problem)
     return layouts or {None: SurfaceLayout(effects=default_effects(level))}
 
 

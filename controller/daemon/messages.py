@@ -45,6 +45,7 @@ from drivers.protocol.table import (
     has_flag,
     name_of,
 )
+from model.answer.answer import is_felt
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import clock
@@ -194,15 +195,18 @@ def contact_status(
                     "verdict": felt.verdict,
                     "frequency_hz": felt.frequency,
                     "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
+                    "is_foreign_felt": felt.is_foreign_felt,
                     "held_back": felt.held_back,
                 }
     if isinstance(report, PlayReport) and any(each.key == contact.key for each in report.quiet):
         # Of several quiet contacts only the level of the loudest is known.
         is_known, one = len(report.quiet) == len(report.contents) == 1, report.felt
+        highest = max(report.quiet_levels.get(contact.key, ()), default=None)
         status |= {
             "role": "quiet",
             "level_db_sl": _quiet_level(one) if is_known and one is not None else None,
-            "foreign_level_db_sl": _finite(report.quiet_levels.get(contact.key)),
+            "foreign_level_db_sl": _finite(highest),
+            "is_foreign_felt": is_felt(highest),
         }
     return ContactStatus.model_validate(status)
 

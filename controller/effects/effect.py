@@ -19,6 +19,9 @@ NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
 
 MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
+DEFAULT_MAX_DB_SL = 40.0
+"""Highest level of a layout that does not raise it [dB SL]; that of any is MAX_DB_SL."""
+
 _DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
 
 

@@ -6,14 +6,21 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from controller.effects.effect import Effect, Level, TunedSection
+from controller.effects.effect import (
+    DEFAULT_MAX_DB_SL,
+    MAX_DB_SL,
+    Effect,
+    Level,
+    TunedSection,
+)
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region
 from model.config.document import Document, KeyPath, read_document
 from model.config.kinds import CheckedFile, ConfigKind
-from model.config.sections import Section, Validation
+from model.config.sections import Quantity, Section, Validation
 from model.config.shapes import ShapedSection
+from model.config.units import LEVEL
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.key_types import Identifier
@@ -21,6 +28,9 @@ from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
+
+
+_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)]
 
 
 class RegionSection(ShapedSection, TunedSection):
@@ -46,6 +56,7 @@ class LayoutSection(Section):
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
     elsewhere: Identifier | None = BUZZ
+    max_level_db_sl: _HighestLevel = DEFAULT_MAX_DB_SL
 
 
 def load_layout(
@@ -69,6 +80,7 @@ def layout_of(
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
     _check_use(validation, ("elsewhere",), elsewhere, effects, is_for_motion=None)
+    _check_levels(validation, effects)
     section = validation.finish()
     return SurfaceLayout(
         regions=tuple(_region(name, region) for name, region in section.regions.items()),
@@ -79,7 +91,7 @@ def layout_of(
 
 def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
-    own = {"effects", "regions", "elsewhere"}
+    own = LayoutSection.model_fields.keys()
     return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
 
 
@@ -142,6 +154,34 @@ def _check_region(
     for key, is_for_motion in (("on_press", False), ("on_move", True), ("on_release", False)):
         name = getattr(region, key)
         _check_use(validation, (*path, key), name, effects, is_for_motion=is_for_motion)
+
+
+def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effect | None]) -> None:
+    """Check that no level is above the highest one of the layout."""
+    highest = validation.field(("max_level_db_sl",), LayoutSection)
+    levels: dict[KeyPath, float] = {
+        ("effects", name): effect.max_db_sl(effect.level_db_sl)
+        for name, effect in effects.items()
+        if effect is not None and effect.level_db_sl is not None
+    }
+    for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
+        region = validation.part(("regions", name), RegionSection)
+        if region is not None and isinstance(region.level, float):
+            levels["regions", name, "level"] = region.level
+    for path, level in levels.items():
+        if problem := level_problem(level, highest):
+            validation.add(path, problem)
+
+
+def level_problem(level_db_sl: float, highest: float | None = None) -> str | None:
+    """Return why a level [dB SL] is too high for a layout; highest: None for the default."""
+    highest = DEFAULT_MAX_DB_SL if highest is None else highest
+    if level_db_sl <= highest:
+        return None
+    return (
+        f"level must be up to {highest:g} dB SL, got {level_db_sl:g}; lower it, or raise "
+        "max_level_db_sl of the layout"
+    )
 
 
 def _check_use(

@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Selection, Targets, not_served
 from controller.play.intent import Target
@@ -21,7 +23,7 @@ from controller.play.joint_answer import (
     selection_of,
 )
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import Answer, amplitudes_of, verdict_of
+from model.answer.answer import Answer, amplitudes_of
 from model.answer.strength import scaled
 from model.choice import NEARLY
 from model.errors import InputError
@@ -178,7 +180,7 @@ class Chooser:
                 is_in_phase=is_long,
             )
             if beside:
-                found = _beside(intended, found, beside)
+                found = _beside(table, intended, found, beside)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
@@ -189,10 +191,10 @@ class Chooser:
         return found
 
 
-def sum_db(levels: Iterable[float]) -> float:
-    """Return the level of powers that add up [dB]."""
-    power = sum([10 ** (level / 10) for level in levels])
-    return 10 * math.log10(power) if power else -math.inf
+def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:
+    """Return the levels of powers that add up [dB], by set of thresholds."""
+    powers = [sum([10 ** (level / 10) for level in each]) for each in zip(*levels, strict=True)]
+    return [10 * math.log10(power) if power else -math.inf for power in powers]
 
 
 def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
@@ -225,27 +227,25 @@ def _alike(found: Answer, target: Target) -> Answer:
     return scaled(found, -excess) if excess > 0 else found
 
 
-def _beside(intended: Intention, found: Selection, beside: Sequence[Selection]) -> Selection:
+def _beside(
+    table: LocalizationTable, intended: Intention, found: Selection, beside: Sequence[Selection]
+) -> Selection:
     """Return what was chosen for a pulse with what its finger feels of others besides."""
     ((contact, _),) = found.targets
-    heard = [each.quiet_levels[contact.key] for each in beside if contact.key in each.quiet_levels]
+    heard = [known for each in beside if (known := each.quiet_levels.get(contact.key))]
     if not found.contents:
         is_used_up = bool(_contents(beside)) and found.reason == LIMITS_LEAVE_NOTHING
         return silent(intended, found.targets, _USED_UP) if is_used_up else found
     if not heard:
         return found
-    (content,), others = found.contents, sum_db(heard)
+    (content,), others = found.contents, np.array(sums_db(heard))
     (felt,) = content.predictions
     promised = felt.promised_contrast_db
     level = -math.inf if felt.level_db_sl is None else felt.level_db_sl
-    promised = min(math.inf if promised is None else promised, level - others)
-    felt = replace(
-        felt,
-        promised_contrast_db=promised,
-        foreign_level_db_sl=others,
-        verdict=verdict_of(promised),
-    )
-    return replace(found, contents=(replace(content, predictions=(felt,)),))
+    levels = table.levels_by_set(level, content.layer.excitation)
+    promised = min(math.inf if promised is None else promised, float((levels - others).min()))
+    felt = replace(felt, promised_contrast_db=promised, foreign_level_db_sl=float(others.max()))
+    return replace(found, contents=(replace(content, predictions=(felt.judged(),)),))
 
 
 def _contents(parts: Iterable[Selection]) -> list[Content]:

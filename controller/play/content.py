@@ -9,7 +9,7 @@ import numpy as np
 
 from controller.play.intent import Gains, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, verdict_of
+from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
 from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
@@ -31,7 +31,7 @@ class Prediction:
     of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of
     others' contents here, which nine of ten plates do not exceed. None where there is nothing to
     compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
-    nominal_db_sl: its level on the plate as modelled.
+    nominal_db_sl: its level on the plate as modelled; pauses: whether it ends, or comes and goes.
     """
 
     contact: Contact
@@ -44,6 +44,21 @@ class Prediction:
     frequency: float | None = None
     content: str | None = None
     nominal_db_sl: float | None = None
+    pauses: bool = False
+
+    @property
+    def is_foreign_felt(self) -> bool:
+        """Whether others' contents may be felt here."""
+        return is_felt(self.foreign_level_db_sl)
+
+    def judged(self) -> "Prediction":
+        """Return it with the verdict that its figures give where it feels a content of its own."""
+        if self.verdict not in (OWN, MIXED):
+            return self
+        verdict = verdict_of(
+            self.promised_contrast_db, self.foreign_level_db_sl, pauses=self.pauses
+        )
+        return replace(self, verdict=verdict)
 
     def weakened(self, gain_db: float, others_db: float) -> "Prediction":
         """Return it with a gain [dB]; others_db: at most on others' contents.
@@ -69,11 +84,7 @@ class Prediction:
                 verdict=HELD_BACK,
                 held_back=f"a strength of {gain_db:g} dB leaves it below the threshold; raise it",
             )
-        return (
-            replace(found, verdict=verdict_of(found.promised_contrast_db))
-            if self.verdict in (OWN, MIXED)
-            else found
-        )
+        return found.judged()
 
 
 @dataclass(frozen=True)
@@ -106,8 +117,8 @@ class Selection:
     targets, quiet: contacts as they were when the contents were chosen, targets with their
     intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
     contents of some targets are still being chosen. quiet_levels [dB SL]: what quiet contacts feel
-    of the contents, which nine of ten plates do not exceed; protected: contacts that must not
-    notice those of others.
+    of the contents by each set of thresholds, which nine of ten plates do not exceed; protected:
+    contacts that must not notice those of others.
     """
 
     targets: Targets
@@ -116,7 +127,7 @@ class Selection:
     reason: str | None = None
     not_served: tuple[Prediction, ...] = ()
     is_pending: bool = False
-    quiet_levels: Mapping[ContactKey, float] = field(default_factory=dict)
+    quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
     protected: frozenset[ContactKey] = frozenset()
 
     @cached_property
@@ -174,7 +185,10 @@ class Selection:
                     gain_db=gain,
                 )
             )
-        levels = {key: level + max(gains.values()) for key, level in self.quiet_levels.items()}
+        loudest = max(gains.values(), default=0.0)
+        levels = {
+            key: [level + loudest for level in by_set] for key, by_set in self.quiet_levels.items()
+        }
         return replace(self, contents=tuple(contents), quiet_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":

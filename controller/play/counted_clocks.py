@@ -44,10 +44,10 @@ class CountedClocks:
     def is_one_lost(self) -> bool:
         """Whether a clock is held no longer to those with which its amplifier shares contents."""
         known = self._now() if self.errors else {}
-        return any(
-            error > counted and MARGIN * error > MAX_HELD >= counted
-            for counted, error in ((self.errors[name], known[name]) for name in self.errors)
-        )
+        for name, counted in self.errors.items():  # with each plan: no further calls
+            if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
+                return True
+        return False
 
     def _is_other(self, known: Mapping[str, float]) -> bool:
         """Whether a clock is worse than counted, or one far better."""

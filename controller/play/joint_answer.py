@@ -152,9 +152,9 @@ def selection_of(
                     () if voice else _predictions(own, sensations, layer),
                 )
             )
-    quiet_levels: dict[ContactKey, float] = {}
-    for contact, level in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True):
-        quiet_levels[contact.key] = -math.inf if math.isnan(level) else level
+    quiet_levels: dict[ContactKey, list[float]] = {}
+    for contact, by_set in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True):
+        quiet_levels[contact.key] = [-math.inf if math.isnan(each) else each for each in by_set]
     return Selection(
         tuple(targets),
         tuple(quiet),
@@ -296,7 +296,7 @@ def _predictions(
         "apart"
     )
     predictions: list[Prediction] = []
-    for (contact, _), felt in zip(targets, sensations, strict=True):
+    for (contact, target), felt in zip(targets, sensations, strict=True):
         predictions.append(
             Prediction(
                 contact,
@@ -309,7 +309,8 @@ def _predictions(
                 layer.frequency,
                 own.content,
                 felt.level_db_sl,
-            )
+                pauses=felt.pauses or target.pulse is not None,
+            ).judged()
         )
     return tuple(predictions)
 

@@ -1,6 +1,6 @@
 """Reports of the control loop to a demo, a log or a dashboard."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -30,7 +30,7 @@ class PlayReport:
     contacts: tuple[Contact, ...]
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
-    quiet_levels: Mapping[ContactKey, float]
+    quiet_levels: Mapping[ContactKey, Sequence[float]]
     contents: Mapping[int, LayerContent]
     latency: float | None
     time: float

@@ -18,7 +18,7 @@ from controller.play.chooser import (
     Chooser,
     Intention,
     is_alone,
-    sum_db,
+    sums_db,
     unanswered,
 )
 from controller.play.content import (
@@ -320,7 +320,7 @@ def _together(
         next(iter(reasons), None) if targets else reason,
         (*[each for part in chosen for each in part.not_served], *skipped),
         quiet_levels={
-            each.key: sum_db(level[each.key] for level in levels if each.key in level)
+            each.key: sums_db([known for level in levels if (known := level.get(each.key))])
             for each in quiet
         },
     )

@@ -138,8 +138,7 @@ class Amplifier(Dialogue):
         self.identity, self.capabilities = identity, can
         self._times.clear()
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
-        self.status_time = self.line.wire.transit(status_words)
-        self.clock.stated = can["clock_error"]
+        self.clock.identified(can["clock_error"], bits=self.line.wire.transit(status_words))
         self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()

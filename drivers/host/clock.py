@@ -15,11 +15,10 @@ clock that cannot be steered or is not to be trusted has an infinite error, and 
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, ahead, clock_at
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, SPAN
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
@@ -42,6 +41,7 @@ _UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _COMMON = 0.1  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
+_STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
 
 
@@ -57,20 +57,17 @@ class _Line(NamedTuple):
 
 
 class HeldClock:
-    """The clock of an amplifier, by its messages; times [s] are of the host's clock.
-
-    stated: its `clock_error` as of the wire, known once it is identified.
-    """
+    """The clock of an amplifier, by its messages; times [s] are of the host's clock."""
 
     def __init__(self) -> None:
-        self.stated = CLOCK_UNKNOWN
+        self.identified(CLOCK_UNKNOWN, bits=0.0)
         self.shortest = math.inf
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self.marked_from = math.inf
         """Since when [s] only Marks are read, see `read_marks`."""
-        self._rate = 0
+        self._pace = 0.0  # seconds a second, by the rate of a Ping
         self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
         self._marks = 0  # since a Status, which may show any of them
         self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
@@ -86,16 +83,17 @@ class HeldClock:
         self._part_ends = -math.inf
         self._least_delay = math.inf  # s; by which a request may have come late, of the promptest
         self._line = _Line(time)
-        self._added, self._added_at = 0.0, time  # s; by shifts and rates, until a time
+        self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
 
-    @property
-    def can_be_steered(self) -> bool:
-        """Whether it obeys shift and rate, as it states."""
-        return self.stated != CLOCK_UNKNOWN
+    def identified(self, stated: int, *, bits: float) -> None:
+        """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
+        self.stated, self.can_be_steered, self._bits = stated, stated != CLOCK_UNKNOWN, bits
 
     def lead(self, time: float) -> float:
         """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
-        return math.remainder(self._unsteered(time) + self._added_until(time), CLOCK_TURN)
+        line = self._line
+        unsteered = line.lead + line.rate * (time - line.time)
+        return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its lead as it is read [s]; infinite before that."""
@@ -133,7 +131,7 @@ class HeldClock:
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
         if not self.can_be_steered or time - self._jumped_at < CLOCK_SETTLING:
-            return self._rate
+            return round(self._pace * _PER_RATE)
         lead, error = self.lead(time), self._line.error
         if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
             self._near_at = time
@@ -160,10 +158,8 @@ class HeldClock:
         elif name == "Ping":
             self._pinged = (self._pinged[0] if self._pinged else arrives), arrives
 
-    def replied(
-        self, name: str, values: Values, status: Values, received: float, *, bits: float
-    ) -> None:
-        """Note a Status that replies to a request at a time [s]; bits [s]: its own time."""
+    def replied(self, name: str, values: Values, status: Values, received: float) -> None:
+        """Note a Status that replies to a request at a time [s]."""
         if self.is_alone:
             return
         (sent, arrives), marks, self._marks = self._requested, self._marks, 0
@@ -171,13 +167,12 @@ class HeldClock:
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and self._is_armed:
-            steps = (values["shift"] + HIGH_WORDS // 2) % HIGH_WORDS - HIGH_WORDS // 2
-            self._added += steps * HIGH_TIME
+            self._added += values["shift"] * HIGH_TIME
             self._near_at = time
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0
-        self.shortest = min(self.shortest, max(received - time - bits, 0.0))
+        self.shortest = min(self.shortest, max(received - time - self._bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
         is_kept = (self._pinged is None or name == "Ping") and (
             marks == 1 or received < self.marked_from
@@ -188,12 +183,10 @@ class HeldClock:
             if not is_kept:  # until the first that counts
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:
-            rate = values["rate"] if self._is_armed else 0
-            if rate != self._rate:  # of several attempts any may have been the first heard
-                since = sum(self._pinged or (time, time)) / 2
-                self._added, self._added_at = self._added_until(since), since
-                self._rate = rate
-            self._pinged = None
+            pace = values["rate"] / _PER_RATE if self._is_armed else 0.0
+            since = sum(self._pinged or (time, time)) / 2  # any attempt may be the first heard
+            self._added += (self._pace - pace) * since
+            self._pace, self._pinged = pace, None
 
     def _read(
         self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
@@ -202,18 +195,19 @@ class HeldClock:
 
         is_reported: whether a jump is said, since no restart explains it.
         """
-        lead = self._unsteered(time)
-        off = ahead(clock, clock_at(time + lead + self._added_until(time)))
+        line, shown = self._line, clock * _STEP - time - self._added - self._pace * time
+        lead = line.lead + line.rate * (time - line.time)
+        off = math.remainder(shown - lead, CLOCK_TURN)
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
         if not -far <= off <= later + far:  # else what delayed all that was read has ended
             if is_reported and not -far - earlier <= off <= later + far:
                 self._jumped_at = time
             self._forget(time)
-            lead, off = 0.0, ahead(clock, clock_at(time))
+            lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
         self._least_delay = min(self._least_delay, later)
         if self._lowest and time < self._part_ends:
             before, low = self._lowest[-1]
-            if lead + off >= low + self._line.rate * (time - before):
+            if lead + off >= low + line.rate * (time - before) - _STEP / 2:  # as it is rounded
                 return
             self._lowest.pop()
         else:
@@ -228,10 +222,11 @@ class HeldClock:
 
         What is likely of crystals counts as if it were measured, too.
         """
-        lowest, (_, _, rate, bend, _, _) = self._lowest, self._line
-        count = max(len(lowest) // 2, min(len(lowest), 2))
-        for _ in range(_ROUNDS):
-            above = sorted(_brought(lowest, time, rate, bend))[:count]
+        rate, bend = self._line.rate, self._line.bend
+        aged = [(time - at, lead) for at, lead in self._lowest]
+        count = max(len(aged) // 2, min(len(aged), 2))
+        for _ in range(_ROUNDS):  # what leads are at that time
+            above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])[:count]
             mean = middle = breadth = scatter = slope = curve = wide = 0.0
             for high, age in above:
                 mean, middle = mean + high / count, middle + age / count
@@ -257,27 +252,12 @@ class HeldClock:
         error = _ERRORS * math.sqrt(scatter * known)
         if count <= _FEW:
             error = max(error, self._least_delay / math.sqrt(12))
-        off = min(_brought(lowest[-_RECENT:], time, rate, bend))[0] - lead
+        off = min([high + (rate - bend * age) * age for age, high in aged[-_RECENT:]]) - lead
         if off > _FAR + _FAR_ERRORS * error:
-            del lowest[:-_RECENT]
+            del self._lowest[:-_RECENT]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
 
     def _is_by_marks(self, time: float) -> bool:
         """Whether all that is kept was read by Marks, for as long as readings count."""
         known = time - self._lowest[0][0] if self._lowest else 0.0
         return self.marked_from < math.inf and known > WINDOW - 2 * _MAX_PART
-
-    def _unsteered(self, time: float) -> float:
-        line = self._line
-        return line.lead + line.rate * (time - line.time)
-
-    def _added_until(self, time: float) -> float:
-        return self._added + self._rate / _PER_RATE * (time - self._added_at)
-
-
-def _brought(
-    leads: Sequence[tuple[float, float]], time: float, rate: float, bend: float
-) -> list[tuple[float, float]]:
-    """Return what leads are at a time [s] by a rate and its bend, and how old they are [s]."""
-    ages = [(time - at, lead) for at, lead in leads]
-    return [(lead + (rate - bend * age) * age, age) for age, lead in ages]

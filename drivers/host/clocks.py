@@ -10,7 +10,6 @@ import asyncio
 import math
 import re
 from collections.abc import Mapping, Sequence
-from functools import cache
 from statistics import median
 from typing import Any
 
@@ -18,6 +17,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.clock import COMMON_AFTER
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
+from drivers.host.members import Members
 from drivers.protocol.table import has_feature
 from drivers.protocol.timing import HEARTBEAT
 
@@ -29,12 +29,20 @@ _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
 
 class Clocks:
-    """The clocks of amplifiers by name, whose lines are open."""
+    """The clocks of the amplifiers of a group, whose lines are open."""
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        self._amplifiers = amplifiers
+    def __init__(self, members: Members) -> None:
+        self._members, self._amplifiers = members, members.amplifiers
+        self._are_alike = True  # and so are their lines
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+
+    def follow(self) -> None:
+        """Know all from now on: one alone, or by which lines and amplifiers they differ."""
+        every = self._amplifiers.values()
+        self._are_alike = len({_kind(each) for each in every}) == 1
+        for each in every:
+            each.clock.is_alone = len(every) == 1
 
     @property
     def errors(self) -> Mapping[str, float]:
@@ -53,11 +61,10 @@ class Clocks:
         if len({each.line for each in amplifiers}) == 1 and now - marked_from > COMMON_AFTER:
             held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
             common = median([each.lead(now) for each in held] or [0.0])
-        is_alike = len({_kind(each) for each in amplifiers}) == 1
         return {
             name: math.hypot(
                 each.clock.error(now, common=common),
-                0.0 if is_alike else each.clock.shortest / 2,
+                0.0 if self._are_alike else each.clock.shortest / 2,
             )
             for name, each in every.items()
         }
@@ -73,7 +80,8 @@ class Clocks:
         now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
             if of_line[0].clock.marked_from < now:
-                loop.call_later(self._later(_INTERVAL), _mark, line)
+                later = self.later(_INTERVAL)
+                loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
             unmarked.append((line, of_line))
             for each in of_line:
@@ -87,52 +95,31 @@ class Clocks:
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
-                takes = sum([_takes(each) for each in of_line])
-                interval = max(least, takes / _MAX_LOAD)
+                takes = [each.exchange_time("GetStatus") for each in of_line]
+                shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+                interval = max(least, sum(map(max, takes, shown)) / _MAX_LOAD)
                 for number in range(1, int(HEARTBEAT / interval)):
-                    loop.call_later(self._later(number * interval), self._read, of_line)
+                    loop.call_later(self.later(number * interval), self._read, of_line)
 
-    def dither(self) -> float:
-        """Return by how much later [s] an amplifier is fed whose heartbeats alone are readings."""
-        return 0.0 if len(self._amplifiers) == 1 else self._later(0.0)
-
-    def _later(self, duration: float) -> float:
+    def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] and some of a frame."""
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME
 
     def _read(self, amplifiers: Sequence[Amplifier]) -> None:
         """Read the statuses of amplifiers that reply, can be steered and are not being read."""
+        if self._members.has_joint_set:
+            return
         for each in amplifiers:
             reading = self._readings.get(each)
             is_free = each.clock.can_be_steered and (reading is None or reading.done())
-            is_free = is_free and not each.line.has_set
             if is_free and each.silence_cause is None and each.line.loss is None:
                 self._readings[each] = each.read_status(Priority.READING)
 
 
-def _takes(amplifier: Amplifier) -> float:
-    """Return how long a reading of an amplifier keeps its line [s], as its last exchange shows."""
-    return max(amplifier.exchange_time("GetStatus"), amplifier.counts.last_round_trip or 0.0)
-
-
-def _mark(line: Line) -> None:
-    """Have all amplifiers of a line keep their clocks, for their next statuses."""
-    line.submit(None, Priority.HEARTBEAT, "Mark", {})
-
-
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
     """Return what amplifiers and lines have in common whose requests are as late at the least."""
-    line, identity = amplifier.line, amplifier.identity
-    return (
-        type(line.wire),
-        _device(line.name),
-        *(identity.get(each) for each in ("vendor", "product", "firmware")),
-    )
-
-
-@cache
-def _device(line: str) -> str:
-    """Return the name of the device of a line without its number; empty for a network."""
-    device = re.match(r"/.*/(\D*)", line)
-    return device[1] if device else ""
+    line, of = amplifier.line, amplifier.identity
+    device = re.match(r"/.*/(\D*)", line.name)  # without its number; none for a network
+    made = of.get("vendor"), of.get("product"), of.get("firmware")
+    return type(line.wire), device and device[1], made

@@ -80,13 +80,12 @@ _logger = logging.getLogger(__name__)
 class Staged:
     """A set that an amplifier has staged, or plays at once: as the wire has it.
 
-    is_exact: to the word; since, until: when [s] it was admitted, and must have been committed.
+    is_exact: to the word; until: when [s] it must have been committed.
     """
 
     token: int
     layers: tuple[LayerSet, ...]
     is_exact: bool
-    since: float
     until: float
 
 
@@ -123,8 +122,6 @@ class Dialogue:
         """What it may play by what is known beside its statuses and what fed it."""
         self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
-        self.status_time = 0.0
-        """How long its Status takes on the wire [s], known once it is identified."""
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -213,7 +210,7 @@ class Dialogue:
             delay, checked = self._check(layers, moment)
         (admitted, stream), self._checked = checked, _UNCHECKED
         messages = parts(stream, session=self.session, token=token, now=now)
-        self._admitted = Staged(token, admitted, True, since=moment, until=moment + delay)
+        self._admitted = Staged(token, admitted, True, until=moment + delay)
         return self._admitted, messages
 
     def refusal_of(self, layers: Sequence[Layer]) -> CommandRefused | None:
@@ -359,7 +356,7 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        self.clock.replied(name, values, reply, now, bits=self.status_time)
+        self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds

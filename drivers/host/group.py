@@ -72,7 +72,7 @@ class Group:
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
         """What they play together."""
-        self._clocks = Clocks(self.amplifiers)
+        self._clocks = Clocks(self.members)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog, self._draw = watchdog, draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
@@ -104,6 +104,7 @@ class Group:
         await self._all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
+        self._clocks.follow()
         self._heartbeats.follow()
         # Each amplifier says itself what it has latched before.
         self.state = GroupState.DISARMED if members.epoch == before else GroupState.STOPPED

@@ -45,10 +45,8 @@ class Heartbeats:
         self._readings: dict[Amplifier, asyncio.Future[Values]] = {}  # of those that are mute
 
     def follow(self) -> None:
-        """Know all from now on: one alone, and those of a line, who are fed ahead of one's sets."""
+        """Know those of a line from now on, who are fed ahead of one's sets."""
         every = self._members.amplifiers.values()
-        for each in every:
-            each.clock.is_alone = len(every) == 1
         for line in {each.line for each in every}:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
@@ -102,9 +100,10 @@ class Heartbeats:
                 all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
                 may_read = not is_late and all_of_line <= HEARTBEAT
                 reading = each.read_status(Priority.HEARTBEAT)
-                feed = partial(self._read_and_feed, each, self._members.epoch, reading)
-            elif is_late and (later := self._clocks.dither()):
-                feed = partial(self._feed_later, each.ping, self._members.epoch, later)
+                feed = partial(self._feed_after, each, self._members.epoch, reading)
+            elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
+                pause = asyncio.sleep(self._clocks.later())
+                feed = partial(self._feed_after, each, self._members.epoch, pause)
             # A late line feeds all again ahead of each: after that the last one's status tells.
             feeds.append((-due if is_late else 0.0, feed))
         return feeds
@@ -116,18 +115,13 @@ class Heartbeats:
             self._sets.token = token_after(self._sets.token)
         return committed or self._sets.token
 
-    async def _read_and_feed(
-        self, amplifier: Amplifier, before: int, reading: "asyncio.Future[Values]"
+    async def _feed_after(
+        self, amplifier: Amplifier, before: int, awaited: Awaitable[object]
     ) -> Values:
-        await reading
+        """Feed one after a reading or a pause, unless a stop or disarm came since an epoch."""
+        await awaited
         self._members.check_none_since(before)
         return await amplifier.ping()
-
-    async def _feed_later(self, feed: Feed, before: int, later: float) -> object:
-        """Feed after a time [s], unless a stop or disarm has come since an epoch."""
-        await asyncio.sleep(later)
-        self._members.check_none_since(before)
-        return await feed()
 
     def _listen(self, amplifier: Amplifier) -> None:
         """Read the status of one that is mute, until it replies or is lost."""

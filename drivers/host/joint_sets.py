@@ -24,7 +24,7 @@ from drivers.playing.contents import Layer
 from drivers.protocol.clock import moment_behind
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
-from drivers.protocol.table import LATCHED, MESSAGES, STATES, name_of
+from drivers.protocol.table import LATCHED, STATES, name_of
 from drivers.protocol.timing import STOP_RAMP
 from registry import clock
 
@@ -32,7 +32,6 @@ INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
 _MAX_GAP = 1 << 14
 _SPAN = 1 << 16
-_COMMIT_WORDS = MESSAGES["Commit"].request.words
 
 
 @dataclass(frozen=True)
@@ -86,13 +85,11 @@ class JointSets:
         Overtaken where it is preempted before that.
         """
         lines = {self._members.amplifiers[name].line for name in layers}
+        self._members.has_joint_set = len(lines) > 1
         try:
-            for line in lines:
-                line.has_set = len(lines) > 1
             return await self._play(layers, is_preempted)
         finally:
-            for line in lines:
-                line.has_set = False
+            self._members.has_joint_set = False
 
     async def _play(
         self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
@@ -183,21 +180,22 @@ class JointSets:
         moment: float | None = None  # at once
         if len(by_line) > 1:
             await _freed([*by_line], until=min([one.until for one in staged.values()]))
-            moment = moment_behind(max([line.arrival(_COMMIT_WORDS) for line in by_line]))
+            moment = moment_behind(max([line.commit_arrives() for line in by_line]))
         for each in staged:
             each.starts = -math.inf if moment is None else moment
+        if moment is None:
+            words = dict.fromkeys(staged, word_passed_by_all(clock.now(), [*staged]))
+        else:
+            words = words_of(moment, [*staged])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
-            if moment is None:
-                words = [word_passed_by_all(clock.now(), sharing)] * len(sharing)
-            else:
-                words = words_of(moment, sharing)
-            if len(sharing) == 1 or len({*words}) > 1:  # that of a clock which is not steered
-                for each, at in zip(sharing, words, strict=True):
-                    requests[each] = each.commit(token, at)
+            at = words[sharing[0]]
+            if len(sharing) == 1 or any(words[each] != at for each in sharing):
+                for each in sharing:  # alone, or with a clock that is not steered
+                    requests[each] = each.commit(token, words[each])
                 continue
-            make = partial(_commit_of, sharing, token, words[0])
+            make = partial(_commit_of, sharing, token, at)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for each in sharing:  # by a heartbeat: where replies are late the watchdogs run
                 requests[each] = each.ping()

@@ -17,7 +17,7 @@ from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
 from drivers.ports.port import OpenPort
 from drivers.protocol.records import Values
-from drivers.protocol.table import BROADCAST, REACTION
+from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.protocol.timing import ATTEMPTS, FAST, REPLY_TIMEOUT
 from drivers.trace import Direction
 from drivers.wires.wire import (
@@ -45,6 +45,7 @@ An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
 _MAX_COMMIT_LATE = 0.003  # s; frames of USB at full speed, 1 ms, of port, hub and adapter
+_COMMIT_WORDS = MESSAGES["Commit"].request.words
 _SENDING = 0.0005  # s; until this process has written to all lines
 _DELAYS = 4  # of this process that prolong the wait for one reply
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
@@ -74,11 +75,8 @@ class Line:
         """The clock of the line [s]."""
         self._boot_time, self._boots_until = boot_time, -math.inf
         self._is_pumping = False
-        self._transits: dict[int, float] = {}  # of requests, by their words
         self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
-        self.has_set = False
-        """Whether it has a set that several lines are to play: no clock is read meanwhile."""
         self.late = 0.0
         """By how much later [s] than the wire takes replies have come, at most `MAX_LATE`."""
 
@@ -127,17 +125,15 @@ class Line:
         """The result of the request on the line, which a set waits for; None if it is free."""
         return None if self._current is None else self._current.result
 
-    def arrival(self, words: int) -> float:
-        """Return by when [s] a request of so many words arrives that is sent next.
+    def commit_arrives(self) -> float:
+        """Return by when [s] a commit arrives that is sent next.
 
         As late as replies have come, by three frames of USB at the most. One that is lost is not
         waited for: it is repeated 30 ms later.
         """
-        takes = self._transits.get(words)
-        if takes is None:
-            takes = self._transits[words] = self.wire.transit(words)
-        free = max(self.time(), self._free_at, self._sent_until)
-        return free + takes + min(self.late, _MAX_COMMIT_LATE) + _SENDING
+        begins = max(self.time(), self._free_at, self._sent_until)
+        late = min(self.late, _MAX_COMMIT_LATE) + _SENDING
+        return begins + self.wire.transit(_COMMIT_WORDS) + late
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""

@@ -30,6 +30,8 @@ class Members:
         self.amplifiers = dict(amplifiers)
         self.epoch = 0
         """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
+        self.has_joint_set = False
+        """Whether they have a set that several lines are to play: no clock is read meanwhile."""
         self.gives_up_at = math.inf
         """When [s] nothing is repeated any more, since all is being closed."""
         self.silencing: set[asyncio.Future[Any]] = set()

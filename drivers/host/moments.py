@@ -5,6 +5,7 @@ word that names a moment to it is another, and what has passed for others may be
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 from drivers.host.dialogue import Dialogue
 from drivers.protocol.clock import (
@@ -18,16 +19,17 @@ from drivers.protocol.clock import (
 from drivers.protocol.table import AHEAD_MAX
 
 _COMMITTING = 0.1  # s; within which a commit arrives
+_Amplifier = TypeVar("_Amplifier", bound=Dialogue)
 _STEP = AHEAD_MAX // 2  # from a high word that is tried to the next
 
 
-def words_of(moment: float, amplifiers: Sequence[Dialogue]) -> list[int]:
+def words_of(moment: float, amplifiers: Sequence[_Amplifier]) -> dict[_Amplifier, int]:
     """Return the high words of the clocks of amplifiers at a moment [s], the nearest ones."""
     word = high_word(clock_at(moment + HIGH_TIME / 2))
-    return [
-        word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
+    return {
+        each: word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
         for each in amplifiers
-    ]
+    }
 
 
 def word_passed_by_all(now: float, amplifiers: Sequence[Dialogue]) -> int:

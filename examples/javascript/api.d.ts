@@ -420,12 +420,14 @@ export interface ContactStatus {
   effect?: string | null;
   /** the effect that it feels: its own, or that of another finger */
   feels?: string | null;
-  /** what a target feels: its own, mixed with the contents of others (promised contrast below 12 dB), the content of another finger, or none */
+  /** what a target feels: its own, mixed with the contents of others (promised contrast below 12 dB, or these are felt beside one that pauses), the content of another finger, or none */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
   /** of what it feels, as asked for, which amplifiers may round; null for several */
   frequency_hz?: number | null;
-  /** of the contents of others there, which nine of ten plates do not exceed; null where there are none */
+  /** of the contents of others there, which nine of ten plates do not exceed, by the most sensitive thresholds; null where there are none */
   foreign_level_db_sl?: number | null;
+  /** whether the contents of others may be felt there: foreign_level_db_sl is above 0; beside a verdict own these are weaker by 12 dB or more */
+  is_foreign_felt?: boolean;
   /** of the contents of others where it is now, on the nominal plate: more than promised while it moves; in the status only, null where there are none */
   leak_db_sl?: number | null;
   /** why it does not feel an effect of its own; null if it does */

@@ -41,15 +41,19 @@ class Sensation:
     Promised measures are those that nine of ten plates within the rig's uncertainty reach, or do
     not exceed; the others those of the plate as modelled, with the fingers on it.
 
-    - verdict: `own`, `mixed` (below OWN_CONTRAST_DB), `shared` (the vibration of another finger),
-      `held back`, with the contrast that it would have had, or `quiet`
+    - verdict: `own`, `mixed` (below OWN_CONTRAST_DB, or what pauses beside others that are felt),
+      `shared` (the vibration of another finger), `held back`, with the contrast that it would have
+      had, or `quiet`
     - layer: number of the layer that plays it, None without one
     - level_db_sl, promised_level_db_sl: of its stimulus, over the duration if that is limited
     - contrast_db, median_contrast_db, promised_contrast_db: its level above that of all other
       vibrations here, or of an only one above its own at the loudest quiet finger; of a quiet
       finger the weakest vibration at its own finger above all of them here. As modelled, of half
-      and of nine of ten plates; None where there is nothing to compare with
-    - foreign_level_db_sl: of all other vibrations here, promised, not nominal as level_db_sl
+      and of nine of ten plates, each the least over the rig's sets of thresholds; None where there
+      is nothing to compare with
+    - foreign_level_db_sl: of all other vibrations here, promised, not nominal as level_db_sl: the
+      greatest over the sets
+    - pauses: whether it ends, or comes and goes
     - lowered_db: by how much it is weaker than its stimulus asks
     - is_disturbing: whether it is held back because of a finger's max_foreign_db_sl
     """
@@ -65,6 +69,12 @@ class Sensation:
     foreign_level_db_sl: float | None = None
     lowered_db: float = 0.0
     is_disturbing: bool = False
+    pauses: bool = False
+
+    @property
+    def is_foreign_felt(self) -> bool:
+        """Whether other vibrations here may be felt."""
+        return is_felt(self.foreign_level_db_sl)
 
 
 @dataclass(frozen=True)
@@ -180,17 +190,19 @@ class Answer:
         """What each finger gets, in the order in which they were given."""
         found, tones = dict[int, Sensation](), self.tones
         known = [  # None for what there is not
-            [None if each != each else each for each in (*contrasts, of_others)]
+            [None if each != each else each for each in (*contrasts, max(of_others))]
             for contrasts, of_others in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
         ]
         for number, stream in enumerate(self.contents.streams):
-            lowered = self.lowered_db(number)
+            lowered, pauses = self.lowered_db(number), self.pauses(number)
             for finger in stream.targets:
                 contrast, median, promised, of_others = known[finger]
                 level, promised_level = tones.level_db_sl[finger]
                 found[finger] = Sensation(
                     self.asked[finger],
-                    SHARED if finger != stream.targets[0] else verdict_of(promised),
+                    SHARED
+                    if finger != stream.targets[0]
+                    else verdict_of(promised, of_others, pauses=pauses),
                     number,
                     level,
                     promised_level,
@@ -199,6 +211,7 @@ class Answer:
                     promised,
                     of_others,
                     lowered,
+                    pauses=pauses,
                 )
         for finger, had, is_disturbing in self.held:
             found[finger] = Sensation(
@@ -270,6 +283,15 @@ class Answer:
                 short = max(short, stimulus.level_db_sl - given)
         return short if short > SAME_LEVEL else 0.0
 
+    def pauses(self, number: int) -> bool:
+        """Whether a layer, by its number, ends or comes and goes, and with it what it masks."""
+        stream = self.contents.streams[number]
+        stimulus = self.asked[stream.targets[0]].stimulus
+        is_modulated = stimulus is not None and stimulus.modulation_hz is not None
+        return stream.duration is not None or (
+            is_modulated and list(self.tones.owners).count(number) > 1
+        )
+
     @property
     def is_reached(self) -> bool:
         """Whether all vibrations have their levels on the plate as modelled."""
@@ -302,7 +324,7 @@ class Answer:
     def disturbed(self) -> list[int]:
         """Fingers, by number, that would feel more of others' vibrations than they allow."""
         levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=True))
-        return [finger for finger, (level, each) in levels if level > each.max_foreign_db_sl]
+        return [finger for finger, (by, each) in levels if by[0] > each.max_foreign_db_sl]
 
     @property
     def stroke_factor(self) -> float:
@@ -345,10 +367,25 @@ class Answer:
         )
 
 
-def verdict_of(promised_contrast_db: float | None) -> str:
-    """Return whether a vibration of a contrast is a finger's own or mixed with others."""
+def verdict_of(
+    promised_contrast_db: float | None, foreign_level_db_sl: float | None, *, pauses: bool
+) -> str:
+    """Return whether a vibration of a contrast is a finger's own or mixed with others.
+
+    A vibration masks what is weaker while it lasts: of one that pauses nothing foreign may be felt.
+    """
     is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
-    return OWN if is_own else MIXED
+    return OWN if is_own and not (pauses and is_felt(foreign_level_db_sl)) else MIXED
+
+
+def is_felt(level_db_sl: float | None) -> bool:
+    """Return whether a level, None for none, is above the threshold."""
+    return level_db_sl is not None and level_db_sl > 0
+
+
+def verdict_shown(verdict: str | None, *, is_foreign_felt: bool) -> str | None:
+    """Return a verdict in words, with what a finger feels beside its own vibration."""
+    return f"{verdict}, others faintly felt" if verdict == OWN and is_foreign_felt else verdict
 
 
 def amplitudes_of(excitations: Iterable[Excitation]) -> dict[str, float]:

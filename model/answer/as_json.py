@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.answer.answer import Answer, Layer
+from model.answer.exposure import exposures
 from model.answer.fingers import BY_NAME, MUST, Finger, Stimulus
 from model.answer.measures import Measures, measures
 from model.answer.plan import answer, prepare_answers
@@ -146,6 +147,7 @@ def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> di
             {
                 "at_m": list(each.finger.at),
                 "verdict": each.verdict,
+                "is_foreign_felt": each.is_foreign_felt,
                 "layer": each.layer,
                 "level_db_sl": nullable(each.level_db_sl),
                 "promised_level_db_sl": nullable(each.promised_level_db_sl),
@@ -154,8 +156,9 @@ def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> di
                 "promised_contrast_db": nullable(each.promised_contrast_db),
                 "foreign_level_db_sl": nullable(each.foreign_level_db_sl),
                 "lowered_db": each.lowered_db,
+                "exposure_m_s2": exposure,
             }
-            for each in found.fingers
+            for each, exposure in zip(found.fingers, exposures(table, found), strict=True)
         ],
         "layers": [_layer_as_json(each, table) for each in found.layers],
         "promised_worst_db": nullable(found.promised_worst_db),

@@ -111,8 +111,8 @@ class Finger:
     `never`, that of one of the same name (`by name`), of the nearest that may have `any`, or it
     `must` feel one with all of its name; is_protected: whether it keeps the others' vibrations away
     where its own is given up; min_contrast_db: promised contrast to the vibrations of others below
-    which these or its own give way; max_foreign_db_sl: level of others' vibrations here that nine
-    of ten plates do not exceed, else they are held back.
+    which these or its own give way; max_foreign_db_sl: level of others' vibrations here, by the
+    rig's own thresholds, that nine of ten plates do not exceed, else they are held back.
     """
 
     at: Point

@@ -125,7 +125,7 @@ def _changed(found: Answer) -> list[str]:
         first = stream.targets[0]
         stimulus = found.asked[first].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
-        if is_modulated and list(found.tones.owners).count(number) == 1:
+        if is_modulated and not found.pauses(number):
             steady.append(f"vibration of {_at(found.asked[first])} is steady")
         lasts = stream.duration is None
         is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL
@@ -366,7 +366,7 @@ class _Answering:
         if contents.streams:
             tones = choose_tones(table, contents)
         else:
-            tones = Tones.none(len(contents.places))
+            tones = Tones.none(len(contents.places), len(table.threshold_sets))
         if not tones.is_apart:
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         given = self.fingers, contents, tones, plan.held, applied

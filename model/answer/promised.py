@@ -71,45 +71,63 @@ def promised(
         )
         by_tone = of_contents[owners]
     power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
-    contrast, level, of_others = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
+    level = np.full((k, 2), np.nan)
+    for j, stream in enumerate(streams):
+        for finger in stream.targets:
+            felt = felt_amplitudes(power, shares, rows, owners == j, (finger,))
+            level[finger] = felt[0], promise(felt)
+    by_set = [
+        _compared(contents, power * factors[:, None, None, None], shares, rows, owners)
+        for factors in np.square(fingers.table.sensitivities[:, rows])
+    ]
+    contrast, of_others, worst = (np.array(each) for each in zip(*by_set, strict=True))
+    return Tones(
+        rows=rows.tolist(),
+        weights=weights.tolist(),
+        gains=by_tone.tolist(),
+        owners=owners.tolist(),
+        contrast_db=decibels(contrast.min(axis=0)).tolist(),
+        level_db_sl=decibels(level).tolist(),
+        foreign_db_sl=decibels(of_others.T).tolist(),
+        worst_db=float(decibels(worst.min())),
+        stroke_factor=factor,
+        is_apart=is_apart,
+    )
+
+
+def _compared(
+    contents: Contents,
+    power: Float32Array,
+    shares: Float32Array,
+    rows: IntArray,
+    owners: IntArray,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Contrast (k, 3), what is felt of others (k,), and the promised contrast of all fingers.
+
+    By one set of thresholds, to which power (m, k, p, d) is; NaN where there is nothing to compare.
+    """
+    streams, k = contents.streams, len(contents.places)
+    contrast, of_others = (np.full(size, np.nan) for size in ((k, 3), k))
     each_own = [
         felt_amplitudes(power, shares, rows, owners == j, s.targets) for j, s in enumerate(streams)
     ]
     ratios: list[Float32Array] = []
-    loudest = np.zeros(power.shape[-1], dtype=np.float32)
     for finger in (*(finger for stream in streams for finger in stream.targets), *contents.quiet):
         felt, others = np.min(each_own, axis=0), np.ones(len(rows), dtype=bool)
         for j, stream in enumerate(streams):
             if finger in stream.targets:
                 others = owners != j
                 felt = felt_amplitudes(power, shares, rows, ~others, (finger,))
-                level[finger] = felt[0], promise(felt)
         if not others.any():
             continue
         heard = np.sqrt(np.maximum(loudest_power(power[others], rows[others], finger), _TINY))
         ratios.append(felt / heard)
         of_others[finger] = promise(heard, 100 - PROMISED_PERCENTILE)
         contrast[finger] = figures(ratios[-1])
-        if finger in contents.quiet:
-            loudest = np.maximum(loudest, heard)
     worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
     if len(streams) == 1:
         contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
-    of_all = worst[2], promise(loudest, 100 - PROMISED_PERCENTILE)
-    worst_db, loudest_db_sl = decibels(np.array(of_all)).tolist()
-    return Tones(
-        rows=rows.tolist(),
-        weights=weights.tolist(),
-        gains=by_tone.tolist(),
-        owners=owners.tolist(),
-        contrast_db=decibels(contrast).tolist(),
-        level_db_sl=decibels(level).tolist(),
-        foreign_db_sl=decibels(of_others).tolist(),
-        worst_db=worst_db,
-        loudest_db_sl=loudest_db_sl,
-        stroke_factor=factor,
-        is_apart=is_apart,
-    )
+    return contrast, of_others, worst[2]
 
 
 def _over_durations(

@@ -8,7 +8,9 @@ chosen by the worst finger on drawn plates; the promise is of other draws, the s
     C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k
 
 and for a quiet finger the weakest content counts, over all contents. An only content has the tone
-of the highest contrast at its level.
+of the highest contrast at its level. Contents differ in frequency, so that this depends on whose
+thresholds their amplitudes are above: the least over the table's sets of thresholds counts, of
+combinations as of the promise. Weights of a content, of one frequency, do not depend on the set.
 
 `model.answer.search_in_c` finds them in C, `model.answer.search_in_numpy` in numpy.
 """
@@ -143,12 +145,12 @@ class Tones:
 
     rows (m,): of the table's frequencies; weights (m, n): up to full stroke; gains (m,): to the
     levels, within the stroke; owners (m,): the content of each tone; contrast_db (k, 3): nominal,
-    of half of the drawn plates and promised, NaN without other contents or fingers; level_db_sl
-    (k, 2): of a finger's own content, nominal and promised; foreign_db_sl (k,): of other contents,
+    of half of the drawn plates and promised, the least over the sets of thresholds, NaN without
+    other contents or fingers; level_db_sl (k, 2): of a finger's own content, nominal and promised,
+    by the rig's own set; foreign_db_sl (k, s): of other contents by each set, the rig's own first,
     which nine of ten plates do not exceed, NaN at fingers that are neither felt nor quiet;
-    worst_db: contrast of all fingers that is promised, NaN for one alone; loudest_db_sl: at quiet
-    fingers; stroke_factor: least factor on the gains for the stroke; is_apart: whether the
-    frequencies are.
+    worst_db: contrast of all fingers that is promised, NaN for one alone; stroke_factor: least
+    factor on the gains for the stroke; is_apart: whether the frequencies are.
     """
 
     rows: list[int]
@@ -157,9 +159,8 @@ class Tones:
     owners: Sequence[int]
     contrast_db: Sequence[Sequence[float]]
     level_db_sl: Sequence[Sequence[float]]
-    foreign_db_sl: list[float]
+    foreign_db_sl: Sequence[Sequence[float]]
     worst_db: float
-    loudest_db_sl: float
     stroke_factor: float
     is_apart: bool
 
@@ -192,8 +193,8 @@ class Tones:
         return found
 
     @classmethod
-    def none(cls, fingers: int) -> "Tones":
-        """Nothing that plays at so many fingers."""
+    def none(cls, fingers: int, sets: int) -> "Tones":
+        """Nothing that plays at so many fingers; sets: of thresholds."""
         contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
-        heard = [-math.inf] * fingers
-        return cls([], [], [], [], contrast, level, heard, math.nan, -math.inf, 1.0, is_apart=True)
+        heard = [(-math.inf,) * sets] * fingers
+        return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)

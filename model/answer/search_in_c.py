@@ -72,7 +72,9 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
         *(addressof(judging), addressof(promise)),
     )
     size = 2 * n * count
-    rows, figures = array("i", bytes(4 * count)), array("f", bytes(4 * (size + count + 6 * k + 3)))
+    of_fingers = k * (3 + 2 + rules.sets)
+    rows = array("i", bytes(4 * count))
+    figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
     to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
     status = run(by.library.answer, to, plates, raster, rules, given)
     if status != FOUND:
@@ -81,7 +83,7 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     weights = map(complex, found[:size:2], found[1:size:2])
     contrast = size + count
     level, of_others = contrast + 3 * k, contrast + 5 * k
-    worst, loudest, factor = found[-3:]
+    worst, factor = found[-2:]
     return Tones(
         rows=rows.tolist(),
         weights=list(zip(*[weights] * n, strict=True)),
@@ -89,9 +91,8 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
         owners=range(count),
         contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
         level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
-        foreign_db_sl=found[of_others:-3],
+        foreign_db_sl=list(zip(*[iter(found[of_others:-2])] * rules.sets, strict=True)),
         worst_db=worst,
-        loudest_db_sl=loudest,
         stroke_factor=factor,
         is_apart=bool(to.is_apart),
     )
@@ -126,6 +127,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
         (WeightSearch * 3)(*map(_method, coherent.WITHIN_STROKE)),
         1 + max(groups, default=0),
+        len(table.threshold_sets),
     )
     rules.point(
         rim=CENTRE_AND_RIM,
@@ -134,6 +136,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         error=table.error_power,
         shares=table.attached.power_shares,
         frequencies=table.frequencies,
+        sensitivities=table.sensitivities.T,
     )
     return plates_structure(table.on_eras), given_raster(table), rules, {}
 

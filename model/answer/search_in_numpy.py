@@ -334,6 +334,7 @@ def best_combination(
     Of all that exchange bands and are apart, else of all that exchange bands.
     """
     streams, hertz = contents.streams, table.frequencies[found.rows]
+    sensitivities = table.sensitivities[:, found.rows]
     for gap in (contents.apart_hz, 0.0):
         combinations = np.flatnonzero(found.streams == 0)[:, None]
         for number in range(1, len(streams)):
@@ -347,10 +348,10 @@ def best_combination(
             combinations = np.concatenate([before, last], axis=1)[allowed]
             if len(combinations) > contents.combinations:
                 some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
-                worst = worst_ratios(combinations, streams, contents.quiet, *some)
+                worst = worst_ratios(combinations, streams, contents.quiet, *some, sensitivities)
                 combinations = combinations[best_few(worst, contents.combinations)]
         if len(combinations):
-            worst = worst_ratios(combinations, streams, contents.quiet, own, loudest)
+            worst = worst_ratios(combinations, streams, contents.quiet, own, loudest, sensitivities)
             return combinations[best_of(worst)], gap == contents.apart_hz
     raise AssertionError("contents with as many bands must have a combination")
 
@@ -361,11 +362,34 @@ def worst_ratios(
     quiet: Sequence[int],
     own: FloatArray,
     loudest: FloatArray,
+    sensitivities: Float32Array,
 ) -> FloatArray:
     """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,).
 
-    Of the first j contents alone; own (m, d), loudest (m, k, d) as of `_judged`.
+    The least over the sets of thresholds, by sensitivities (s, m). Of the first j contents alone;
+    own (m, d), loudest (m, k, d) as of `_judged`.
     """
+    by_set = [
+        _worst_ratios(
+            combinations,
+            streams,
+            quiet,
+            own * factors[:, None],
+            loudest * np.square(factors)[:, None, None],
+        )
+        for factors in sensitivities.astype(float)
+    ]
+    return np.asarray(np.min(by_set, axis=0))
+
+
+def _worst_ratios(
+    combinations: IntArray,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    own: FloatArray,
+    loudest: FloatArray,
+) -> FloatArray:
+    """The ratios by one set of thresholds."""
     levels, total = own[combinations] ** 2, loudest[combinations].sum(axis=1)
     worst = np.full((len(combinations), own.shape[1]), np.inf)
     for j, at in enumerate(combinations.T):

@@ -18,8 +18,9 @@ _SILENT_DB = -60.0  # a gain by which a content is not felt
 def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
     """Return an answer whose stimuli that are limits are as strong as the others allow.
 
-    Quiet fingers have IMPERCEPTIBLE_DB_SL of all of them together at most, on nine of ten plates.
-    For those that feel a vibration of their own none is raised above that, nor lowered.
+    Quiet fingers have IMPERCEPTIBLE_DB_SL, by the rig's own thresholds, of all of them together at
+    most, on nine of ten plates. For those that feel a vibration of their own none is raised above
+    that, nor lowered.
     """
     streams, tones = found.contents.streams, found.tones
     limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
@@ -34,8 +35,8 @@ def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
         level = min(tones.level_db_sl[finger][0] for finger in stream.targets)
         highest = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
         quiet, others = found.contents.quiet, found.contents.others(number)
-        allowed = highest - max([heard[finger] for finger in quiet], default=-math.inf)
-        raised = highest - max([heard[finger] for finger in others], default=-math.inf)
+        allowed = highest - max([heard[finger][0] for finger in quiet], default=-math.inf)
+        raised = highest - max([heard[finger][0] for finger in others], default=-math.inf)
         gains_db[number] = min((stream.limit_db_sl or 0.0) - level, allowed, max(raised, 0.0))
     return with_gains(table, found, gains_db)
 
@@ -47,8 +48,7 @@ def scaled(found: Answer, gain_db: float) -> Answer:
         tones,
         gains=[factor * each for each in tones.gains],
         level_db_sl=[[each + gain_db for each in levels] for levels in tones.level_db_sl],
-        foreign_db_sl=[each + gain_db for each in tones.foreign_db_sl],
-        loudest_db_sl=tones.loudest_db_sl + gain_db,
+        foreign_db_sl=[[each + gain_db for each in by_set] for by_set in tones.foreign_db_sl],
         stroke_factor=tones.stroke_factor * factor,
     )
     return replace(found, tones=louder)

@@ -128,7 +128,9 @@ def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
 
 def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
     """Yield what each finger feels, and what was changed."""
-    yield "finger [m]         frequency       level    contrast  nominal  foreign level"
+    from model.answer.answer import verdict_shown
+
+    yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
     for finger in found["fingers"]:
         layer = finger["layer"]
         frequency = None if layer is None else found["layers"][layer]["frequency_hz"]
@@ -137,7 +139,9 @@ def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
             f"{_cell(finger['promised_level_db_sl'], 'dB SL'):>11s} "
             f"{_cell(finger['promised_contrast_db'], 'dB'):>11s} "
             f"{_cell(finger['contrast_db'], 'dB'):>8s} "
-            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  {finger['verdict']}"
+            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s} "
+            f"{finger['exposure_m_s2']:6.2f} m/s²  "
+            f"{verdict_shown(finger['verdict'], is_foreign_felt=finger['is_foreign_felt'])}"
         )
     if found["promised_worst_db"] is not None:
         yield f"worst finger: {found['promised_worst_db']:.1f} dB promised"

@@ -19,8 +19,10 @@ typedef struct {
     phases phases;
     method one_finger, several, within[3];
     int groups;                    /* of ERAs whose clocks are held together: a content is of one of these */
+    int sets;                      /* of thresholds, the rig's own first */
     const int *rim, *group;        /* (n) of each ERA */
     const float *threshold, *error, *shares, *frequencies; /* (f); (f, n); (f, n, n) or NULL, as of `grouped`; (f) [Hz] */
+    const float *sensitivities;    /* (f, sets) by which amplitudes to the thresholds of a set are higher */
 } rules;
 
 /* Fingers (k) and contents, as given. */
@@ -60,10 +62,10 @@ typedef struct {
     int is_apart, *rows;
     float *weights;     /* (contents, n) */
     float *gains;       /* (contents) within the stroke */
-    float *contrast;    /* (k, 3) [dB] nominal, half of plates, promised; NaN where there is none */
+    float *contrast;    /* (k, 3) [dB] nominal, half of plates, promised, the least over the sets; NaN where there is none */
     float *level;       /* (k, 2) [dB SL] of its own content, nominal and promised */
-    float *foreign;     /* (k) [dB SL] of other contents, which few plates exceed */
-    float *of_all;      /* worst contrast promised [dB]; loudest at quiet fingers [dB SL]; least factor on levels */
+    float *foreign;     /* (k, sets) [dB SL] of other contents, which few plates exceed */
+    float *of_all;      /* worst contrast promised [dB]; least factor on levels */
 } answered;
 
 enum { FOUND, NOT_REACHED };

@@ -74,61 +74,88 @@ SHARED int best_tone(const candidates *from, const float *own, const float *loud
     return chosen_tone;
 }
 
-/* What tones do on some of the plates that judge: (count, draws), (count, k, draws). */
+/* What tones do on some of the plates that judge, as powers by one set of thresholds: (count, draws), (count, k, draws). */
 typedef struct {
     size_t draws;
     const float *own, *loudest;
 } judged;
 
-/* The same on every so many of the plates only. */
-SHARED judged some_of(const judged *every, size_t count, size_t fingers, size_t step, arena *memory) {
-    const size_t draws = (every->draws + step - 1) / step;
-    float *own = floats(memory, count * draws + LANES), *loudest = floats(memory, count * fingers * draws + LANES);
-    for (size_t d = 0; d < draws; d++) {
-        for (size_t i = 0; i < count; i++) own[i * draws + d] = every->own[i * every->draws + d * step];
-        for (size_t i = 0; i < count * fingers; i++) loudest[i * draws + d] = every->loudest[i * every->draws + d * step];
+/* By each set (sets), on every so many of the plates, of amplitudes at targets and powers by the first set. */
+SHARED judged *by_sets(const float *own, const float *loudest, size_t plates, const candidates *from, size_t k, size_t step,
+                       const rules *by, arena *memory) {
+    const size_t draws = (plates + step - 1) / step, count = from->count, room = count * draws + LANES;
+    judged *found = take(memory, by->sets * sizeof(judged));
+    for (int set = 0; set < by->sets; set++) {
+        float *own_power = floats(memory, room), *others_power = floats(memory, k * room);
+        for (size_t i = 0; i < count; i++) {
+            const float factor = by->sensitivities[from->rows[i] * by->sets + set], power = factor * factor;
+            for (size_t d = 0; d < draws; d++) {
+                const float amplitude = own[i * plates + d * step];
+                own_power[i * draws + d] = power * amplitude * amplitude;
+            }
+            for (size_t j = i * k; j < (i + 1) * k; j++)
+                for (size_t d = 0; d < draws; d++) others_power[j * draws + d] = power * loudest[j * plates + d * step];
+        }
+        found[set] = (judged){.draws = draws, .own = own_power, .loudest = others_power};
     }
-    return (judged){.draws = draws, .own = own, .loudest = loudest};
+    return found;
 }
 
-/* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents. */
+/* The least power ratio of a combination (contents) at any finger, of the first contents, on LANES plates. */
+INLINE lanes least_ratio(const int *tone, size_t contents, const judged *on, size_t from, const int *content_of,
+                         size_t fingers, const question *of) {
+    const size_t draws = on->draws;
+    lanes least = filled(INFINITY), weakest = filled(INFINITY);
+    for (size_t j = 0; j < contents; j++) weakest = smaller(weakest, some(on->own + tone[j] * draws + from));
+    for (size_t finger = 0; finger < fingers; finger++) {
+        const int own_content = content_of[finger];
+        if (own_content < 0 || (own_content < (int)contents && contents == 1)) continue;
+        if (own_content >= (int)contents && own_content < of->contents) continue;
+        lanes others = {0}, level = weakest;
+        for (size_t j = 0; j < contents; j++)
+            if ((int)j != own_content) others += some(on->loudest + (tone[j] * fingers + finger) * draws + from);
+        if (own_content < (int)contents) level = some(on->own + tone[own_content] * draws + from);
+        least = smaller(least, level / larger(others, filled(FAINT)));
+    }
+    return least;
+}
+
+/* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents, the least over
+ * the sets (on). LANES combinations at once, of which the lowest ratios are kept in order. */
 SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, const judged *on,
                          const int *content_of, size_t fingers, const rules *by, const question *of, arena *memory) {
     const size_t draws = on->draws;
-    const float *own = on->own, *loudest = on->loudest;
+    const double place = (double)by->judged / 100 * (double)(draws - 1);
+    const size_t low = (size_t)place;
     const arena mark = *memory;
-    float *ratios = floats(memory, draws + LANES);
-    for (int each = 0; each < count; each++) {
-        const int *tone = combinations + (size_t)each * of->contents;
-        for (size_t from = 0; from < draws; from += LANES) {
-            lanes least = filled(INFINITY), weakest = filled(INFINITY);
-            for (size_t j = 0; j < contents; j++) {
-                lanes amplitude = some(own + tone[j] * draws + from);
-                weakest = smaller(weakest, amplitude * amplitude);
-            }
-            for (size_t finger = 0; finger < fingers; finger++) {
-                const int own_content = content_of[finger];
-                if (own_content < 0 || (own_content < (int)contents && contents == 1)) continue;
-                if (own_content >= (int)contents && own_content < of->contents) continue;
-                lanes others = {0}, level = weakest;
-                for (size_t j = 0; j < contents; j++)
-                    if ((int)j != own_content) others += some(loudest + (tone[j] * fingers + finger) * draws + from);
-                if (own_content < (int)contents) {
-                    level = some(own + tone[own_content] * draws + from);
-                    level *= level;
+    lanes *lowest = take(memory, (low + 2) * sizeof(lanes));
+    for (int first = 0; first < count; first += LANES) {
+        lanes found = filled(INFINITY);
+        for (int set = 0; set < by->sets; set++) {
+            for (size_t i = 0; i < low + 2; i++) lowest[i] = filled(INFINITY);
+            for (size_t from = 0; from < draws; from += LANES) {
+                lanes ratios[LANES];
+                for (int l = 0; l < LANES; l++) {
+                    const size_t each = first + l < count ? first + l : count - 1;
+                    ratios[l] = least_ratio(combinations + each * of->contents, contents, on + set, from, content_of, fingers, of);
                 }
-                least = smaller(least, level / larger(others, filled(FAINT)));
+                transpose(ratios);
+                for (size_t d = 0; d < LANES && from + d < draws; d++)
+                    for (size_t i = 0; i < low + 2; i++) {
+                        const lanes below = smaller(lowest[i], ratios[d]);
+                        ratios[d] = larger(lowest[i], ratios[d]), lowest[i] = below;
+                    }
             }
-            memcpy(ratios + from, &least, sizeof least);
+            found = smaller(found, lowest[low] + filled((float)(place - (double)low)) * (lowest[low + 1] - lowest[low]));
         }
-        worst[each] = percentile(ratios, (int)draws, by->judged);
+        for (int l = 0; l < LANES && first + l < count; l++) worst[first + l] = found[l];
     }
     release(memory, mark);
 }
 
 /* A tone of each content, of all combinations that exchange bands and are apart, else of all that exchange bands. */
-SHARED int best_combination(int *chosen_tones, const candidates *from, const judged *every, const plates *on,
-                            const rules *by, const question *of, arena *memory) {
+SHARED int best_combination(int *chosen_tones, const candidates *from, const float *own, const float *loudest,
+                            const plates *on, const rules *by, const question *of, arena *memory) {
     const int contents = of->contents, most = of->combinations;
     const size_t each = (size_t)of->bands * by->groups * 2 * of->candidates; /* tones of a content */
     const size_t room = each > (size_t)most ? each : (size_t)most;
@@ -140,7 +167,9 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const jud
         for (int t = of->starts[j]; t < of->starts[j + 1]; t++) content_of[of->targets[t]] = j;
     int *tried = integers(memory, room * each * contents), *order = integers(memory, room * each);
     float *worst = floats(memory, room * each);
-    const judged few = some_of(every, from->count, on->k, by->pruning_step, memory);
+    const size_t plates = of->judging->count;
+    const judged *few = by_sets(own, loudest, plates, from, on->k, by->pruning_step, by, memory);
+    const judged *every = by_sets(own, loudest, plates, from, on->k, 1, by, memory);
     for (int pass = 0; pass < 2; pass++) {
         const float gap = pass ? 0 : of->apart - SAME_FREQUENCY;
         int count = 1, found = 0;
@@ -160,7 +189,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const jud
                 }
             count = found;
             if (j && count > most) { /* a content alone has no ratio to others */
-                worst_ratios(worst, tried, count, j + 1, &few, content_of, on->k, by, of, memory);
+                worst_ratios(worst, tried, count, j + 1, few, content_of, on->k, by, of, memory);
                 best_first(order, worst, count, memory);
                 count = most;
             } else
@@ -220,8 +249,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, memory);
     if (contents > 1) {
         bring_to_level(own, loudest, &from, k, by, of, memory);
-        const judged by_draws = {.draws = draws, .own = own, .loudest = loudest};
-        to->is_apart = best_combination(best_tones, &from, &by_draws, on, by, of, memory);
+        to->is_apart = best_combination(best_tones, &from, own, loudest, on, by, of, memory);
         if (to->is_apart < 0) return NOT_REACHED;
     }
     for (size_t j = 0; j < contents; j++) {
@@ -269,7 +297,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     find_rows(&of, of.priority + contents, memory);
     answered to = {.rows = found->rows, .weights = found->figures};
     to.gains = to.weights + 2 * contents * on.n, to.contrast = to.gains + contents, to.level = to.contrast + 3 * k;
-    to.foreign = to.level + 2 * k, to.of_all = to.foreign + k;
+    to.foreign = to.level + 2 * k, to.of_all = to.foreign + k * by->sets;
     const int status = answer_from(&to, &on, by, &of, memory);
     found->is_apart = to.is_apart;
     return status;

@@ -128,6 +128,61 @@ INLINE void to_decibels(float *ratios, size_t count) {
     for (size_t i = 0; i < count; i++) ratios[i] = 20 * log10f(ratios[i]);
 }
 
+/* Lower figures (3) to those of ratios: nominal, of half of the plates, promised. */
+INLINE void lower(float *figures, float *ratios, const felt *of) {
+    const float found[3] = {ratios[0], promised(ratios, of, 50), promised(ratios, of, of->by->promised)};
+    for (int i = 0; i < 3; i++) figures[i] = fminf(figures[i], found[i]);
+}
+
+/* Levels by the first set of thresholds, contrasts lowered to those by one set, to which gains are, and foreign levels. */
+SHARED void compare(answered *to, const felt *now, int set, float *own, float *some, float *worst, arena *memory) {
+    const question *of = now->of;
+    const size_t contents = of->contents, plates = now->plates, groups = now->groups;
+    const arena mark = *memory;
+    float *power = floats(memory, plates);
+    for (size_t i = 0; i < plates; i++) worst[i] = INFINITY;
+    int any = 0;
+    for (size_t j = 0; j < contents; j++)
+        for (size_t group = 0; group < groups; group++)
+            keep(own + j * plates, weakest_target(now, j, group, 0), of->promise, group);
+    for (size_t each = 0; each < (size_t)of->starts[contents] + of->quiet_count; each++) {
+        const int is_quiet = each >= (size_t)of->starts[contents];
+        const size_t finger = is_quiet ? of->quiet[each - of->starts[contents]] : of->targets[each];
+        size_t j = 0;
+        while (!is_quiet && each >= (size_t)of->starts[j + 1]) j++;
+        if (is_quiet) {
+            memcpy(some, own, plates * sizeof(float));
+            for (size_t other = 1; other < contents; other++)
+                for (size_t i = 0; i < plates; i++) some[i] = fminf(some[i], own[other * plates + i]);
+        } else {
+            for (size_t group = 0; group < groups; group++)
+                keep(some, own_amplitude(now, j, group, finger, 0), of->promise, group);
+            if (!set) {
+                memcpy(power, some, plates * sizeof(float));
+                to->level[2 * finger] = power[0], to->level[2 * finger + 1] = promised(power, now, now->by->promised);
+            }
+            if (contents == 1) continue;
+        }
+        for (size_t group = 0; group < groups; group++)
+            keep(power, foreign_power(now, is_quiet ? contents : j, group, finger), of->promise, group);
+        for (size_t i = 0; i < plates; i++) {
+            some[i] /= sqrtf(fmaxf(power[i], FAINT));
+            worst[i] = fminf(worst[i], some[i]);
+        }
+        any = 1;
+        to->foreign[finger * now->by->sets + set] = sqrtf(promised(power, now, 100 - now->by->promised));
+        lower(to->contrast + 3 * finger, some, now);
+    }
+    if (any) {
+        for (int t = 0; contents == 1 && t < of->starts[1]; t++) { /* an only content has that of the loudest finger */
+            memcpy(some, worst, plates * sizeof(float));
+            lower(to->contrast + 3 * of->targets[t], some, now);
+        }
+        to->of_all[0] = fminf(to->of_all[0], promised(worst, now, now->by->promised));
+    }
+    release(memory, mark);
+}
+
 /* Figures of tones at rows, of weights (contents, n). */
 SHARED void promise(answered *to, const plates *on, const rules *by, const question *of, const float *columns,
                     arena *memory) {
@@ -146,66 +201,25 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
                 .plates = plates};
 
     float *own = floats(memory, contents * plates), *some = floats(memory, plates), *worst = floats(memory, plates);
-    float *loudest = floats(memory, plates);
     for (size_t j = 0; j < contents; j++) {
         to->gains[j] = 1;
         for (size_t group = 0; group < groups; group++) keep(own, weakest_target(&now, j, group, 1), of->promise, group);
         to->gains[j] = of->level[j] / fmaxf(promised(own, &now, by->promised), LEAST);
     }
-    to->of_all[2] = share_stroke(to->gains, of, to->weights, on->n, memory);
+    to->of_all[1] = share_stroke(to->gains, of, to->weights, on->n, memory);
 
     for (size_t i = 0; i < 3 * k; i++) to->contrast[i] = NAN;
     for (size_t i = 0; i < 2 * k; i++) to->level[i] = NAN;
-    for (size_t i = 0; i < k; i++) to->foreign[i] = NAN;
-    for (size_t i = 0; i < plates; i++) worst[i] = INFINITY, loudest[i] = 0;
-    int any = 0;
-    for (size_t j = 0; j < contents; j++)
-        for (size_t group = 0; group < groups; group++)
-            keep(own + j * plates, weakest_target(&now, j, group, 0), of->promise, group);
-    for (size_t each = 0; each < (size_t)of->starts[contents] + of->quiet_count; each++) {
-        const int is_quiet = each >= (size_t)of->starts[contents];
-        const size_t finger = is_quiet ? of->quiet[each - of->starts[contents]] : of->targets[each];
-        size_t j = 0;
-        while (!is_quiet && each >= (size_t)of->starts[j + 1]) j++;
-        if (is_quiet) {
-            memcpy(some, own, plates * sizeof(float));
-            for (size_t other = 1; other < contents; other++)
-                for (size_t i = 0; i < plates; i++) some[i] = fminf(some[i], own[other * plates + i]);
-        } else {
-            for (size_t group = 0; group < groups; group++)
-                keep(some, own_amplitude(&now, j, group, finger, 0), of->promise, group);
-            const arena before = *memory;
-            float *same = floats(memory, plates);
-            memcpy(same, some, plates * sizeof(float));
-            to->level[2 * finger] = same[0], to->level[2 * finger + 1] = promised(same, &now, by->promised);
-            release(memory, before);
-            if (contents == 1) continue;
-        }
-        const arena before = *memory;
-        float *power = floats(memory, plates);
-        for (size_t group = 0; group < groups; group++)
-            keep(power, foreign_power(&now, is_quiet ? contents : j, group, finger), of->promise, group);
-        for (size_t i = 0; i < plates; i++) {
-            some[i] /= sqrtf(fmaxf(power[i], FAINT));
-            worst[i] = fminf(worst[i], some[i]);
-            if (is_quiet) loudest[i] = fmaxf(loudest[i], sqrtf(power[i]));
-        }
-        any = 1;
-        to->foreign[finger] = sqrtf(promised(power, &now, 100 - by->promised));
-        float *contrast = to->contrast + 3 * finger;
-        contrast[0] = some[0], contrast[1] = promised(some, &now, 50), contrast[2] = promised(some, &now, by->promised);
-        release(memory, before);
+    for (size_t i = 0; i < k * by->sets; i++) to->foreign[i] = NAN;
+    to->of_all[0] = NAN;
+    float *gains = floats(memory, contents);
+    now.gains = gains;
+    for (int set = 0; set < by->sets; set++) {
+        for (size_t j = 0; j < contents; j++) gains[j] = to->gains[j] * by->sensitivities[to->rows[j] * by->sets + set];
+        compare(to, &now, set, own, some, worst, memory);
     }
-    to->of_all[0] = NAN, to->of_all[1] = promised(loudest, &now, 100 - by->promised);
-    if (any) {
-        const float modelled = worst[0], half = promised(worst, &now, 50);
-        to->of_all[0] = promised(worst, &now, by->promised);
-        for (int t = 0; contents == 1 && t < of->starts[1]; t++) { /* an only content has that of the loudest finger */
-            float *contrast = to->contrast + 3 * of->targets[t];
-            contrast[0] = modelled, contrast[1] = half, contrast[2] = to->of_all[0];
-        }
-    }
-    to_decibels(to->contrast, 3 * k), to_decibels(to->level, 2 * k), to_decibels(to->foreign, k), to_decibels(to->of_all, 2);
+    to_decibels(to->contrast, 3 * k), to_decibels(to->level, 2 * k), to_decibels(to->foreign, k * by->sets);
+    to_decibels(to->of_all, 1);
     release(memory, mark);
 }
 

@@ -90,7 +90,7 @@ class Rules(Structure):
         ("one_finger", WeightSearch),
         ("several", WeightSearch),
         ("within", 3 * WeightSearch),
-        *_fields(i="groups", p="rim group threshold error shares frequencies"),
+        *_fields(i="groups sets", p="rim group threshold error shares frequencies sensitivities"),
     ]
 
 

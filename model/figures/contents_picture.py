@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from model.answer.answer import OWN_CONTRAST_DB, Layer, Sensation
+from model.answer.answer import OWN_CONTRAST_DB, Layer, Sensation, verdict_shown
 from model.arrays import FloatArray, lattice
 from model.figures.drawing import label_plate, raster
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -102,9 +102,10 @@ def _draw(
 
 def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
     """Write verdict, level and contrast beside a finger, on the side towards the middle."""
-    lines = [finger.verdict]
+    words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
+    lines = [str(words)]
     if finger.layer is not None:
-        lines = [f"{_frequency(contents[finger.layer])}, {finger.verdict}"]
+        lines = [f"{_frequency(contents[finger.layer])}, {words}"]
         figures = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
         lines += [
             f"{each:.0f} dB {what}"

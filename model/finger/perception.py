@@ -79,19 +79,15 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
     return np.asarray(np.exp(np.interp(np.log(frequency), np.log(known), np.log(acceleration))))
 
 
-def sensitivity_margin_db(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> FloatArray:
-    """How far [dB] the lowest of all sets lies below one at frequencies [Hz], at least 0.
+def sensitivities(
+    frequencies: FloatArray, sets: Sequence[str], threshold: str = DEFAULT_THRESHOLD
+) -> FloatArray:
+    """How much higher an amplitude is to the thresholds of sets (s,) than to those of one, (s, f).
 
-    Raises InputError for frequencies at which that one has no data; others without are left out.
+    frequencies (f,) [Hz]. Raises InputError for frequencies at which any has no data.
     """
-    own = detection_threshold(frequency, threshold)
-    lowest = own
-    for name in THRESHOLDS:
-        low, high = _tabulated(name)[0][[0, -1]]
-        inside = (low <= frequency) & (frequency <= high)
-        other = detection_threshold(np.clip(frequency, low, high), name)
-        lowest = np.where(inside, np.minimum(lowest, other), lowest)
-    return decibels(own / lowest)
+    own = detection_threshold(frequencies, threshold)
+    return np.array([own / detection_threshold(frequencies, each) for each in sets])
 
 
 def sensation_level(

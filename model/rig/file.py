@@ -82,6 +82,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         uncertainty=Uncertainty(**section.uncertainty.model_dump()),
         fingertip=fingertip_of(section.fingertip),
         threshold=section.threshold,
+        promised_thresholds=tuple(section.promised_thresholds),
         outputs=frozenset(
             name
             for name, amplifier in section.amplifiers.items()

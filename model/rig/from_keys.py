@@ -4,7 +4,7 @@ A rig keeps the keys that it was made of, so that what follows from one follows 
 damping of a ratio, a mesh that is chosen, the homogeneous plate that a laminate is like.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ def rig(
     uncertainty: Any = None,
     fingertip: Any = None,
     threshold: str | None = None,
+    promised_thresholds: Sequence[str] | None = None,
 ) -> Rig:
     """Make a rig of a `Plate` and an `Era` for each name, as of a file with these sections.
 
@@ -75,6 +76,7 @@ def rig(
         "uncertainty": uncertainty,
         "fingertip": fingertip,
         "threshold": threshold,
+        "promised_thresholds": promised_thresholds,
     }
     return rig_of(_document("era.rig", sections))
 

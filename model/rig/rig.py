@@ -14,7 +14,7 @@ from typing import Any
 from model.config.document import Document
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.perception import DEFAULT_THRESHOLD
+from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad
@@ -45,8 +45,10 @@ class Rig:
     masses: on the plate, ERAs without an amplifier among them, whose names are supports; laminate:
     of which the plate is made, also where its layers are solved as a homogeneous one; uncertainty:
     of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
-    threshold: name of the set of detection thresholds (`model.finger.perception`); outputs: the
-    amplifiers whose full level is an output, to which bases move by their gains, not a motion;
+    threshold: name of the set of detection thresholds that levels are above
+    (`model.finger.perception`); promised_thresholds: of the sets by which promises hold, beside
+    that one; outputs: the amplifiers whose full level is an output, to which bases move by their
+    gains, not a motion;
     clock_errors: what each amplifier is taken to state of its clock [s], infinite for one that
     cannot be steered; document: its keys.
     """
@@ -62,6 +64,7 @@ class Rig:
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     fingertip: Fingertip | None = field(default_factory=Fingertip)
     threshold: str = DEFAULT_THRESHOLD
+    promised_thresholds: tuple[str, ...] = THRESHOLDS
     supports: tuple[str, ...] = ()
     outputs: frozenset[str] = frozenset()
     clock_errors: Mapping[str, float] = field(default_factory=dict)

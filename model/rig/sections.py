@@ -28,7 +28,7 @@ from model.config.units import (
     STIFFNESS,
     TIME,
 )
-from model.finger.perception import DEFAULT_THRESHOLD
+from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.key_types import (
     GAINS,
     MODES,
@@ -382,7 +382,8 @@ class RigSection(Section):
     """A rig file.
 
     mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT; uncertainty: without it that of a plate which was
-    not measured; fingertip: none for weightless fingers; threshold: a set of detection thresholds.
+    not measured; fingertip: none for weightless fingers; threshold: a set of detection thresholds;
+    promised_thresholds: those by which promises hold.
     """
 
     plate: PlateSection
@@ -426,4 +427,14 @@ class RigSection(Section):
     [people](../concepts/people.md#detection-thresholds).
 
     Limits: `vibrotactile-probe`, `pressing-fingertip`
+    """
+
+    promised_thresholds: Annotated[
+        list[Annotated[str, AfterValidator(check_threshold)]],
+        Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
+    ]
+    """Sets beside that of `threshold` by which promises hold: the one that says least counts. All
+    that are published if left out; name that of `threshold` alone for promises by it alone.
+
+    Limits: a list of `vibrotactile-probe`, `pressing-fingertip`
     """

@@ -204,7 +204,8 @@ def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
             f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, got "
             f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
         )
-    check_has_threshold(frequencies, rig.threshold)
+    for each in (rig.threshold, *rig.promised_thresholds):
+        check_has_threshold(frequencies, each)
 
 
 MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first

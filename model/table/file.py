@@ -33,7 +33,7 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 
 _MAX_SHOWN = 3  # keys in which a table is of another rig
 
@@ -225,7 +225,8 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
     for x, y in places:
         if not (0 <= x <= table.plate.length and 0 <= y <= table.plate.width):
             raise InputError(f"ERAs and masses must be on the plate, got ({x:g}, {y:g}) m")
-    check_has_threshold(table.frequencies, table.threshold)
+    for each in table.threshold_sets:
+        check_has_threshold(table.frequencies, each)
     # Rows are found by frequency with a binary search.
     if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
         raise InputError("frequencies must be positive and ascend, at least one")

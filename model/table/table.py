@@ -34,7 +34,12 @@ from model.finger.fingertip import (
     GAUSS_LEGENDRE,
 )
 from model.finger.grid import Grid
-from model.finger.perception import decibels, detection_threshold, is_background
+from model.finger.perception import (
+    decibels,
+    detection_threshold,
+    is_background,
+    sensitivities,
+)
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import fingerprint_of
 from model.rig.uncertainty import Uncertainty
@@ -101,6 +106,7 @@ class LocalizationTable:
     uncertainty: Uncertainty
     fingertip: Fingertip | None
     threshold: str
+    promised_thresholds: tuple[str, ...]
     mesh: PlateMesh
     raster: Raster
     grid: Grid
@@ -279,6 +285,23 @@ class LocalizationTable:
     def thresholds(self) -> NDArray[np.float32]:
         """Detection thresholds [m/s²] at all frequencies, (f,)."""
         return detection_threshold(self.frequencies, self.threshold).astype(np.float32)
+
+    @property
+    def threshold_sets(self) -> tuple[str, ...]:
+        """Names (s,) of the sets of thresholds by which promises hold, that of levels first."""
+        return tuple(dict.fromkeys((self.threshold, *self.promised_thresholds)))
+
+    @cached_property
+    def sensitivities(self) -> Float32Array:
+        """How much higher amplitudes are to the thresholds of each set than the first, (s, f)."""
+        found = sensitivities(self.frequencies, self.threshold_sets, self.threshold)
+        return found.astype(np.float32)
+
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> FloatArray:
+        """A level of an excitation by each set of thresholds (s,), at least [dB SL]."""
+        played = np.array([tone.frequency for tone in excitation.values()])
+        factors = sensitivities(played, self.threshold_sets, self.threshold)
+        return level_db_sl + decibels(factors.min(axis=1))
 
     @cached_property
     def modal_dispersion(self) -> Dispersion | None:

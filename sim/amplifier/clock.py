@@ -37,8 +37,6 @@ class Crystal:
 
     def counted(self, age: float) -> float:
         """Return the seconds that it counts in its first seconds."""
-        if not (self.error or self.warm_up):
-            return age
         warming = age + SETTLING * math.expm1(-age / SETTLING)
         return age + self.error * age + self.warm_up * SETTLING * warming
 

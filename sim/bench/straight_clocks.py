@@ -65,5 +65,4 @@ def _renewed(known: StraightClock, now: StraightClock) -> StraightClock:
 
 def _behind(known: StraightClock, now: StraightClock) -> float:
     """Return by how much a clock is behind that of now [s]."""
-    half = CLOCK_TURN / 2
-    return (now.shown - known.at(now.time) + half) % CLOCK_TURN - half
+    return math.remainder(now.shown - known.at(now.time), CLOCK_TURN)

@@ -29,7 +29,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults.fault_window import Faults
 from sim.transport.far_end import HOST, TcpEnd, TerminalEnd
-from sim.transport.line_kinds import LINE_KINDS, PROMPT, LineDelays
+from sim.transport.line_kinds import LINE_NAMES, PROMPT, delays_of
 
 _SERIAL_BITS, _MODBUS_BITS = 10, 11  # of a byte: start, eight data, parity on Modbus, stop
 
@@ -107,13 +107,6 @@ def _default_line(wire: Wire) -> str:
     return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
 
-def _delays(wire: Wire, devices: Devices) -> LineDelays | None:
-    """Those of a line, None where it is prompt."""
-    if wire.line_kind in (None, PROMPT):
-        return None
-    return LINE_KINDS[wire.line_kind].delays((wire.seed, devices[0].name))
-
-
 def _speed(wire: Wire, default: int) -> int | None:
     """Bits per second of a line: as given, the default where it is not prompt, or None."""
     return wire.speed or (None if wire.line_kind in (None, PROMPT) else default)
@@ -126,7 +119,7 @@ async def _serial(wire: Wire, devices: Devices) -> Urls:
     async with TerminalEnd(
         devices[0],
         partial(SerialAmplifiers, numbered),
-        delays=_delays(wire, devices),
+        delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
         byte_time=_SERIAL_BITS / speed if speed else 0.0,
         unpluggable=wire.unpluggable,
     ) as end:
@@ -143,7 +136,7 @@ async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
     async with TerminalEnd(
         devices[0],
         partial(ModbusAmplifiers, _numbered(devices), is_rtu=True),
-        delays=_delays(wire, devices),
+        delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
         byte_time=_MODBUS_BITS / speed if speed else 0.0,
         unpluggable=wire.unpluggable,
     ) as end:
@@ -154,7 +147,7 @@ async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
 @asynccontextmanager
 async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
     registers = ModbusAmplifiers(_numbered(devices), lambda data: None, is_rtu=False)
-    delays = _delays(wire, devices)
+    delays = delays_of(wire.line_kind, wire.seed, devices[0].name)
     async with TcpEnd(devices[0], registers.of_connection, delays=delays, port=wire.port) as end:
         line = f"modbus+tcp://{HOST}:{end.port}"
         yield {device.name: f"{line}/{device.address}" for device in devices}
@@ -173,7 +166,7 @@ async def _slcan(wire: Wire, devices: Devices) -> Urls:
             devices[0],
             partial(SlcanAdapter, bus),
             faults=Faults(),
-            delays=_delays(wire, devices),
+            delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
             unpluggable=wire.unpluggable,
         ) as end:
             line = f"can+slcan://{end.port}?bitrate={wire.speed or BITRATE}"
@@ -187,7 +180,7 @@ async def _socketcand(wire: Wire, devices: Devices) -> Urls:
             devices[0],
             partial(SocketcandClient, bus),
             faults=Faults(),
-            delays=_delays(wire, devices),
+            delays=delays_of(wire.line_kind, wire.seed, devices[0].name),
             port=wire.port,
         ) as end:
             line = f"can+socketcand://{HOST}:{end.port}/{BUS_NAME}"
@@ -262,8 +255,8 @@ def choose_lines(wires: Mapping[str, Wire], options: Sequence[str]) -> dict[str,
         name, equals, kind = text.rpartition("=")
         if equals and name not in wires:
             raise InputError(f"--line {text}: amplifier must be one of {', '.join(wires)}")
-        if kind not in (*LINE_KINDS, PROMPT):
-            known = ", ".join((*LINE_KINDS, PROMPT))
+        if kind not in LINE_NAMES:
+            known = ", ".join(LINE_NAMES)
             raise InputError(f"--line {text}: must be KIND or NAME=KIND, KIND one of {known}")
         for each, wire in wires.items():
             if not equals or each == name or (wire.is_one_line and wire == wires[name]):

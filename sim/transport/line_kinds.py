@@ -7,7 +7,7 @@ of an FTDI chip that a second reply fills up.
 import math
 import random
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _FTDI_PACKET = 62  # bytes beside two of status
 _SIGMAS, _STALLS = 4.0, 5.0  # of a log-normal part and of a stall: no longer ones occur
@@ -129,20 +129,14 @@ _RECEIVING = Latency(least=80e-6, median=90e-6, sigma=1.0, stalls=0.03, stall=2e
 _HIGH_SPEED = LineKind(_WRITING, _WAKING, frame=125e-6, usb_byte=8 / 480e6)
 _FULL_SPEED = LineKind(_WRITING, _WAKING, frame=1e-3, usb_byte=8 / 12e6)
 
-
-def _ftdi(latency_timer: float) -> LineKind:
-    frame, usb_byte = _FULL_SPEED.frame, _FULL_SPEED.usb_byte
-    return LineKind(_WRITING, _WAKING, frame, usb_byte, latency_timer)
-
-
 PROMPT = "prompt"
 """The name of a line that adds nothing."""
 LINE_KINDS: Mapping[str, LineKind] = {
     "native": LineKind(_WRITING, _WAKING),
     "usb-high-speed": _HIGH_SPEED,
     "usb-full-speed": _FULL_SPEED,
-    "ftdi": _ftdi(16e-3),
-    "ftdi-low-latency": _ftdi(1e-3),
+    "ftdi": replace(_FULL_SPEED, latency_timer=16e-3),
+    "ftdi-low-latency": replace(_FULL_SPEED, latency_timer=1e-3),
     "can": LineKind(_WRITING, _WAKING),
     "can-usb": _FULL_SPEED,
     "ethernet": LineKind(_SENDING, _RECEIVING),
@@ -153,3 +147,10 @@ native: a UART of the board; ftdi: with the chip's timer of 16 ms, or as the hos
 where it can; can: a controller of the board, can-usb: an adapter; ethernet: Modbus TCP, servers.
 On CAN a frame waits for that on the bus, too.
 """
+LINE_NAMES = (*LINE_KINDS, PROMPT)
+"""All that a line may be."""
+
+
+def delays_of(kind: str | None, *line: object) -> LineDelays | None:
+    """Return those of a line of a kind by its name, None where it is prompt, as without a name."""
+    return None if kind in (None, PROMPT) else LINE_KINDS[kind].delays(line)

@@ -18,9 +18,10 @@ FREQUENCIES = np.linspace(40.0, 500.0, 27)
 
 
 def smooth_rig() -> Rig:
-    """The paper's rig on 6x5 elements of the fifth order."""
+    """The paper's rig on 6x5 elements of the fifth order, promising by one set of thresholds."""
     rig = make_paper_rig(6, 5)
-    return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, ELEMENTS["Q5"]))
+    mesh = Mesh(6, 5, rig.plate.length, rig.plate.width, ELEMENTS["Q5"])
+    return replace(rig, mesh=mesh, promised_thresholds=(rig.threshold,))
 
 
 def forms_of(table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0) -> Forms:

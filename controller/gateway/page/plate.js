@@ -22,6 +22,9 @@ export const fixed = (value, digits = 0) => (value === null || value === undefin
 // What is promised is not rounded up.
 export const atLeast = (value) => fixed(value === null ? null : Math.floor(value));
 
+// What a finger feels: its own content, whether others are felt beside it, or why not its own.
+export const felt = ({ verdict, is_foreign_felt }) => (verdict === "own" && is_foreign_felt ? "own, others faintly felt" : verdict);
+
 export class PlateOverlay {
   constructor(plate, svg) {
     this.plate = plate;
@@ -191,7 +194,7 @@ export class PlateOverlay {
     if (layer !== undefined) ring.style.stroke = colourOf(layer);
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
     let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB over others` : "";
-    if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${verdict}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
+    if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${felt(contact)}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }

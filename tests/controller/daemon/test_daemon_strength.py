@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -34,9 +35,10 @@ STEEPEST = (1 - LOWER) * math.pi / 2 * STEP / FADE
 
 @cache
 def phased_table() -> LocalizationTable:
-    """For two contents at once."""
-    frequencies = np.arange(60.0, 301.0, 20.0)
-    return build_table(make_paper_rig(12, 9), frequencies=frequencies, drive_mode="phased")
+    """For two contents at once, of levels that a step on the wire does not round by much."""
+    frequencies, rig = np.arange(60.0, 301.0, 20.0), make_paper_rig(12, 9)
+    rig = replace(rig, promised_thresholds=(rig.threshold,))
+    return build_table(rig, frequencies=frequencies, drive_mode="phased")
 
 
 @asynccontextmanager

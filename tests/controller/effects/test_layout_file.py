@@ -37,7 +37,7 @@ def test_load_layout_reads_the_example() -> None:
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None
-    found = layout.region_at(0.22, 0.06)
+    found = layout.region_at(0.205, 0.045)
     assert found is not None
     assert found.name == "knob"
     assert layout.region_at(0.30, 0.01) is None
@@ -95,6 +95,37 @@ def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) ->
     layout = load_layout(path, load_rig(example_rig_path()).plate)
     found = [layout.region_at(x, 0.1) for x in (0.1, 0.15)]
     assert [region.name for region in found if region] == ["over", "under"]
+
+
+@pytest.mark.parametrize(
+    ("highest", "problems"),
+    [
+        ("", ["effects.strong", "regions.a.level"]),
+        ("max_level_db_sl: 45", ["regions.a.level"]),
+        ("max_level_db_sl: 50", []),
+        ("max_level_db_sl: 61", ["max_level_db_sl"]),
+        ("max_level_db_sl: 39", ["max_level_db_sl"]),
+    ],
+)
+def test_levels_end_where_the_layout_says(
+    tmp_path: Path, highest: str, problems: list[str]
+) -> None:
+    """At 40 dB SL, or where the layout raises it, 60 at most; one problem a level."""
+    path = tmp_path / "layout.yaml"
+    path.write_text(
+        f"{highest}\n"
+        "effects: {strong: {kind: ramp, start_level: 45, level: 20}}\n"
+        "regions:\n"
+        "  a: {circle: {at: [0.1, 0.1], radius: 0.02}, on_press: strong, level: 50}\n",
+        encoding="utf-8",
+    )
+    if not problems:
+        assert load_layout(path, None).max_db_sl == 50
+        return
+    with pytest.raises(ConfigError) as caught:
+        load_layout(path, None)
+    found = str(caught.value)
+    assert [each for each in problems if each not in found] == []
 
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"

@@ -77,7 +77,7 @@ async def test_one_content_beside_a_protected_finger(effect: Buzz | Click, is_pl
         assert fingers.levels_db_sl()[3] < -10
         if is_played:
             (applied,) = fingers.applied
-            (quiet,) = applied.quiet_levels.values()
+            ((quiet,),) = applied.quiet_levels.values()
             assert fingers.levels_db_sl()[3] < quiet < -10
 
 

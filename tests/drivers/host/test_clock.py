@@ -57,7 +57,7 @@ class Exchanges:
 
     def __post_init__(self) -> None:
         """Identify it."""
-        self.held.stated = self.stated
+        self.held.identified(self.stated, bits=1e-3)
         self.held.is_alone = False
 
     def send(self, name: str, **values: int) -> None:
@@ -75,7 +75,7 @@ class Exchanges:
         if name == "Arm":
             self.state = ARMED
         status = {"state": self.state, "clock": counter.word}
-        self.held.replied(name, values, status, counter.at + 2e-3, bits=1e-3)
+        self.held.replied(name, values, status, counter.at + 2e-3)
 
     def arm(self) -> int:
         """Read it for a second, then arm; returns the shift."""
@@ -296,7 +296,7 @@ def test_only_marks_count_once_they_are_used() -> None:
             talk.now += 2e-3
             talk.held.sent("GetStatus", {}, talk.now, talk.now)
             status = {"state": OFF, "clock": marked}
-            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3, bits=1e-3)
+            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
     for talk in talks:
         talk.counter.go(talk.now)
     seen = talks[0].held.lead(talks[0].now) - talks[1].held.lead(talks[1].now)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from model.answer.measures import is_imperceptible
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import (
@@ -13,10 +12,9 @@ from model.finger.perception import (
     felt_part,
     highest_measured,
     sensation_level,
-    sensitivity_margin_db,
+    sensitivities,
 )
 from model.structure.plate import Material, Plate
-from model.vibration.excitation import Tone
 
 PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"
 
@@ -77,7 +75,7 @@ def test_frequencies_without_data_are_refused(frequency):
         lambda: check_has_threshold(asked),
         lambda: detection_threshold(asked, PRESSING),
         lambda: sensation_level(asked, np.ones(2)),
-        lambda: sensitivity_margin_db(asked),
+        lambda: sensitivities(asked, THRESHOLDS),
     ):
         with pytest.raises(InputError, match="10 to 1000 Hz"):
             refused()
@@ -89,11 +87,11 @@ def test_a_set_that_is_not_known_is_refused():
         detection_threshold(np.array([100.0]), "thumb")
 
 
-def test_quiet_fingers_are_unaware_only_below_the_lowest_thresholds():
-    """At 250 Hz the probe's thresholds are 28 dB above the lowest: -38 dB SL suffices, -37 not."""
-    played = [{"SW": Tone(250.0, 1e-6)}]
-    assert [is_imperceptible(level, played, PROBE) for level in (-38.1, -37.5)] == [True, False]
-    assert [is_imperceptible(level, played, PRESSING) for level in (-10.1, -9.9)] == [True, False]
+def test_sensitivities_are_ratios_of_thresholds():
+    """At 250 Hz the probe's thresholds are 0.247 m/s² and those of pressing fingers 28 dB lower."""
+    found = sensitivities(np.array([40.0, 250.0]), (PROBE, PRESSING), PROBE)
+    assert found[0] == pytest.approx(1)
+    assert found[1] == pytest.approx([0.251 / 0.0919, 0.247 / 0.0098], rel=0.02)
 
 
 def test_measured_thresholds_end():

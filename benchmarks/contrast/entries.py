@@ -64,7 +64,9 @@ class _Case:
         strokes = np.diag([complex(era.stroke) for era in self.table.eras])
         bases = np.repeat(strokes[None], len(rows), axis=0)
         at = touched(self.table, self.placed)
-        return accelerations_on(self.table, *at, rows, bases, plates).swapaxes(2, 3)
+        return accelerations_on(self.table, *at, self.table.attached, rows, bases, plates).swapaxes(
+            2, 3
+        )
 
     @property
     def weights(self) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.identification.answers import Answer, answer, known_table, table_of
 from benchmarks.identification.coverage import fields_held, parameters_held
-from benchmarks.identification.hidden import LOAD_STD
+from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD
 from benchmarks.identification.server import HiddenPlates
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
@@ -30,7 +30,8 @@ _MARGIN = 0.013
 class Outcome:
     """Of one plate: contrasts [dB] by way, load and number of quiet fingers, and its fit.
 
-    kept: by what is promised and load, whether the plate as identified gives it; seconds: of
+    kept: by what is promised and load, whether the plate as identified gives it; is_explained:
+    whether anything is promised of it; seconds: of
     processor time of the identification; errors, fields: see `coverage`.
     """
 
@@ -38,12 +39,15 @@ class Outcome:
     contrasts: dict[tuple[str, bool, int], list[float]]
     kept: dict[tuple[str, bool], list[bool]] = field(default_factory=dict)
     chi2: float = np.nan
+    mode_shift: float = np.nan
     held_out: float = np.nan
     unexplained: float = np.nan
     seconds: float = np.nan
     errors: dict[str, Reals] = field(default_factory=dict)
     fields: Reals = field(default_factory=lambda: np.zeros(0))
     refusal: str = ""
+    is_explained: bool = False
+    sensors: int = 4
 
 
 def outcome(
@@ -55,21 +59,24 @@ def outcome(
     *,
     sets: int,
     rounds: int = 4,
+    sensors: int = 4,
 ) -> Outcome:
     """Identify a hidden plate and judge answers on it.
 
     written: tables of the rig as it is written, by whether fingers load it; rounds: of interleaved
-    tones, four for every ERA at each tone.
+    tones, four for every ERA at each tone; sensors: at the first ERAs, then INSIDE.
     """
-    found = Outcome(kind, {})
+    found = Outcome(kind, {}, sensors=sensors)
     started = time.process_time()
     try:
-        identified = identify(rig, _measurement(plates, rig, kind, seed, rounds), seed=seed)
+        measured = _measurement(plates, rig, kind, seed, rounds, sensors)
+        identified = identify(rig, measured, seed=seed)
     except InputError as refusal:
         found.refusal = str(refusal)
         return found
     found.seconds = time.process_time() - started
-    found.chi2 = identified.chi2
+    found.chi2, found.mode_shift = identified.chi2, identified.mode_shift
+    found.is_explained = identified.is_explained
     if identified.held_out:
         found.held_out = identified.held_out.total
         found.unexplained = identified.held_out.unexplained
@@ -77,7 +84,8 @@ def outcome(
     truth = plates.truth(kind, seed, FREQUENCIES, raster)
     found.errors = parameters_held(identified, truth)
     found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
-    for loaded in (False, True) if sets else ():
+    is_judged = identified.is_explained or kind in FAMILY
+    for loaded in (False, True) if sets and is_judged else ():
         tables = {"written": written[loaded], "identified": _table(identified, loaded)}
         for quiet in QUIET:
             rng = np.random.default_rng([seed, quiet])
@@ -110,11 +118,14 @@ def _table(identified: Identification, loaded: bool) -> LocalizationTable:
     return table_of(identified.rig, FREQUENCIES, loaded=loaded)
 
 
-def _measurement(plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int) -> Measurement:
-    values = plates.measured(kind, seed, FREQUENCIES)
+def _measurement(
+    plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int, count: int
+) -> Measurement:
+    values = plates.measured(kind, seed, FREQUENCIES, count)
     played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    return Measurement.of(sensors, FREQUENCIES, np.where(played[:, None], values, np.nan))
+    sensors += [Sensor(f"inside {n}", x=x, y=y) for n, (x, y) in enumerate(INSIDE.tolist())]
+    return Measurement.of(sensors[:count], FREQUENCIES, np.where(played[:, None], values, np.nan))
 
 
 def _felt(

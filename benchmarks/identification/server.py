@@ -41,9 +41,9 @@ class HiddenPlates:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
-    def measured(self, kind: str, seed: int, frequencies: Reals) -> Complexes:
-        """Responses at the ERAs (f, s, n) [1/s²] with noise."""
-        return np.asarray(self._ask("measured", kind, seed, frequencies))
+    def measured(self, kind: str, seed: int, frequencies: Reals, sensors: int) -> Complexes:
+        """Responses at so many sensors (f, s, n) [1/s²] with noise, the first ones at the ERAs."""
+        return np.asarray(self._ask("measured", kind, seed, frequencies, sensors))
 
     def felt(
         self, kind: str, seed: int, frequency: float, points: Reals, fingers: Reals, factors: Reals
@@ -92,8 +92,8 @@ def _plate(kind: str, seed: int) -> Hidden:
     return draw(kind, seed)
 
 
-def _measured(kind: str, seed: int, frequencies: Reals) -> Complexes:
-    return _plate(kind, seed).measured(frequencies, np.random.default_rng([seed, 1]))
+def _measured(kind: str, seed: int, frequencies: Reals, sensors: int) -> Complexes:
+    return _plate(kind, seed).measured(frequencies, np.random.default_rng([seed, 1]), sensors)
 
 
 def _felt(

@@ -74,8 +74,9 @@ class Line:
 class ThinPlate:
     """A free plate: sides, thickness [m], E [Pa], rho [kg/m³], nu.
 
-    soft: x from, to, y from, to [m] of a part that has lost a share of its rigidity, the last;
-    taper: thickness that each side's ends have more or less than its middle, relative.
+    parts: x from, to, y from, to [m] of parts that are stiffer and heavier, and what they have of
+    rigidity and of mass beside the plate's, relative; taper: thickness that each side's ends have
+    more or less than its middle, relative.
     """
 
     length: float
@@ -84,7 +85,7 @@ class ThinPlate:
     modulus: float
     density: float
     ratio: float
-    soft: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    parts: tuple[tuple[float, ...], ...] = ()
     taper: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
@@ -99,11 +100,12 @@ class ThinPlate:
         x, y = (line.integrals(slope=slope, power=3) for line, slope in lines)
         mass_x, mass_y = (line.integrals(slope=slope)[0, 0] for line, slope in lines)
         rigidity = self.modulus * self.thickness**3 / 12 / (1 - self.ratio**2)
-        stiffness = self._bending(x, y)
-        if lost := self.soft[4]:
-            part = along.integrals(*self.soft[:2]), across.integrals(*self.soft[2:4])
-            stiffness = stiffness - lost * self._bending(*part)
-        mass = self.density * self.thickness * np.kron(mass_x, mass_y)
+        stiffness, mass = self._bending(x, y), np.kron(mass_x, mass_y)
+        for *place, stiffer, heavier in self.parts:
+            of_x, of_y = along.integrals(*place[:2]), across.integrals(*place[2:])
+            stiffness = stiffness + stiffer * self._bending(of_x, of_y)
+            mass = mass + heavier * np.kron(of_x[0, 0], of_y[0, 0])
+        mass = self.density * self.thickness * mass
         values, vectors = linalg.eigh(rigidity * stiffness, mass)
         values[:3] = 0.0
         return values, vectors

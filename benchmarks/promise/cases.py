@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,19 @@ from model.table.table import LocalizationTable
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVEL_DB_SL = 14.0
 IDENTIFIED = Uncertainty(
-    gain=0.015, phase_deg=1.5, thickness=0.002, stiffness=0.01, damping=1.1, fingertip=0.5
+    gain=0.015,
+    phase_deg=1.5,
+    stiffness=0.01,
+    damping=1.1,
+    fingertip=0.5,
+    **Uncertainty.of_frequency(0.002),
+    place=0.0003,
 )
+"""As after `era rig identify`; harmonics are those of any rig."""
+
+FURTHER = ("modulus", "place")
+"""Errors of plates that deviate, which promises count since later than others."""
+
 JOINS, CHANGES, LEAVES, MOVES = "joins", "changes", "leaves", "moves"
 
 Band = tuple[float, float]
@@ -33,7 +45,8 @@ class Case:
     without; may_swap: in any order. modulation_hz: of the last content. events: what the last
     finger with a content does, one after the other, once all have been felt together. line: kind of
     the line, prompt without; is_one_bus: or a line for each amplifier; resting [s]: while the
-    fingers rest, before it is measured.
+    fingers rest, before it is measured; without: keys of the uncertainty that are none;
+    with_errors: whether it is one of several that differ by these alone.
     """
 
     name: str
@@ -45,10 +58,13 @@ class Case:
     bands: tuple[Band, ...] = ()
     may_swap: bool = False
     modulation_hz: float | None = None
+    apart: float = 0.0
     events: tuple[str, ...] = ()
     line: str | None = None
     is_one_bus: bool = True
     resting: float = 0.0
+    without: tuple[str, ...] = ()
+    with_errors: bool = False
 
     @property
     def title(self) -> str:
@@ -60,12 +76,13 @@ class Case:
     def rig(self) -> Rig:
         """The rig with its uncertainty."""
         rig = load_rig(EXAMPLES / f"{self.rig_name}.yaml")
-        return replace(rig, uncertainty=IDENTIFIED) if self.is_identified else rig
+        known = IDENTIFIED if self.is_identified else rig.uncertainty
+        return replace(rig, uncertainty=replace(known, **dict.fromkeys(self.without, 0.0)))
 
     @property
     def table(self) -> LocalizationTable:
         """The table of the rig."""
-        return _table(self.rig_name, self.is_identified)
+        return _table(self.rig_name, self.is_identified, self.without)
 
     def bands_for(self, places: list[Point]) -> list[Band]:
         """The band of each content, by the best order where they may swap."""
@@ -88,8 +105,8 @@ class Case:
 
 
 @cache
-def _table(rig_name: str, is_identified: bool) -> LocalizationTable:
-    rig = Case("", None, rig_name, is_identified=is_identified).rig
+def _table(rig_name: str, is_identified: bool, without: tuple[str, ...]) -> LocalizationTable:
+    rig = Case("", None, rig_name, is_identified=is_identified, without=without).rig
     grid = np.arange(40.0, 321.0, 10.0)
     return build_table(rig, drive_mode="phased", frequencies=grid)
 
@@ -106,6 +123,33 @@ def _resting(name: str, line: str, *, is_one_bus: bool = False) -> Case:
         resting=RESTING,
     )
 
+
+_ERRORS = {
+    "neither harmonics nor further errors": ("harmonic", *FURTHER),
+    "1 % of second harmonic": FURTHER,
+    "1 % of second harmonic, and the further errors": (),
+}
+"""Of plates that deviate, by those that are none."""
+
+
+def _two_contents(errors: str) -> list[Case]:
+    """Two contents on plates of some errors, on each kind of rig."""
+    name, without = f"two contents, {errors}", _ERRORS[errors]
+    return [
+        Case(name, None, rig, is_identified=known, without=without, with_errors=True)
+        for known in (False, True)
+        for rig in ("paper_plate", "car_display")
+    ]
+
+
+def _landing(contents: int, rig_name: str, apart: float) -> Case:
+    """Contents that fingers feel who land together, or one after the other."""
+    name = f"{'two' if contents == 2 else 'three'} contents, landing"
+    name = f"{name} {apart:g} s apart" if apart else f"{name} together"
+    return Case(name, None, rig_name, contents, is_identified=True, apart=apart)
+
+
+APART = 0.35  # s; between fingers that land one after the other
 
 HELD, RESTING = 3.0, 5.0  # s
 """While clocks are read before any finger comes, and while fingers rest after."""
@@ -138,4 +182,7 @@ CASES = (
     _resting("one bus, USB of full speed", "usb-full-speed", is_one_bus=True),
     _resting("lines of USB, high speed", "usb-high-speed"),
     _resting("lines of USB, full speed", "usb-full-speed"),
+    *(case for errors in _ERRORS for case in _two_contents(errors)),
+    *[_landing(*each) for each in product((2, 3), ("paper_plate", "car_display"), (0.0, APART))],
+    Case("two contents", None, "car_display", is_identified=True, events=(*_EVENTS, MOVES)),
 )

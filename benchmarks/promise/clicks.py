@@ -106,11 +106,22 @@ def given(
     for number in range(plates):
         factor, finger = float(drawn.thickness[number]), rig.fingertip
         eras = tuple(
-            replace(era, stiffness=k * era.stiffness, damping=drawn.damping[number] * era.damping)
-            for era, k in zip(rig.eras, drawn.stiffness[number].tolist(), strict=True)
+            replace(
+                era,
+                x=min(max(era.x + x, 0.0), rig.plate.length),
+                y=min(max(era.y + y, 0.0), rig.plate.width),
+                stiffness=k * era.stiffness,
+                damping=drawn.damping[number] * era.damping,
+            )
+            for era, k, (x, y) in zip(
+                rig.eras,
+                drawn.stiffness[number].tolist(),
+                drawn.places[number].tolist(),
+                strict=True,
+            )
         )
         plate = replace(
-            rig.plate,
+            rig.plate.scaled(modulus=float(drawn.modulus[number])),
             thickness=factor * rig.plate.thickness,
             loss_factor=float(drawn.loss[number]) * rig.plate.loss_factor,
         )
@@ -135,7 +146,9 @@ def given(
             threshold = other.thresholds[other.rows_of(frequencies)]
             steady = np.linalg.norm(amplitudes / threshold[:, None], axis=0)
             level = 20 * math.log10(float(steady @ fingertip_weights(*contacts[0], plate)))
-            quiet = 10 * math.log10(float(pulse.heard[1:].max()))
+            distorted = bases * drawn.harmonic[number]
+            harmonics = ringing.over(zip((2 * hertz).tolist(), distorted, strict=True))
+            quiet = 10 * math.log10(float((pulse.heard + harmonics.heard)[1:].max()))
             found[row, number] = level + 20 * math.log10(float(pulse.gains[0])) - quiet
     return found
 

@@ -18,6 +18,7 @@ from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from sim.amplifier.clock import StraightClock
 from sim.bench.bench import Bench
+from sim.plant import second_harmonic
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.loaded_plates import Placement
 from sim.plant.voiced_base import motion_of
@@ -47,7 +48,7 @@ class _Part(Bench):
 
     def _motion(self, index: int, playing: Sequence[Voice], clock: StraightClock) -> Any:
         errors, terms = self._errors[index], []
-        for voice in playing:
+        for voice in (*playing, *second_harmonic.of_voices(playing, errors.harmonic)):
             if self.is_heard(self.owners.get(voice.layer)):
                 at = np.array([voice.frequency])
                 threshold = float(detection_threshold(at, self.threshold)[0])

@@ -45,11 +45,13 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the 
 _chain: Any = import_module("chain").Chain
 _run_virtual: Any = import_module("virtual_loop").run_virtual
 
-SETTLING, STEADY, FIRST = 1.2, 0.25, 0.100  # s
+SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
 SPEED, WAY = 0.2, 0.1  # m/s, m; of the finger that moves
 STEP, REPORTED = 0.0025, 4
 """Steps [s] of the finger that moves, and lifts: longer ones would be taps on the plate. The panel
 reports every fourth."""
+ANSWERS = "answers while moving, above their promise"
+"""Of the contrast over the next 80 ms; its share of 0 dB and more is what is kept."""
 LIFTING = np.arange(0.875, 0, -0.125)  # load of the finger, until the panel reports that it is off
 
 
@@ -98,6 +100,7 @@ class _Event:
     first: PlayReport
     after: _Steady
     path: tuple[tuple[float, float], ...] = ()
+    answers: tuple[PlayReport, ...] = ()
 
 
 class _Wanted:
@@ -171,8 +174,10 @@ class _Session:
             for id, band in enumerate(case.bands_for(contents)):
                 self._wanted.targets[id] = {"band": band}
             self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
-            await asyncio.sleep(HELD if case.resting else 0)
-            on.at = dict(enumerate(self._places))
+            await asyncio.sleep(HELD if len(self._rig.amplifiers) > 1 else 0)
+            for id, at in enumerate(self._places):
+                on.at[id] = at
+                await on.hold(case.apart)
             if case.resting:
                 await on.hold(case.resting)
             before = first = await self._settled(on)
@@ -214,7 +219,9 @@ class _Session:
                 path.append(clock.now())
         after = await self._settled(on)
         first = on.applied[min(count, len(on.applied) - 1)]
-        return _Event(name, max(first.time, began), before, first, after, tuple(pairwise(path)))
+        answers = [each for each in on.applied[count:] if path[0] < each.time < path[-1] - NEXT]
+        way = tuple(pairwise(path))
+        return _Event(name, max(first.time, began), before, first, after, way, tuple(answers))
 
     def _place(self, on: Any, loads: Mapping[str, float]) -> None:
         """Place the fingers on the plate without a report of the panel."""
@@ -285,6 +292,13 @@ def _measured(
             mover = heard[last]
             resting = [mover.contrast_db(each.span) for each in (event.before, event.after)]
             found.events[MOVES].append(mover.contrast_db(*event.path) - float(np.mean(resting)))
+            for each in event.answers:
+                promised = {one.contact.key.id: one for one in each.targets}[last]
+                if promised.promised_contrast_db is not None:
+                    until = each.time + NEXT
+                    spans = [one for one in event.path if each.time <= one[0] < one[1] <= until]
+                    above = mover.contrast_db(*spans) - promised.promised_contrast_db
+                    found.events[ANSWERS].append(above)
         else:
             _note(event, found, heard, timing, case)
     return found

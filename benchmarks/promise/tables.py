@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.promise.cases import Case
-from benchmarks.promise.session import Outcome
+from benchmarks.promise.session import ANSWERS, Outcome
 
 Found = Mapping[Case, Sequence[Outcome]]
 
@@ -32,15 +32,22 @@ def as_markdown(found: Found) -> str:
         columns = [[value for one in each for value in one.events.get(name, [])] for name in names]
         if any(columns):
             cells = [
-                _shown(values, worst=_WORST.get(name, 90))
+                _shown(values, worst=_WORST.get(name, 90)) + _share(name, values)
                 for name, values in zip(names, columns, strict=True)
             ]
             lines.append(f"| {case.title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-_WORST = {"moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
+_WORST = {ANSWERS: 10, "moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
 """Percentile that is the worst tenth, where that is not the 90th."""
+
+
+def _share(name: str, values: Sequence[float]) -> str:
+    """The share of answers that keep their promise."""
+    if name != ANSWERS or not values:
+        return ""
+    return f", {100 * np.mean(np.array(values) >= 0):.0f} % of {len(values)} kept"
 
 
 def kept(found: Sequence[Outcome]) -> float:

@@ -81,9 +81,7 @@ class TouchSimulator:
             Contact(ContactKey("quiet", number), *place, since=0.0)
             for number, place in enumerate(quiet)
         ]
-        return answered(
-            self.table, [(finger, target)], others, self.capabilities, before={}, kept_within=None
-        )
+        return answered(self.table, [(finger, target)], others, self.capabilities, before={})
 
     def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
         """Play a target's content at a finger."""

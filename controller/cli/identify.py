@@ -25,6 +25,11 @@ _NOT_EXPLAINED = (
     "nothing touches the plate, and by era rig check that it is that of the file and wired as it "
     "says"
 )
+_NOT_KNOWN = (
+    "modes must be those of the rig's plate to 2 standard deviations; no rig is written. Its "
+    "fields between the sensors are not known: remove what is bonded to the plate, such as a frame "
+    "along its edges, or use the rig as written; sensors inside the plate show where it differs"
+)
 
 
 def identify(
@@ -164,12 +169,13 @@ def identify(
         else []
     )
     report = identification_report.as_json(found, expected) | measured_json(measured)
+    reason = _NOT_EXPLAINED if found.is_known_well else _NOT_KNOWN
     finish(
         rows,
         report if as_json else None,
         files=files,
         elapsed=time.perf_counter() - started,
-        refusal=None if found.is_explained else _NOT_EXPLAINED,
+        refusal=None if found.is_explained else reason,
     )
 
 

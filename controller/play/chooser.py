@@ -14,9 +14,9 @@ import numpy as np
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Selection, Targets, not_served
+from controller.play.crossfades import Crossfades
 from controller.play.intent import Target
 from controller.play.joint_answer import (
-    KEPT_WITHIN,
     LIMITS_LEAVE_NOTHING,
     Shape,
     answered,
@@ -60,30 +60,31 @@ class ChoiceRequest:
     """What is to be chosen; of what is intended only that.
 
     before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
-    whether what lasts takes longer than the control loop may wait; is_moving: whether only places
-    have changed; is_rested: whether what plays would do, too, but kept its frequencies while a
-    finger moved.
+    whether what lasts takes longer than the control loop may wait; is_rested: whether what plays
+    would do, too, but may be led to what promises more; now [s].
     """
 
     intended: Intention
     before: Mapping[tuple[ContactKey, int], Content]
     kept: tuple[Selection, ...]
     takes_long: bool = False
-    is_moving: bool = False
     is_rested: bool = False
+    now: float = math.inf
 
 
 @dataclass(frozen=True)
 class Choice:
     """What was asked, and what was chosen: for what lasts, and for each finger with a pulse.
 
-    is_limited: whether what lasts has only what pulses leave that play beside it.
+    is_limited: whether what lasts has only what pulses leave that play beside it; steps: to what
+    lasts otherwise, one after the other.
     """
 
     requested: ChoiceRequest
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
-    is_limited: bool
+    is_limited: bool = False
+    steps: tuple[Selection, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,8 @@ class Chooser:
 
     def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
         """Choose what is asked for, what lasts first."""
+        if requested.is_rested:
+            return Choice(requested, None, {}, steps=self._steps(requested, capabilities))
         kept, lasting, is_limited = [*requested.kept], None, False
         if requested.intended.lasting:
             lasting, is_limited = self._lasting(requested, capabilities)
@@ -129,6 +132,19 @@ class Chooser:
             limited = silent(requested.intended, targets, _USED_UP)
         return limited, True
 
+    def _steps(
+        self, requested: ChoiceRequest, capabilities: PlaybackCapabilities
+    ) -> tuple[Selection, ...]:
+        """Choose the steps from what plays to what promises more; none on any failure."""
+        intended = requested.intended
+        targets, quiet = intended.lasting, intended.quiet_beside(intended.lasting)
+        given = self.table, targets, quiet, capabilities, requested.before, intended.protected
+        try:
+            return Crossfades(*given, shape=self.shape).steps()
+        except Exception as error:
+            _logger.error("loop: table failed, keeping what plays", exc_info=error)
+            return ()
+
     def _left_by(
         self, contents: Sequence[Content], capabilities: PlaybackCapabilities
     ) -> PlaybackCapabilities:
@@ -152,11 +168,6 @@ class Chooser:
         table, intended, before = self.table, requested.intended, requested.before
         quiet, protected = intended.quiet_beside(targets), intended.protected
         is_long = requested.takes_long and beside is None
-        kept_within: float | None = KEPT_WITHIN
-        if not is_long:
-            kept_within = math.inf if _is_step(targets, before) else None
-        elif requested.is_moving:
-            kept_within = math.inf
         try:
             answer = answered(
                 table,
@@ -165,7 +176,8 @@ class Chooser:
                 capabilities,
                 before=before,
                 protected=protected,
-                kept_within=kept_within,
+                keeps=is_long or _is_step(targets, before),
+                now=requested.now if is_long else math.inf,
             )
             if not is_long:
                 answer = _alike(answer, targets[0][1])
@@ -260,7 +272,6 @@ def unanswered(requested: ChoiceRequest, reason: str) -> Choice:
         requested,
         None if requested.is_rested else none,
         {each[0].key: silent(intended, (each,), reason) for each in intended.short},
-        is_limited=False,
     )
 
 

@@ -94,7 +94,8 @@ class Content:
     key: of the finger whose content it is, and 0, or the number of a side band of it, which has no
     predictions; targets: that finger, then those that share it; placement: where they are, and all
     others; predictions: one per target, which also depend on others; gain_db: that the layer has,
-    its fingers' strength.
+    its fingers' strength. is_led: whether it takes the place of what its finger feels along a
+    cross-fade, which others hardly notice.
     """
 
     key: tuple[ContactKey, int]
@@ -103,6 +104,7 @@ class Content:
     layer: Layer
     predictions: tuple[Prediction, ...] = field(default=(), compare=False)
     gain_db: float = 0.0
+    is_led: bool = field(default=False, compare=False)
 
     @property
     def frequency(self) -> float | None:

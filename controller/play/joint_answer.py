@@ -1,8 +1,7 @@
 """Contents of fingers from one answer of the table, a layer for each.
 
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
-one promises 3 dB more to the worst finger, or serves more of them. While a finger moves, only the
-latter counts: another frequency begins with an onset, for which the next place does not wait.
+one serves more fingers. What promises more is led over to once all rest (`crossfades`).
 """
 
 import cmath
@@ -13,6 +12,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from controller.play.ahead import felt_on_ways, foreign_on_ways, with_ways
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Prediction, Selection, not_served
 from controller.play.intent import Target, band_of_table
@@ -28,13 +28,10 @@ from model.answer.answer import (
     Sensation,
 )
 from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
-from model.answer.plan import answer, worst_of
+from model.answer.plan import answer
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
-
-KEPT_WITHIN = 3.0
-"""How much more [dB] another frequency must promise to take the place of one that is felt."""
 
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
@@ -60,17 +57,22 @@ def answered(
     *,
     before: Mapping[tuple[ContactKey, int], Content],
     protected: frozenset[ContactKey] = frozenset(),
-    kept_within: float | None = KEPT_WITHIN,
+    keeps: bool = True,
+    now: float = math.inf,
 ) -> Answer:
-    """Answer the fingers of targets and of quiet contacts.
+    """Answer the fingers of targets and of quiet contacts, those that move on their ways.
 
-    before: what fingers feel now, whose frequencies are kept unless others promise so much more
-    [dB]; None to keep none. Raises InputError for fingers that are too close.
+    before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
+    fingers, or more strongly; now [s]: infinite where all rest. Raises InputError for fingers that
+    are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
+    if math.isfinite(now):
+        contacts = [*[contact for contact, _ in targets], *quiet]
+        fingers = with_ways(fingers, contacts, now, table.plate)
     request = partial(
         answer,
         table,
@@ -78,18 +80,16 @@ def answered(
         shaped=is_shaped and not targets[0][1].is_short,  # all or none
         limits=capabilities.limits,
     )
-    kept = fingers if kept_within is None else _kept(fingers, targets, before)
+    kept = _kept(fingers, targets, before) if keeps else fingers
     if kept == fingers:
         return request(fingers)
-    found, within = request(kept), kept_within or 0.0
-    worst, served, lowered = found.promised_worst_db, len(found.layers), _lowered_db(found)
-    least = OWN_CONTRAST_DB if math.isfinite(within) else -math.inf
+    found = request(kept)
+    served, lowered = len(found.layers), _lowered_db(found)
     is_loud = lowered < _SHORT_OF
-    if is_loud and served == len(targets) and (worst is None or worst >= least):
+    if is_loud and served == len(targets):
         return found
     other = request(fingers)
-    gain = worst_of(other) - worst_of(found)
-    is_better = gain >= within or (not is_loud and _lowered_db(other) < lowered)
+    is_better = not is_loud and _lowered_db(other) < lowered
     return other if (len(other.layers), is_better) > (served, False) else found
 
 
@@ -109,14 +109,18 @@ def selection_of(
     before: what fingers feel now, whose phases are kept if is_in_phase.
     """
 
+    count = len(targets) + len(quiet)
+    sensed = felt_on_ways(found, count)
+    here = replace(found, asked=found.asked[:count])  # without the ends of ways
+
     @cache
     def fields() -> Complex64Array:
-        places = [each.finger.at for each in found.fingers[: len(targets)]]
+        places = [each.finger.at for each in sensed[: len(targets)]]
         return table.unit_fields(np.array(places), contacts=places)
 
     contents: list[Content] = []
     skipped: list[Prediction] = []
-    felt, unfelt = [*zip(targets, found.fingers, strict=False)], set[ContactKey]()
+    felt, unfelt = [*zip(targets, sensed, strict=False)], set[ContactKey]()
     for (contact, _), each in felt:
         if each.verdict == HELD_BACK:
             skipped.append(_held_back(contact, each))
@@ -124,6 +128,7 @@ def selection_of(
             unfelt.add(contact.key)
             skipped.append(not_served(contact, reason))
     for layer in found.layers:
+        layer = replace(layer, fingers=tuple([each for each in layer.fingers if each < count]))
         own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
         for number in layer.fingers:
             finger, sensation = felt[number]
@@ -132,7 +137,7 @@ def selection_of(
                 sensations.append(sensation)
         if not own:
             continue
-        contact, placed, voices = own[0][0], found.placement(layer), layer.voices
+        contact, placed, voices = own[0][0], here.placement(layer), layer.voices
         carrier = before.get((contact.key, 0))
         is_continued = carrier is not None and all(
             (then := before.get((contact.key, voice))) is not None
@@ -152,9 +157,8 @@ def selection_of(
                     () if voice else _predictions(own, sensations, layer),
                 )
             )
-    quiet_levels: dict[ContactKey, list[float]] = {}
-    for contact, by_set in zip(quiet, found.tones.foreign_db_sl[len(targets) :], strict=True):
-        quiet_levels[contact.key] = [-math.inf if math.isnan(each) else each for each in by_set]
+    levels = foreign_on_ways(found, count)[len(targets) :]
+    quiet_levels = {contact.key: by_set for contact, by_set in zip(quiet, levels, strict=True)}
     return Selection(
         tuple(targets),
         tuple(quiet),

@@ -39,6 +39,15 @@ RELEASE_RAMP = 0.010
 STRENGTH_FADE = 0.100
 """Time [s] within which what plays is led to another strength, along a raised cosine."""
 
+CROSSFADE = 0.300
+"""Time [s] within which one content takes the place of another, and that falls, by raised cosines.
+
+Shorter ones are heard by the fingers that are on nulls, in time.
+"""
+
+FALL_AFTER = 0.27 * CROSSFADE
+"""Time [s] by which the other falls later, so that its finger feels no dip between."""
+
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
@@ -63,7 +72,8 @@ class LayerContent:
     ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its
     first target would have been lifted, as known when it was sent; between renewal_due and
     renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
-    ended by itself unless it was renewed.
+    ended by itself unless it was renewed. is_falling: whether another content takes its place along
+    a cross-fade: it falls at ending_due, and is not renewed.
     """
 
     content: Content
@@ -76,6 +86,7 @@ class LayerContent:
     renewal_due: float = math.inf
     renewable_until: float = math.inf
     ends_at: float = math.inf
+    is_falling: bool = False
 
     @property
     def settled_after(self) -> float:
@@ -181,6 +192,20 @@ class Layers:
             voices = [each for each in left if each.targets == newest.targets]
             skipped, left = skipped + voices, [each for each in left if each not in voices]
 
+    def may_lead(self, contents: Sequence[Content], now: float) -> bool:
+        """Whether contents may be led to from what plays at a time [s].
+
+        All of their fingers must feel theirs. Each other frequency needs a free layer, and the
+        ledgers must admit both together.
+        """
+        if {each.key for each in contents} - {one.content.key for one in self.contents.values()}:
+            return False
+        before = [(self._led_from(each), each.frequency) for each in contents]
+        tuned = [each for each, new in before if each and each.content.frequency != new]
+        if len(self.may_play) + len(tuned) > self._count:
+            return False
+        return self.check(self._sets(contents, now, is_shaped=True)[0].by_amplifier) is None
+
     def silence(self, ramp: float, now: float) -> Sets:
         """Return the silence of all layers along a ramp [s]; nothing if they are silent."""
         if self.is_silent:
@@ -192,12 +217,18 @@ class Layers:
     def endings(self, now: float) -> Sets:
         """Return the sets that give endings to what plays, where that is due at a time [s].
 
-        By a set of its own, so that no touch waits for them. What a ledger refuses fades.
+        By a set of its own, so that no touch waits for them. What a ledger refuses fades. What
+        gives way to another content falls.
         """
         layers: dict[int, PlateLayer] = {}
         endings: dict[int, answer.Layer] = {}
         for number, one in self.contents.items():
-            if one.ending_due <= now:
+            if one.ending_due <= now and one.is_falling:
+                layers[number] = self.builder.build_fall(
+                    number, one.layer.excitation, ramp=CROSSFADE, playing=self._drive_of(number)
+                )
+                endings[number] = one.layer
+            elif one.ending_due <= now:
                 content = one.content
                 layers[number], endings[number] = self.builder.build_ending(
                     number,
@@ -284,6 +315,10 @@ class Layers:
     def ended(self, now: float) -> tuple[Content, ...]:
         """Return the contents that have ended by themselves by a time [s], once."""
         over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
+        fallen = {number for number in over if self.contents[number].is_falling}
+        self.may_play -= fallen
+        self._replace({n: one for n, one in self.contents.items() if n not in fallen})
+        over = [number for number in over if number not in fallen]
         for number in over:
             self._change(number, drive={})
         contents = tuple(self.contents[number].content for number in over)
@@ -300,7 +335,10 @@ class Layers:
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: what plays in its own, else a finger's, new ones in those that end."""
+        """Contents by layer: what plays in its own, else a finger's, new ones in those that end.
+
+        One that another gives way to has one that is free.
+        """
         numbers: dict[int, Content] = {}
         for number, one in self.contents.items():
             if one.content in contents:  # what is predicted of it may differ
@@ -310,11 +348,16 @@ class Layers:
             if content in kept:
                 continue
             known = self._layer_of.get(content.key)
+            before = self._led_from(content)
+            if before is not None and before.content.frequency != content.frequency:
+                free = [n for n in range(self._count) if n not in self.may_play | numbers.keys()]
+                known = next(iter(free), known)
             if known is None or known in numbers:  # a pulse beside what others share
                 new.append(content)
             else:
                 numbers[known] = content
-        for number in (*sorted(self.may_play), *range(self._count)):
+        falling = {n for n, one in self.contents.items() if one.is_falling}
+        for number in (*sorted(self.may_play - falling), *range(self._count)):
             if new and number not in numbers:
                 numbers[number] = new.pop(0)
         return numbers
@@ -346,7 +389,8 @@ class Layers:
         self.is_silent = False
         layer_of: dict[tuple[ContactKey, int], int] = {}
         for number, one in playing.items():
-            layer_of.setdefault(one.content.key, number)
+            if not one.is_falling:
+                layer_of.setdefault(one.content.key, number)
         self._layer_of = layer_of
         self.may_play |= sets.started
 
@@ -365,15 +409,15 @@ class Layers:
         settled = [0.0]
         for number in starting:
             content = numbers[number]
-            left, is_led = _all_left(content, now), self._is_led(number, content)
+            left, fade = _all_left(content, now), self._fade_of(number, content)
             layers[number], played = self.builder.build_pattern(
                 number,
-                replace(content.layer, ramp=STRENGTH_FADE) if is_led else content.layer,
+                replace(content.layer, ramp=fade) if fade else content.layer,
                 content.placement,
                 playing=self._drive_of(number),
                 valid_for=self._lasts(content, left, now),
                 restarts=number in restarting,
-                is_led=is_led,
+                is_led=fade > 0,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
                 among=len(starting),
             )
@@ -381,16 +425,43 @@ class Layers:
             playing[number] = LayerContent(content, played, is_shaped=may_end)
             settled.append(playing[number].settled_after)
         for number in self.may_play - numbers.keys():
+            if is_shaped and (falling := self._falling(number, contents, now)) is not None:
+                playing[number] = falling
+                continue
             has_endings = is_shaped and self._may_end_shaped(number, now)
             layers[number] = self.builder.build_end(number, has_endings=has_endings)
             settled.append(self.builder.end_ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
 
-    def _is_led(self, number: int, content: Content) -> bool:
-        """Whether a content goes on in its layer at another strength."""
-        before = self.contents[number].content if number in self.contents else content
-        same = [(one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content)]
-        return same[0] == same[1] and before.gain_db != content.gain_db
+    def _fade_of(self, number: int, content: Content) -> float:
+        """How long [s] a content is led to from what its finger feels; 0 where it begins."""
+        before = self.contents[number].content if number in self.contents else None
+        same = [
+            (one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content) if one
+        ]
+        if before is not None and before.gain_db != content.gain_db:
+            return STRENGTH_FADE if same[0] == same[1] else 0.0
+        is_led = self._led_from(content) is not None and same[0] == same[-1]
+        return CROSSFADE if is_led else 0.0
+
+    def _led_from(self, content: Content) -> LayerContent | None:
+        """What its finger feels, and a content that is led to takes the place of."""
+        one = self.contents.get(self._layer_of.get(content.key, -1))
+        if one is None or not content.is_led or one.content == content:
+            return None
+        return None if one.content.targets[0][1].is_short else one
+
+    def _falling(self, number: int, contents: Sequence[Content], now: float) -> LayerContent | None:
+        """What a layer plays, if it gives way to one of these contents; None if it ends at once."""
+        if (one := self.contents.get(number)) is None:
+            return None
+        for content in contents:
+            if one.is_falling and content.is_led and content.key == one.content.key:
+                return one
+            if self._led_from(content) is one:
+                due = now + FALL_AFTER
+                return replace(one, is_falling=True, ending_due=due, renewal_due=math.inf)
+        return None
 
     def _fades(self, sets: Sets) -> bool:
         """Whether anything that plays is ended or replaced."""

@@ -105,6 +105,7 @@ class Planner:
         self._selector = Selector(
             Chooser(table, self.layers.builder.shape),
             arrived=self._note_answer,
+            may_lead=self.layers.may_lead,
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
         self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused

@@ -149,6 +149,30 @@ class SetBuilder:
         layer = Layer(number, ramp=ramp, valid_for=valid_for, renew=True)
         return dict.fromkeys(self.rig.amplifiers, layer)
 
+    def build_fall(
+        self, number: int, excitation: physics.Excitation, *, ramp: float, playing: Drive
+    ) -> PlateLayer:
+        """Build the set by which a layer falls along a ramp [s] to what nobody feels, and ends.
+
+        Not to silence, on the way to which no later set could end it sooner, as under a finger that
+        lifts. playing: what each ERA plays now in this layer.
+        """
+        least = _LEVEL.from_wire(1)
+        faint = {
+            name: replace(tone, amplitude=least * self.rig.strokes[name])
+            for name, tone in excitation.items()
+        }
+        ramp = min(ramp, self.ramp_max)
+        return route(
+            faint,
+            self.rig,
+            ramp=ramp,
+            number=number,
+            playing=playing,
+            restarted=frozenset(),
+            valid_for=ramp,
+        )
+
     def build_end(self, number: int, *, has_endings: bool) -> PlateLayer:
         """Build the set that ends a layer along its endings, or along a ramp."""
         if has_endings:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 
+from controller.play.ahead import STRETCH
 from controller.play.answer_thread import MAX_LATE, TIME_LIMIT, AnswerThread
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.chooser import (
@@ -36,11 +37,18 @@ from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
-# radius is still within the disc that the pattern was chosen for.
-MOVE_TOLERANCE = 0.008
+# radius is still within the disc that the pattern was chosen for. One that moves is answered for
+# this way ahead.
+MOVE_TOLERANCE = STRETCH
 
-# s; a finger that has not moved further for so long rests, and contents are chosen anew for it.
+# s; fingers of which none has come, left or moved further for so long rest.
 _RESTS_AFTER = 0.1
+
+CROSSFADE_INTERVAL = 0.4
+"""Time [s] from one step of a way to a better answer to the next, each of another finger."""
+
+MIN_INTERVAL = 1.0
+"""Time [s] from the last step of such a way to the next way."""
 
 GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
 BLOCKED = (
@@ -66,11 +74,6 @@ def _is_met_by(intended: Intention, chosen: Selection) -> bool:
         and (key in intended.protected) == (key in chosen.protected)
         for key, contact in now.items()
     )
-
-
-def _is_moved_from(intended: Intention, chosen: Selection) -> bool:
-    """Whether those that feel what was chosen are to feel it still, in other places."""
-    return _is_among(intended, chosen) and _is_part_of(intended, chosen, _of_any_level)
 
 
 def _is_among(intended: Intention, chosen: Selection) -> bool:
@@ -112,10 +115,11 @@ class Selector:
     a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
     targets and their levels do, no contact has moved more than 8 mm, and none has another load,
     which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
-    others as they are: a change would be felt. An answer that takes too long is given up: all that
+    others as they are. Once all rest, contents are led to a better answer, if there is one, a step
+    after the other, until anything changes. An answer that takes too long is given up: all that
     lasts is silent until its fingers change, or until that answer has ended at last. chooser:
     answers the next question; what the thread computes goes on by the former one. arrived: called
-    when the thread is done.
+    when the thread is done; may_lead: whether contents may be led to from what plays at a time [s].
     """
 
     def __init__(
@@ -123,17 +127,22 @@ class Selector:
         chooser: Chooser,
         *,
         arrived: Callable[[], None] = lambda: None,
+        may_lead: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
-        self.chooser = chooser
+        self.chooser, self._may_lead = chooser, may_lead
         self._thread: AnswerThread[Choice] = AnswerThread(arrived, self._request_again)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
         self._is_outdated = False  # what the thread computes
+        self._is_limited = False  # what lasts, by pulses that play
+        self._situation: object = None
+        self._steps: Sequence[Selection] = ()  # to a better answer
+        self._led_at = -math.inf  # s; by the last step
         self.requests = 0
         """How often the thread was asked."""
         self.due = math.inf
-        """When [s] to select anew though no contact changes: a finger rests, a pulse has ended."""
+        """When [s] to select anew though no contact changes: all rest, or pulses have ended."""
 
     @property
     def is_choosing(self) -> bool:
@@ -171,10 +180,13 @@ class Selector:
         back = came.intersection([contact.key for contact, _ in self._lasting.targets])
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
+        if (situation := _situation_of(intended)) != self._situation:
+            self._situation = situation
+            self._rest_again(now)
         arrived = self._thread.take() if self._thread.is_busy else None
         if arrived is not None:
             is_late = self._is_outdated or not self._is_intended(arrived, intended)
-            self._take(arrived, is_late=is_late)
+            self._take(arrived, now, is_late=is_late)
             self._is_outdated = False
         pulses, self._short = self._short, {}
         for contact, target in short:
@@ -191,9 +203,9 @@ class Selector:
                 intended, pulses, now, has_waited=arrived is not None
             ):
                 if not requested.takes_long:
-                    self._take(chooser.choose(requested, capabilities))
+                    self._take(chooser.choose(requested, capabilities), now)
                 elif self._thread.is_blocked:
-                    self._take(unanswered(requested, BLOCKED))
+                    self._take(unanswered(requested, BLOCKED), now)
                 else:
                     self.requests += 1
                     self._thread.compute(
@@ -209,7 +221,21 @@ class Selector:
 
     def choose_anew(self) -> None:
         """Choose anew what lasts, silent until then; what the thread computes is not taken."""
-        self._lasting, self._is_outdated = _NOTHING, self._thread.is_busy
+        self._lasting, self._steps, self._is_outdated = _NOTHING, (), self._thread.is_busy
+
+    def _rest_again(self, now: float) -> None:
+        """Leave the way to a better answer, if any, until all have rested."""
+        self._steps, self.due = (), max(now + _RESTS_AFTER, self._led_at + MIN_INTERVAL)
+
+    def _lead(self, now: float) -> None:
+        """Take the next step to a better answer at a time [s], if the amplifiers can."""
+        step, *self._steps = self._steps
+        if not self._may_lead(step.contents, now):
+            self._steps = ()
+            return
+        self._lasting = step
+        self._led_at = now
+        self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
     def _request_again(self) -> None:
         """Ask anew for fingers that were left without an answer, since one has ended."""
@@ -230,11 +256,21 @@ class Selector:
         """
         lasting = intended.lasting
         is_kept = not lasting or _is_met_by(intended, self._lasting)
-        is_due = self.due < math.inf and self.due <= now
-        is_rested = bool(lasting) and is_due and is_kept
-        if is_due:
-            self.due = now + _RESTS_AFTER if lasting and not is_rested else math.inf
         new = tuple([each for each in intended.short if each[0].key not in self._short])
+        is_due, takes_long = self.due < math.inf and self.due <= now, False
+        if is_due:
+            self.due = math.inf
+            is_kept = is_kept and not self._is_limited  # by pulses that have ended
+        if lasting:
+            takes_long = not is_alone(lasting, intended.protected)
+        is_rested = is_due and is_kept and takes_long
+        velocities = [each.motion.velocity(now) for each in intended.contacts]
+        if is_rested and (new or self._playing(now) or any(map(any, velocities))):
+            self._rest_again(now)
+            is_rested = False
+        if is_rested and self._steps:
+            self._lead(now)
+            return
         if is_kept and not is_rested and not new:
             return
         felt = _felt(self._lasting, self._fingers.keys())
@@ -247,16 +283,15 @@ class Selector:
             new = ()
         if is_kept and not is_rested:
             return
-        takes_long = not is_alone(lasting, intended.protected)
-        is_moving = takes_long and not is_rested and _is_moved_from(intended, self._lasting)
-        self.due = now + _RESTS_AFTER if is_moving else math.inf
+        if not is_rested:
+            self._rest_again(now)
         yield ChoiceRequest(
             replace(intended, short=new),
             before,
             self._playing(now),
             takes_long,
-            is_moving,
             is_rested,
+            now,
         )
 
     def _playing(self, now: float) -> tuple[Selection, ...]:
@@ -276,22 +311,30 @@ class Selector:
             return True  # in doubt nothing plays
         return (
             found is not None
-            and (chosen.requested.is_rested or not _is_met_by(intended, self._lasting))
+            and (self._is_limited or not _is_met_by(intended, self._lasting))
             and _is_among(intended, found)
             and intended.protected <= found.protected
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
         )
 
-    def _take(self, chosen: Choice, *, is_late: bool = False) -> None:
-        """Take what was chosen; is_late: without what lasts."""
+    def _take(self, chosen: Choice, now: float, *, is_late: bool = False) -> None:
+        """Take what was chosen, at a time [s]; is_late: without what lasts."""
         self._short = {**self._short, **chosen.short}
+        if chosen.steps and _situation_of(chosen.requested.intended) == self._situation:
+            self._steps, self.due = chosen.steps, now
         if chosen.lasting is not None and not is_late:
-            self._lasting = chosen.lasting
+            self._lasting, self._is_limited = chosen.lasting, chosen.is_limited
             if self._lasting.reason in _UNANSWERED:
                 self.due = math.inf
             if chosen.is_limited:
                 ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER
+
+
+def _situation_of(intended: Intention) -> object:
+    """Equal as long as the same fingers are to feel the same of what lasts, in any places."""
+    contacts = frozenset([(each.key, each.since, each.load) for each in intended.contacts])
+    return contacts, _targets_of(intended.lasting), intended.protected
 
 
 def _together(

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from controller.sources.eviction import to_evict
 from controller.sources.loads import LANDING, followed
+from controller.sources.motion import AT_REST, Motion
 from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
@@ -43,7 +44,7 @@ class Contact:
     """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
 
     load: relative to the rig's fingertip, bounded and in steps, 1 where nothing is
-    reported.
+    reported. motion: its way of late.
     """
 
     key: ContactKey
@@ -51,6 +52,7 @@ class Contact:
     y: float
     since: float
     load: float = 1.0
+    motion: Motion = field(default=AT_REST, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +202,8 @@ class ContactTracker:
         if touch.load is not None and time - since >= LANDING:
             load = followed(load, touch.load)
         x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
-        return Contact(key, x, y, since, load)
+        motion = AT_REST if known is None else known.motion
+        return Contact(key, x, y, since, load, motion.followed(time, x, y))
 
     def _keep_taps(self, frame: TouchFrame) -> None:
         """Keep contacts that have just come down and are not in a frame any more."""

@@ -37,7 +37,7 @@ class ExpectedSet:
                 return False
             self.drop()
             self._began = when
-        return self._parts.keep(part, when[1])
+        return not self.staged and self._parts.keep(part, when[1])
 
     def sent(self, last: Values) -> str:
         """Note the last part of a set that is sent; returns what is wrong with it, or ""."""

@@ -249,6 +249,14 @@ def is_last(part: Values) -> bool:
     return bool(part["index"] >= part["parts"] - 1)
 
 
+def is_earlier_part(number: int, words: Sequence[int]) -> bool:
+    """Whether words of a message are a part but the last, whatever else is wrong with them."""
+    message = MESSAGES["Set"]
+    at = message.request.places["index"]
+    is_headed = number == message.number and len(words) > at
+    return is_headed and words[at] >> 8 < (words[at] >> 1) % 128 - 1
+
+
 @dataclass
 class Assembly:
     """Parts of one set but the last, as they arrive, in any order and repeatedly.

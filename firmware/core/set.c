@@ -169,10 +169,9 @@ bool intake_keep(struct intake *intake, uint16_t token, uint16_t bits, const str
             return false;
         begin(intake, token, parts, now);
     }
-    if (intake->parts != parts)
+    if (intake->parts != parts || intake->is_staged)
         return false;
-    if (!intake->is_staged) // else it came again
-        insert(intake, (uint8_t)FIELD_OF(bits, SET_INDEX), part);
+    insert(intake, (uint8_t)FIELD_OF(bits, SET_INDEX), part);
     return true;
 }
 

@@ -36,18 +36,23 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     """Weighted acceleration at each finger of an answer, root mean square [m/s²].
 
     Of all vibrations together, normal to the plate, at the loudest point of the fingertip, while
-    they are at their full strength; nine of ten plates do not exceed it.
+    they are at their full strength; nine of ten plates do not exceed it. Beyond 1 kHz, where
+    thresholds end, harmonics do not count.
     """
     tones, contents = found.tones, found.contents
     if not tones.rows:
         return [0.0] * len(contents.places)
     rows = np.array(tones.rows)
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
-    power = fingers.powers(PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64))
-    threshold = table.thresholds[rows] * hand_weighting(table.frequencies[rows])
-    factors = (tones.gains * threshold).astype(np.float32) ** 2 / 2
-    power = power * factors[:, None, None, None]
+    drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
+    frequencies, at_harmonics = table.frequencies[rows], table.harmonic_thresholds[rows]
+    factors, of_harmonics = (
+        (tones.gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
+        for each, at in ((table.thresholds[rows], frequencies), (at_harmonics, 2 * frequencies))
+    )
+    power = fingers.powers(*drawn) * factors.astype(np.float32)[:, None, None, None]
+    harmonics = fingers.harmonics(*drawn) * of_harmonics.astype(np.float32)[:, None, None]
     return [
-        promise(np.sqrt(loudest_power(power, rows, finger)), 100 - PROMISED_PERCENTILE)
+        promise(np.sqrt(loudest_power(power, harmonics, rows, finger)), 100 - PROMISED_PERCENTILE)
         for finger in range(len(contents.places))
     ]

@@ -7,6 +7,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
 from model.drive_modes.forms import Forms
+from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate, outer
@@ -25,11 +26,15 @@ MAX_VARIANCE_FINE = 0.005
 
 @dataclass(frozen=True, eq=False)
 class FingersOnPlate:
-    """The plate of a table with k fingers on it, and the shapes under these."""
+    """The plate of a table with k fingers on it, and the shapes under these.
+
+    at_harmonics: the same at twice the table's frequencies; None where ERAs have no harmonics.
+    """
 
     table: LocalizationTable
     tips: FingertipShapes
     touched: TouchedPlate
+    at_harmonics: TouchedPlate | None
 
     @classmethod
     def of(
@@ -46,11 +51,18 @@ class FingersOnPlate:
         """
         if by_kernel:
             tips = read_fingertips(table, places)
-            return cls(table, tips, touch(table.on_eras, tips.few[:, 0], loads))
-        tips = table.raster.fingertips(np.array(places), table.shapes)
+        else:
+            tips = table.raster.fingertips(np.array(places), table.shapes)
         centres = tips.few[:, 0]
-        stiffness = table.attached.finger_stiffness(len(centres), loads)
-        return cls(table, tips, TouchedPlate(table.on_eras, centres, stiffness))
+
+        def touched(on: PlateOnEras) -> TouchedPlate:
+            if by_kernel:
+                return touch(on, centres, loads)
+            return TouchedPlate(on, centres, on.plate.finger_stiffness(len(centres), loads))
+
+        has_harmonics = table.uncertainty.harmonic > 0
+        twice = touched(table.at_harmonics) if has_harmonics else None
+        return cls(table, tips, touched(table.on_eras), twice)
 
     def forms(self, rows: IntArray, *, with_fine: bool) -> "FingerForms":
         """What the fingers have of the ERAs at rows (f,) of the table's frequencies.
@@ -58,7 +70,7 @@ class FingersOnPlate:
         with_fine: at their fine points, too.
         """
         tips, fine = self.tips, self.tips.fine if with_fine else None
-        power = self.table.error_power
+        power = self.table.search_error_power
         return FingerForms(
             self, rows, self.touched.forms(rows, tips.few, tips.few_weights, power, fine)
         )
@@ -76,14 +88,26 @@ class FingersOnPlate:
     ) -> tuple[Float32Array, Float32Array]:
         """Mean amplitude over each fingertip, and power at its loudest point, of c drives.
 
+        With the second harmonics in the latter.
+
         owners (m,): the drive of each tone, ascending; both (c, k, 1 + d).
         """
+        starts = np.flatnonzero(np.diff(owners, prepend=-1))
+        harmonics = np.add.reduceat(self.harmonics(by, rows, weights), starts)
         if len(rows) == 1 + owners[-1]:
             sensed = self.drawn(by, rows, weights)
-            return sensed.means, sensed.loudest
+            return sensed.means, sensed.loudest + harmonics
         power = self.powers(by, rows, weights).reshape(len(rows), -1, 1 + by.count)
-        starts = np.flatnonzero(np.diff(owners, prepend=-1))
-        return over_fingertips(np.add.reduceat(power, starts), self.tips.fine_weights)
+        means, loudest = over_fingertips(np.add.reduceat(power, starts), self.tips.fine_weights)
+        return means, loudest + harmonics
+
+    def harmonics(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
+        """Squared amplitude to threshold of second harmonics at fingers, (m, k, 1 + d)."""
+        if self.at_harmonics is None:
+            return np.zeros((len(rows), len(self.tips.few), 1 + by.count), dtype=np.float32)
+        tips, threshold = self.tips, self.table.harmonic_thresholds[rows]
+        found = self.at_harmonics.harmonics(by, rows, weights, tips.few, tips.few_weights)
+        return np.asarray(found / np.square(threshold)[:, None, None])
 
     def powers(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
         """Squared amplitudes to threshold of tones at fine points, (m, k, p, 1 + d)."""

@@ -62,23 +62,35 @@ def promised(
     """
     shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
+    harmonics = fingers.harmonics(PROMISED_DRAWS, rows, weights)
     if any(stream.duration is not None for stream in streams):
-        power = _over_durations(fingers, contents, steady, rows, weights, owners, ringing)
+        over = fingers, contents, steady, rows, weights, owners, ringing
+        power, gains_over = _over_durations(*over)
+        harmonics = harmonics * np.square(gains_over)[:, None, None]
     by_tone, factor = gains, 1.0
     if by_tone is None:
         of_contents, factor = _gains_to_levels(
-            contents, power, steady, shares, rows, weights, owners
+            contents, power, steady, harmonics, shares, rows, weights, owners
         )
         by_tone = of_contents[owners]
-    power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
+    squares = np.square(by_tone, dtype=np.float32)[:, None, None]
+    power, harmonics, table = power * squares[..., None], harmonics * squares, fingers.table
     level = np.full((k, 2), np.nan)
     for j, stream in enumerate(streams):
         for finger in stream.targets:
             felt = felt_amplitudes(power, shares, rows, owners == j, (finger,))
             level[finger] = felt[0], promise(felt)
+    sensitivities = table.sensitivities[:, rows], table.harmonic_sensitivities[:, rows]
     by_set = [
-        _compared(contents, power * factors[:, None, None, None], shares, rows, owners)
-        for factors in np.square(fingers.table.sensitivities[:, rows])
+        _compared(
+            contents,
+            power * np.square(at_tones)[:, None, None, None],
+            harmonics * np.square(at_harmonics)[:, None, None],
+            shares,
+            rows,
+            owners,
+        )
+        for at_tones, at_harmonics in zip(*sensitivities, strict=True)
     ]
     contrast, of_others, worst = (np.array(each) for each in zip(*by_set, strict=True))
     return Tones(
@@ -98,13 +110,15 @@ def promised(
 def _compared(
     contents: Contents,
     power: Float32Array,
+    harmonics: Float32Array,
     shares: Float32Array,
     rows: IntArray,
     owners: IntArray,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Contrast (k, 3), what is felt of others (k,), and the promised contrast of all fingers.
 
-    By one set of thresholds, to which power (m, k, p, d) is; NaN where there is nothing to compare.
+    By one set of thresholds, to which power (m, k, p, d) and that of harmonics (m, k, d) are; NaN
+    where there is nothing to compare.
     """
     streams, k = contents.streams, len(contents.places)
     contrast, of_others = (np.full(size, np.nan) for size in ((k, 3), k))
@@ -120,7 +134,8 @@ def _compared(
                 felt = felt_amplitudes(power, shares, rows, ~others, (finger,))
         if not others.any():
             continue
-        heard = np.sqrt(np.maximum(loudest_power(power[others], rows[others], finger), _TINY))
+        heard = loudest_power(power[others], harmonics[others], rows[others], finger)
+        heard = np.sqrt(np.maximum(heard, _TINY))
         ratios.append(felt / heard)
         of_others[finger] = promise(heard, 100 - PROMISED_PERCENTILE)
         contrast[finger] = figures(ratios[-1])
@@ -138,29 +153,35 @@ def _over_durations(
     weights: Complex64Array,
     owners: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
-) -> Float32Array:
-    """Power (m, k, p, d) of tones over the durations of their contents."""
-    power, table = steady.copy(), fingers.table
+) -> tuple[Float32Array, Float32Array]:
+    """Power (m, k, p, d) of tones over the durations of their contents, and gains (m,) over these.
+
+    Gains are those of amplitudes at the target.
+    """
+    power, table, gains = steady.copy(), fingers.table, np.ones(len(rows), dtype=np.float32)
     strokes = np.array([era.stroke for era in table.eras])
     for tone, owner in enumerate(owners.tolist()):
         stream, over = contents.streams[owner], ringing[owner]
         if stream.duration is None:
             continue
         if over is None:  # along a shaped onset
-            power[tone] *= np.float32(shaped_gain(stream.duration) ** 2)
+            gains[tone] = shaped_gain(stream.duration)
+            power[tone] *= gains[tone] ** 2
             continue
         frequency = float(table.frequencies[rows[tone]])
         felt, own = over.over([(frequency, weights[tone] * strokes)]), [*stream.targets]
         at_targets = power[tone, own] * np.square(felt.gains[own])[:, None, None]
-        power[tone] = on_drawn_plates(steady[tone], felt.heard, felt.gains[own].min())
+        gains[tone] = felt.gains[own].min()
+        power[tone] = on_drawn_plates(steady[tone], felt.heard, gains[tone])
         power[tone, own] = at_targets
-    return power
+    return power, gains
 
 
 def _gains_to_levels(
     contents: Contents,
     power: Float32Array,
     steady: Float32Array,
+    harmonics: Float32Array,
     shares: Float32Array,
     rows: IntArray,
     weights: Complex64Array,
@@ -178,7 +199,9 @@ def _gains_to_levels(
         lasting = felt_amplitudes(steady, shares, alone, owners == j, stream.targets)
         gains[j] = levels[j] / max(felt[0], 1e-30)
         if others := contents.others(j):
-            at = [loudest_power(power[owners == j], rows[owners == j], each) for each in others]
+            own = owners == j
+            of_own = power[own], harmonics[own], rows[own]
+            at = [loudest_power(*of_own, each) for each in others]
             contrast = promise(felt / np.sqrt(np.maximum(np.max(at, axis=0), _TINY)))
             allowed = _allowed_gain(levels[j], float(felt[0]), contrast)
             gains[j] = min(gains[j], max(allowed, levels[j] / max(promise(lasting), 1e-30)))
@@ -247,17 +270,20 @@ def felt_amplitudes(
     return np.asarray(np.min([shares[t] @ np.sqrt(squares[t]) for t in targets], axis=0))
 
 
-def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:
+def loudest_power(
+    power: Float32Array, harmonics: Float32Array, rows: IntArray, finger: int
+) -> Float32Array:
     """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
 
-    Of contents of one frequency, by rows (j,), the amplitudes add.
+    Of contents of one frequency, by rows (j,), the amplitudes add. With that of their second
+    harmonics over the fingertip, (j, k, d), of any phase.
     """
     at = power[:, finger]
     total = np.zeros(at.shape[1:], dtype=at.dtype)
     order = np.argsort(rows, kind="stable").tolist()
     for _, same in groupby(order, key=rows.__getitem__):
         total += np.sqrt(at[list(same)]).sum(axis=0) ** 2
-    return np.asarray(total.max(axis=0))
+    return np.asarray(total.max(axis=0) + harmonics[:, finger].sum(axis=0))
 
 
 def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:

@@ -56,9 +56,9 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     count, n, k = len(streams), len(table.eras), len(places)
     kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
     plates, raster, rules, by_count = kept
-    judging, promise, stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
+    judging, promise, *stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
     if contents.loads.count(1.0) < len(contents.loads):
-        stiffness = table.attached.finger_stiffness(k, contents.loads)
+        stiffness = [*_stiffness(table, k, contents.loads)]
     # Not arrays of numpy, of which each takes as long to make and to read as all of these.
     numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
     at = array("d", [coordinate for place in places for coordinate in place])
@@ -67,7 +67,8 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
         *(count, len(streams[0].bands), k, len(quiet)),
         *(contents.candidates, contents.combinations),
         *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
-        *(at.buffer_info()[0], stiffness.ctypes.data),
+        at.buffer_info()[0],
+        *(each.ctypes.data for each in stiffness),
         None if background is None else background.ctypes.data,
         *(addressof(judging), addressof(promise)),
     )
@@ -98,8 +99,9 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     )
 
 
-_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array]
-"""Plates that judge and those of the promise, and the stiffness of fingers that press lightly."""
+_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array, Complex64Array]
+"""Plates that judge and those of the promise, and the stiffness of fingers that press lightly, also
+at twice the frequencies."""
 
 _Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
 """What kernels read of a table; and of so many fingers."""
@@ -111,7 +113,17 @@ def _with(table: LocalizationTable, fingers: int) -> _Fingers:
     judging, promise = (
         draws_structure(table.on_eras, fingers, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
     )
-    return judging, promise, table.attached.finger_stiffness(fingers)
+    return judging, promise, *_stiffness(table, fingers)
+
+
+def _stiffness(
+    table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()
+) -> tuple[Complex64Array, Complex64Array]:
+    """Stiffness of fingers at a table's frequencies, and at twice these where harmonics count."""
+    stiffness = table.attached.finger_stiffness(fingers, loads)
+    if not table.uncertainty.harmonic:
+        return stiffness, stiffness
+    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads)
 
 
 def _kept_of(table: LocalizationTable) -> _Kept:
@@ -120,7 +132,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
     variance = uncertainty.gain_variance
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
-        *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.thickness > 0),
+        *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.frequency > 0),
         *(variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
         *(PERCENTILE, PROMISED_PERCENTILE),
         *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
@@ -137,7 +149,12 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         shares=table.attached.power_shares,
         frequencies=table.frequencies,
         sensitivities=table.sensitivities.T,
+        search_error=table.search_error_power,
+        harmonic_threshold=table.harmonic_thresholds,
+        harmonic_sensitivities=table.harmonic_sensitivities.T,
     )
+    if uncertainty.harmonic > 0:
+        rules.at_harmonics = addressof(plates_structure(table.at_harmonics))
     return plates_structure(table.on_eras), given_raster(table), rules, {}
 
 

@@ -100,7 +100,7 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     shares = np.zeros_like(weights)
     shares[others] = weights[others] / np.float32(len(others))
     every = points.reshape(1, -1, points.shape[2])
-    found = touched.forms(rows, every, shares.reshape(1, -1), table.error_power)
+    found = touched.forms(rows, every, shares.reshape(1, -1), table.search_error_power)
     fields = found.fields.reshape(len(rows), *points.shape[:2], -1)
     mean = (weights[target] @ fields[:, target])[None]
     level, threshold = float(contents.levels[0]), table.thresholds.take(rows)

@@ -148,10 +148,11 @@ def uncertainty_of(
     fitted = {
         "gain": _rounded(gain),
         "phase_deg": _rounded(phase_deg),
-        "thickness": _rounded(rms("modulus") / 2) if known["modulus"] else before.thickness,
         "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
+    if known["modulus"]:
+        fitted |= Uncertainty.of_frequency(_rounded(rms("modulus") / 2))
     return Uncertainty.clipped(**asdict(before) | fitted)
 
 

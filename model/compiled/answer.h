@@ -3,7 +3,7 @@
 #define ANSWER_H
 
 #include "choice.h"
-#include "drawn.h"
+#include "harmonics.h"
 #include "fingertips.h"
 #include "forms.h"
 #include "search.h"
@@ -22,7 +22,9 @@ typedef struct {
     int sets;                      /* of thresholds, the rig's own first */
     const int *rim, *group;        /* (n) of each ERA */
     const float *threshold, *error, *shares, *frequencies; /* (f); (f, n); (f, n, n) or NULL, as of `grouped`; (f) [Hz] */
-    const float *sensitivities;    /* (f, sets) by which amplitudes to the thresholds of a set are higher */
+    const float *sensitivities, *harmonic_sensitivities; /* (f, sets) by which amplitudes to a set's are higher, and at 2 f */
+    const float *search_error, *harmonic_threshold;        /* (f, n) error and harmonics, of searches; (f) */
+    const plates *at_harmonics;                            /* at twice the frequencies; NULL without harmonics */
 } rules;
 
 /* Fingers (k) and contents, as given. */
@@ -35,6 +37,7 @@ typedef struct {
     const float *level;         /* (contents) amplitude to threshold */
     const double *places;       /* (k, 2) [m] */
     const float *stiffness;     /* (f, k) of fingers */
+    const float *at_harmonics;  /* the same at twice the frequencies */
     const float *background;    /* (f, n, n) form of the rest of the plate, for no other finger */
     const draws *judging, *promise;
 } asked;
@@ -46,6 +49,7 @@ typedef struct {
     const int *starts, *targets, *quiet, *priority;
     const float *level, *background;
     const draws *judging, *promise;
+    distortion harmonics;
     int rows, few, fine;        /* that any band holds; points of a finger */
     int *row, *band;            /* (rows) of the table; (contents, bands, 2) of these */
     const float *few_points, *fine_points, *few_weights, *fine_weights;

@@ -51,7 +51,7 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     }
     const grouped all = {.groups = 1, .p = k * p, .others = by->others, .gain_variance = by->gain_variance,
                          .ridge = by->ridge, .points = is_coarse ? on->centres : of->few_points, .weights = weights,
-                         .error = by->error, .shares = by->shares};
+                         .error = by->search_error, .shares = by->shares};
     formed found = new_forms(on, &all, memory);
     best reached = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};
     value *target = values(memory, n);
@@ -272,7 +272,7 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
         has_fine |= (int)find_others(is_other, of, content, k) <= by->max_by_point;
     const grouped each = {.groups = k, .p = of->few, .fine = has_fine ? k * of->fine : 0, .others = by->others,
                           .gain_variance = by->gain_variance, .ridge = by->ridge, .points = of->few_points,
-                          .fine_points = of->fine_points, .weights = of->few_weights, .error = by->error,
+                          .fine_points = of->fine_points, .weights = of->few_weights, .error = by->search_error,
                           .shares = by->shares};
     formed *found = take(memory, blocks * sizeof(formed));
     searched *forms = take(memory, blocks * sizeof(searched));

@@ -15,11 +15,14 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
         const sensors at = {.points = points, .rows = of->fine_points, .weights = of->fine_weights, .error = by->error,
                             .threshold = by->threshold};
         const tones drawn = respond(on, draws, &at, columns, some, from->rows + first, from->weights + 2 * n * first, memory);
+        const size_t groups = group_count(draws);
+        const lanes *harmonics = find_harmonics(&of->harmonics, draws, k, some, from->rows + first,
+                                                from->weights + 2 * n * first, memory);
         lanes *sensed = take(memory, points * sizeof(lanes));
         value *found = values(memory, points), *force = values(memory, on->b + k + 1);
         for (size_t tone = 0; tone < some; tone++) {
             const size_t each = first + tone, content = from->content[each];
-            for (size_t group = 1; group < group_count(draws); group++) {
+            for (size_t group = 1; group < groups; group++) {
                 size_t at_plate, plates = plates_of(draws, group, &at_plate);
                 sense(sensed, &drawn, tone, group, found, force);
                 lanes weakest = filled(INFINITY);
@@ -33,6 +36,7 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
                 for (size_t finger = 0; finger < k; finger++) {
                     lanes highest = {0};
                     for (size_t i = finger * fine; i < (finger + 1) * fine; i++) highest = larger(highest, sensed[i]);
+                    highest += harmonics[(tone * k + finger) * groups + group];
                     memcpy(loudest + (each * k + finger) * count + at_plate - 1, &highest, plates * sizeof(float));
                 }
             }
@@ -295,6 +299,13 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     of.priority = of.quiet + of.quiet_count;
     of.is_ranked = contents == 1 && of.starts[1] == 1 && of.bands == 1 && of.quiet_count > 0 && by->groups == 1;
     find_rows(&of, of.priority + contents, memory);
+    plates twice;
+    if (by->at_harmonics) {
+        twice = *by->at_harmonics;
+        twice.k = given->fingers, twice.centres = at.centres, twice.stiffness = given->at_harmonics;
+        of.harmonics = (distortion){.on = &twice, .threshold = by->harmonic_threshold, .points = at.few,
+                                    .weights = at.few_weights, .few = read->few};
+    }
     answered to = {.rows = found->rows, .weights = found->figures};
     to.gains = to.weights + 2 * contents * on.n, to.contrast = to.gains + contents, to.level = to.contrast + 3 * k;
     to.foreign = to.level + 2 * k, to.of_all = to.foreign + k * by->sets;

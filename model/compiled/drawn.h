@@ -14,6 +14,7 @@ typedef struct {
     const float *loss, *damping;    /* (width) */
     const float *own, *gains;       /* (a, width); (rows, 2, a, width) real and imaginary parts */
     const float *errors;            /* (2, k, width) */
+    const float *harmonics;         /* (2, n, width) second harmonics of ERAs, relative to their motion */
 } draws;
 
 /* Points of all fingers, and what tones at them are measured by. */

@@ -11,7 +11,8 @@ typedef struct {
     const question *of;
     const int *rows;
     const lanes *powers;
-    const float *gains;
+    const lanes *harmonics; /* (contents, k, groups) over fingertips */
+    const float *gains, *harmonic_gains; /* of contents, and of their harmonics */
     size_t groups, plates;
 } felt;
 
@@ -59,6 +60,10 @@ SHARED lanes foreign_power(const felt *of, size_t without, size_t group, size_t 
         }
         loudest = larger(loudest, total);
     }
+    for (size_t content = 0; content < contents; content++)
+        if (content != without)
+            loudest += of->harmonic_gains[content] * of->harmonic_gains[content] *
+                       of->harmonics[(content * of->on->k + finger) * of->groups + group];
     return loudest;
 }
 
@@ -199,6 +204,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
             sense(powers + (content * groups + group) * points, &drawn, content, group, found, force);
     felt now = {.on = on, .by = by, .of = of, .rows = to->rows, .powers = powers, .gains = to->gains, .groups = groups,
                 .plates = plates};
+    now.harmonics = find_harmonics(&of->harmonics, of->promise, k, contents, to->rows, to->weights, memory);
 
     float *own = floats(memory, contents * plates), *some = floats(memory, plates), *worst = floats(memory, plates);
     for (size_t j = 0; j < contents; j++) {
@@ -212,10 +218,14 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
     for (size_t i = 0; i < 2 * k; i++) to->level[i] = NAN;
     for (size_t i = 0; i < k * by->sets; i++) to->foreign[i] = NAN;
     to->of_all[0] = NAN;
-    float *gains = floats(memory, contents);
-    now.gains = gains;
+    float *gains = floats(memory, contents), *harmonic_gains = floats(memory, contents);
+    now.gains = gains, now.harmonic_gains = harmonic_gains;
     for (int set = 0; set < by->sets; set++) {
-        for (size_t j = 0; j < contents; j++) gains[j] = to->gains[j] * by->sensitivities[to->rows[j] * by->sets + set];
+        for (size_t j = 0; j < contents; j++) {
+            const size_t at = to->rows[j] * by->sets + set;
+            gains[j] = to->gains[j] * by->sensitivities[at];
+            harmonic_gains[j] = to->gains[j] * by->harmonic_sensitivities[at];
+        }
         compare(to, &now, set, own, some, worst, memory);
     }
     to_decibels(to->contrast, 3 * k), to_decibels(to->level, 2 * k), to_decibels(to->foreign, k * by->sets);

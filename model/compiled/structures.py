@@ -63,7 +63,7 @@ class PlateDraws(Structure):
 
     _fields_ = _fields(
         i="count bases nodes width first_base first_node gains_of_row",
-        p="node loss damping own gains errors",
+        p="node loss damping own gains errors harmonics",
     )
 
 
@@ -91,6 +91,7 @@ class Rules(Structure):
         ("several", WeightSearch),
         ("within", 3 * WeightSearch),
         *_fields(i="groups sets", p="rim group threshold error shares frequencies sensitivities"),
+        *_fields(p="harmonic_sensitivities search_error harmonic_threshold at_harmonics"),
     ]
 
 
@@ -109,7 +110,7 @@ class GivenQuestion(Structure):
 
     _fields_ = [
         *_fields(i="contents bands fingers quiet_count candidates combinations", f="apart"),
-        *_fields(p="numbers level places stiffness background judging promise"),
+        *_fields(p="numbers level places stiffness at_harmonics background judging promise"),
     ]
 
 

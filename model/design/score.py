@@ -83,7 +83,7 @@ class Scorer:
         self._rig = rig
         self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
         uncertainty = rig.uncertainty
-        std = uncertainty.thickness
+        std = uncertainty.frequency  # a modulus moves resonances as a thickness does
         self._thicknesses = np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
         self._mounts = mounts_of(eras, (), self._omega, uncertainty)
         tip = rig.fingertip

@@ -4,11 +4,13 @@ from typing import Any
 
 from model.choice import best_of
 from model.counting import counted
+from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_match import MAX_FIT_ERROR, NOTICEABLE_DB
 from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
+from model.structure.attachments import PointLoad
 
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
@@ -58,6 +60,8 @@ def verdict_rows(verdict: Verdict) -> list[str]:
             f"OUTLIERS: {counted(int(by_sensor.sum()), 'value')} left out, {by_sensor[worst]} of "
             f"them of sensor {verdict.sensors[worst]}: check for loose contacts if they are many"
         )
+    if verdict.beyond is not None:
+        rows.append(_beyond_row(verdict.beyond))
     if rows:
         return rows
     if difference_rows(verdict):
@@ -77,11 +81,41 @@ def difference_rows(verdict: Verdict) -> list[str]:
         if abs(change) >= _MIN_CHANGE
     )
     within = "within tolerances, but not as written: " if verdict.plate_matches else ""
+    if verdict.beyond is not None and verdict.beyond.load is None:
+        within, changes = "", "by what has no name"
     return [
         f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; patterns for the rig reach "
         f"{difference.contrast_db:.0f} dB instead of {difference.contrast_known_db:.0f} dB, "
         f"{difference.loss_db:.1f} dB less: calibrate it with `era calibrate`"
     ]
+
+
+def _beyond_row(beyond: BeyondTolerances) -> str:
+    """Line on what lies on a plate, or is beyond tolerances without a name."""
+    load = beyond.load
+    if beyond.taper is not None:
+        x, y = (f"{100 * each:+.1f} %" for each in beyond.taper)
+        return (
+            f"THICKNESS: the plate is {x} thicker at the end of x and {y} at that of y than in its "
+            "middle, by what its sensors read: check it, or the sensors' scales"
+        )
+    if load is None:
+        what = (
+            f"{beyond.farthest} are off by {beyond.deviation:.1f} standard deviations of their "
+            "tolerance"
+            if beyond.deviation
+            else f"{percent(beyond.error)} of the response is unexplained"
+        )
+        return (
+            f"UNNAMED: the plate is as written, but for something that has no name here: {what}; "
+            "check its thickness, what is bonded to it and the sensors' scales, and measure for "
+            "`era calibrate`"
+        )
+    place = f"at ({load.x:.2f}, {load.y:.2f}) m"
+    if isinstance(load, PointLoad):
+        grams = in_display_unit(load.mass, "kg")
+        return f"MASS: {grams} {place}: remove it, or write it to the rig's masses"
+    return f"FINGER: the plate is touched {place}: take away what rests there, and measure again"
 
 
 def _plate_rows(verdict: Verdict) -> list[str]:
@@ -161,6 +195,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "wiring_matches": verdict.wiring_matches,
         "plate": {
             "matches": verdict.plate_matches,
+            "beyond": None if verdict.beyond is None else _beyond_as_json(verdict.beyond),
             "changes": {} if difference is None else difference.changes,
             "contrast_db": None if difference is None else difference.contrast_db,
             "contrast_known_db": None if difference is None else difference.contrast_known_db,
@@ -196,6 +231,25 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "sensor_count": len(verdict.sensors),
         "drive_frequencies_hz": verdict.frequencies.tolist(),
         "findings": verdict_rows(verdict),
+    }
+
+
+def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
+    load = beyond.load
+    x, y = beyond.taper or (None, None)
+    kind = "unnamed" if x is None else "thickness"
+    if load is not None:
+        kind = "mass" if isinstance(load, PointLoad) else "finger"
+    return {
+        "kind": kind,
+        "x_m": None if load is None else load.x,
+        "y_m": None if load is None else load.y,
+        "mass_kg": load.mass if isinstance(load, PointLoad) else None,
+        "thicker_at_end_of_x": x,
+        "thicker_at_end_of_y": y,
+        "farthest": beyond.farthest or None,
+        "standard_deviations": beyond.deviation or None,
+        "unexplained": beyond.error,
     }
 
 

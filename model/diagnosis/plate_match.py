@@ -33,15 +33,17 @@ _MAX_OUTLIERS = 0.05  # of all values; of a plate 3 % longer than its rig's a te
 class Match:
     """The best fit of a plate.
 
-    plate: of the rig; z (n,): deviation of each of its fitted values in standard deviations of its
-    prior; gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of
-    robust residuals and of z; error, median_error: rms and median of residuals relative to the rms
-    of their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
-    drive, with gains; outliers (f, e, s): mask of values that no error counts.
+    plate: of the rig; x (p,): all its parameters; z (n,): deviation of each of its fitted values in
+    standard deviations of its prior; gains (e,): magnitude of each channel, NaN if not used; cost:
+    half the sum of squares of robust residuals and of z; error, median_error: rms and median of
+    residuals relative to the rms of their row; responses (f, e, s) of the ERAs; predicted (f, e,
+    s): of those that the channels drive, with gains; outliers (f, e, s): mask of values that no
+    error counts.
     """
 
     rig: Rig
     plate: SensedPlate
+    x: FloatArray
     z: FloatArray
     gains: FloatArray
     cost: float
@@ -116,6 +118,7 @@ def match_plate(
     return Match(
         plate.rig_at(z),
         plate,
+        z,
         z[plate.numbers],
         gains,
         best.cost,

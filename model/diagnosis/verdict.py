@@ -18,6 +18,12 @@ from model.diagnosis.assignment import (
     match_shapes,
     phases_of_drive,
 )
+from model.diagnosis.beyond_tolerances import (
+    MAX_ERROR,
+    BeyondTolerances,
+    FormMatch,
+    match_with_form,
+)
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
     BadSensor,
@@ -36,7 +42,7 @@ from model.diagnosis.plate_match import (
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 
-WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
+WEAK, STRONG = 0.8, 1.25  # gain of a channel: 2 dB either way, four times what a drive varies
 MAX_DEVIATION = 3.0  # standard deviations of a parameter's prior
 _LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
@@ -79,7 +85,8 @@ class Verdict:
     plate_matches: whether the rig's plate within its priors explains the measurement; match: that
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
     out; swapped: cycles of channels by their ERAs; difference: of that plate from the rig's, None
-    without a plate that fits; sensors: names of those that were not left out.
+    without a plate that fits; sensors: names of those that were not left out; beyond: what of a
+    plate that matches is beyond tolerances, None for nothing or where it was not sought.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -91,6 +98,7 @@ class Verdict:
     difference: PlateDifference | None
     sensors: tuple[str, ...]
     frequencies: FloatArray
+    beyond: BeyondTolerances | None = None
 
     @property
     def wiring_matches(self) -> bool:
@@ -100,7 +108,7 @@ class Verdict:
     @property
     def is_well(self) -> bool:
         """Whether no fault was found."""
-        return self.plate_matches and self.wiring_matches
+        return self.plate_matches and self.wiring_matches and self.beyond is None
 
 
 def diagnose(
@@ -109,11 +117,13 @@ def diagnose(
     *,
     max_deviation: float = MAX_DEVIATION,
     check: Check | None = None,
+    has_form: bool = False,
 ) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
     max_deviation: of a parameter of the plate, in standard deviations of its prior; check: that
-    responses are what they claim, before channels are judged by their size.
+    responses are what they claim, before channels are judged by their size; has_form: whether the
+    plate may have form errors, and what is beyond them is sought, by sensors of known scale.
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
     if not observation.measured.any():
@@ -159,8 +169,15 @@ def diagnose(
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [each.name for each in off])
-        again = diagnose(rig, observation.without(wrong), max_deviation=max_deviation)
+        again = diagnose(
+            rig, observation.without(wrong), max_deviation=max_deviation, has_form=has_form
+        )
         return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
+    form: FormMatch | None = None
+    if has_form:
+        form = match_with_form(plate, observation, values, drives)
+        if form.match.error <= MAX_ERROR:
+            match = form.match
     matches = match.error <= MAX_FIT_ERROR and match.worst <= max_deviation
     explanations: Sequence[Explanation] = ()
     fitted = match
@@ -193,6 +210,7 @@ def diagnose(
         plate_difference(rig, plate.responses(), match) if match.error <= MAX_FIT_ERROR else None,
         observation.sensors,
         observation.frequencies,
+        form.beyond if form is not None and matches else None,
     )
 
 

@@ -4,9 +4,12 @@ Plates of several thicknesses have their ERAs and masses eliminated, once for ea
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
 s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (as in `model.reduction.free_plate`): of one h times as thick
+and frequencies higher by it (as in `model.reduction.free_plate`); another modulus moves frequencies
+alone. Of one h times as thick, whose frequencies are q times as high
 
-    g = 1 / (h (h² s lambda - w²)),    dg / d ln loss = -i h³ Im(s lambda) g².
+    g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
+
+Plates are drawn along one axis, of q; h is what is likely of a plate of that q.
 
 Elimination. Attachments b, the ERAs first, of dynamic stiffness Z:
 
@@ -22,7 +25,7 @@ uncertainty the other parameters change the response nearly in proportion.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from statistics import NormalDist
 
@@ -113,13 +116,18 @@ class AttachedPlate(Mounts):
     ) -> tuple[Complex64Array, Complex64Array]:
         """g of plates of known thicknesses at a frequency by its row, (d, r) [s²/kg].
 
-        And its change by one standard deviation of the loss factor. deviations (d,): in standard
-        deviations.
+        And its change by one standard deviation of the loss factor. deviations (d,): of the
+        frequencies, in standard deviations.
         """
-        factor = np.maximum(1 + self.uncertainty.thickness * deviations, LEAST_THICKNESS)
-        receptance = modal_receptance(self.modal[[row]], self.omega[[row]], factor)[:, 0]
-        lost = -1j * math.log(self.uncertainty.damping) * self.modal[row].imag
-        by_loss = lost * factor[:, None] ** 3 * receptance**2
+        known = self.uncertainty
+        share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
+        off = known.frequency * deviations
+        higher = np.maximum(1 + off, LEAST_THICKNESS)
+        factor = np.maximum(1 + share * off, LEAST_THICKNESS)
+        stiffness = (higher / factor)[:, None, None] ** 2 * self.modal[[row]]
+        receptance = modal_receptance(stiffness, self.omega[[row]], factor)[:, 0]
+        lost = -1j * math.log(known.damping) * self.modal[row].imag
+        by_loss = lost * (factor * higher**2)[:, None] * receptance**2
         return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
@@ -180,6 +188,12 @@ def attach(
     )
 
 
+def at_harmonics(plate: AttachedPlate, twice: AttachedPlate) -> AttachedPlate:
+    """A plate at twice the frequencies of one, whose bases move as far as they do there."""
+    forces = twice.forces * (plate.strokes / twice.strokes)
+    return replace(twice, forces=forces, strokes=plate.strokes)
+
+
 MODELLED = 0
 THICKER, THINNER = 1, 2
 """Thicknesses by a standard deviation from the nominal one, by index."""
@@ -228,7 +242,7 @@ class PlateOnEras:
         Where its thickness is certain there is the nominal one alone.
         """
         deviations, first = [np.zeros(1)], {}
-        if plate.uncertainty.thickness > 0:
+        if plate.uncertainty.frequency > 0:
             deviations.append(np.array([1.0, -1.0]))
             for count in node_counts:
                 first[count] = sum(map(len, deviations))
@@ -244,6 +258,22 @@ class PlateOnEras:
             for to, part in zip(found, parts, strict=True):
                 to[row] = part
         return cls(plate, first, *found)
+
+    def with_places(self, shifts: FloatArray) -> "PlateOnEras":
+        """Let the ERAs' places be off, which counts as a further error of their stiffnesses.
+
+        shifts (n, 2, r): change of the shapes at the ERAs, by one standard deviation along x and y.
+        An error of a stiffness that changes the fields of all ERAs by as much, mean square over the
+        plate, of the modelled plate without fingers.
+        """
+        plate, n = self.plate, self.plate.era_count
+        deformed = np.eye(n) * plate.strokes[:, None] - self.moved[:, MODELLED, :n]
+        by_one = np.linalg.norm(self.by_force[:, MODELLED, :n], axis=2)
+        by_one = by_one * np.linalg.norm(deformed, axis=2)
+        changed = [_by_places(self, row, shifts) for row in range(len(by_one))]
+        by_stiffness = np.hypot(plate.by_stiffness.real, changed / by_one)
+        found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
+        return replace(self, plate=found)
 
     @property
     def fields(self) -> Complex64Array:
@@ -265,3 +295,21 @@ def _eliminated(
     moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
+
+
+def _by_places(on: PlateOnEras, row: int, shifts: FloatArray) -> FloatArray:
+    """Size of the change of all ERAs' fields together as each is off, (n,) [m/s²].
+
+    At full stroke, accelerations of the coordinates, at a row of the frequencies, of the modelled
+    plate without fingers. An ERA acts with its force F at other shapes, phi + d, and is moved
+    otherwise: a force F d - phi Z d u.
+    """
+    plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
+    g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
+    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
+    tilted = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
+    acting = forces[:, None, :, None] * shifts[:, :, None]
+    acting = acting - tilted[..., None] * plate.shapes[:n, None, None]
+    free = (g * acting).reshape(2 * n * n, -1)
+    found = w2 * free - ((free @ plate.shapes.T) * Z) @ T
+    return np.asarray(np.linalg.norm(found.reshape(n, -1), axis=1))

@@ -32,6 +32,9 @@ JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
 """Drawn plates that judge candidates, and those of the promise."""
 
+COMMON = 2.0
+"""Standard deviations by which the gain of all ERAs together is off on drawn plates."""
+
 
 @dataclass(frozen=True, eq=False)
 class Draws:
@@ -40,7 +43,8 @@ class Draws:
     loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
     masses, load of each finger; gains (1, a, d): relative change of each ERA's, complex, or (f, a,
     d) at f frequencies; errors (k, d): of discretisation at each finger, complex of mean square 1;
-    node (d,): which of the thicknesses each has.
+    harmonics (n, d): second harmonic of each ERA, complex, relative to its motion; node (d,): which
+    of the thicknesses each has.
     """
 
     loss: Float32Array
@@ -48,6 +52,7 @@ class Draws:
     own: Float32Array
     gains: Complex64Array
     errors: Complex64Array
+    harmonics: Complex64Array
     node: IntArray
 
 
@@ -62,20 +67,24 @@ def draw(
     gain: float,
     phase: float,
     common_gain: float,
+    harmonic: float,
     thicknesses: int,
 ) -> Draws:
     """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
-    gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together. Of each
-    thickness as many plates, or one less.
+    gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together; harmonic:
+    root mean square of each ERA's. Of each thickness as many plates, or one less. All answers of a
+    plate share its common gain: half of the plates have it COMMON standard deviations low, the
+    others high, so that a plate whose own is no farther off keeps nine of ten levels.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1, count)
+    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
-    parameters, sizes, phases, real, imaginary, common = np.split(
-        numbers, np.cumsum([3 + n + k, n, n, k, k])
+    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature = np.split(
+        numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n])
     )
+    common = np.where(common > np.median(common), COMMON, -COMMON)
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
     own = np.insert(parameters[3:], [n] * masses, 0.0, axis=0)
     drawn = Draws(
@@ -83,12 +92,18 @@ def draw(
         damping=parameters[2].astype(np.float32),
         own=own.astype(np.float32),
         gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64)[None],
-        errors=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary), dtype=np.complex64),
+        errors=_complex(real, imaginary),
+        harmonics=_complex(harmonics, quadrature, harmonic),
         node=np.arange(count) * thicknesses // count,
     )
     for shared in vars(drawn).values():
         shared.setflags(write=False)  # cached, and so shared
     return drawn
+
+
+def _complex(real: FloatArray, imaginary: FloatArray, size: float = 1.0) -> Complex64Array:
+    """Complex normal numbers of a root mean square, of normal ones."""
+    return np.asarray(math.sqrt(0.5) * size * (real + 1j * imaginary), dtype=np.complex64)
 
 
 def standard_normal(rng: np.random.Generator, rows: int, count: int) -> np.ndarray:

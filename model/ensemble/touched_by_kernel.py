@@ -62,7 +62,7 @@ class TouchedByKernel(TouchedPlate):
         plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
         fine_count = 0 if fine is None else fine.shape[1]
         known = plate.uncertainty
-        rules = known.thickness > 0, known.gain_variance, RIDGE
+        rules = known.frequency > 0, known.gain_variance, RIDGE
         of = PointGroups(g, p, g * fine_count, *rules)
         of.point(
             points=points,
@@ -146,6 +146,7 @@ def _structure(
     errors = np.stack([draws.errors.real, draws.errors.imag])
     gains = np.stack([draws.gains.real, draws.gains.imag], axis=1)
     floats = {"loss": draws.loss, "damping": draws.damping, "own": draws.own}
-    floats |= {"gains": gains, "errors": errors}
+    harmonics = np.stack([draws.harmonics.real, draws.harmonics.imag])
+    floats |= {"gains": gains, "errors": errors, "harmonics": harmonics}
     found.point(node=draws.node, **{name: padded(each) for name, each in floats.items()})
     return found

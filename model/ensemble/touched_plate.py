@@ -14,8 +14,8 @@ with h the field of each ERA, t_pj the acceleration by a force at attachment j, 
 each ERA at full stroke deforms it. Each change d is one by a standard deviation, s_j that of the
 stiffness: the ERAs' damping c together, stiffness of each ERA and load of each finger j on their
 own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects locally.
-For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly. The
-loss factor changes next to nothing.
+For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly; the
+modulus counts along with it (`attached_plate`). The loss factor changes next to nothing.
 
 `model.ensemble.touched_by_kernel` runs the same in C.
 """
@@ -144,7 +144,7 @@ class TouchedPlate:
         stretched = -moved
         stretched.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes[rows]
         changes = [h, by_force[:, :, :n] @ (plate.by_damping[rows, :, None] * stretched[:, :n])]
-        if plate.uncertainty.thickness > 0:
+        if plate.uncertainty.frequency > 0:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
@@ -251,6 +251,30 @@ class TouchedPlate:
             *over_fingertips(powers, shares), powers if with_powers else None
         )
 
+    def harmonics(
+        self,
+        by: Drawing,
+        rows: IntArray,
+        weights: Complex64Array,
+        points: Float32Array,
+        shares: Float32Array,
+    ) -> Float32Array:
+        """Mean square of second harmonics over k fingertips [m²/s⁴], (m, k, 1 + d).
+
+        Of a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; the rest as
+        of `drawn`. None of the nominal plate.
+        """
+        (k, p), d, n = shares.shape, by.count, self.on.plate.era_count
+        draws, _, (t, first_base), _ = drawn_on(self.on, k, by)
+        at, bases = rows.repeat(t), first_base + np.tile(np.arange(t), len(rows))
+        by_force, _ = self.sources(at, bases, points.reshape(k * p, -1))
+        driven = self.on.plate.forces[at] * weights.repeat(t, axis=0)
+        fields = (by_force[:, :, :n] * driven[:, None]).reshape(len(rows), t, k * p, n)
+        drawn = fields @ draws.harmonics.reshape(n, t, d // t).swapaxes(0, 1)
+        power = power_of(drawn).swapaxes(1, 2).reshape(len(rows), k, p, d)
+        found = (shares[:, None] @ power)[:, :, 0]
+        return np.asarray(np.pad(found, ((0, 0), (0, 0), (1, 0))), dtype=np.float32)
+
     def _fingers(
         self, rows: IntArray, nodes: IntArray
     ) -> tuple[Complex64Array, Complex64Array, Complex64Array]:
@@ -300,6 +324,7 @@ def drawn_on(
         gain=plate.uncertainty.gain,
         phase=math.radians(plate.uncertainty.phase_deg),
         common_gain=plate.uncertainty.common_gain,
+        harmonic=plate.uncertainty.harmonic,
         thicknesses=nodes,
     )
     if plate.clocks.errors:

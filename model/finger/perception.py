@@ -55,6 +55,11 @@ def highest_measured(threshold: str = DEFAULT_THRESHOLD) -> float:
     return max(float(row["frequency_hz"]) for row in known)
 
 
+def highest_known(threshold: str = DEFAULT_THRESHOLD) -> float:
+    """Frequency [Hz] to which a set of thresholds has data."""
+    return float(_tabulated(threshold)[0][-1])
+
+
 def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> None:
     """Raise InputError for frequencies [Hz] at which a set of thresholds has no data."""
     if threshold not in THRESHOLDS:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from model.identification.fit_report import quality_rows, value_rows
-from model.identification.identify import MAX_CHI2, Identification
+from model.identification.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
 from model.identification.parameters import KINDS
 from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
@@ -121,8 +121,13 @@ def parameter_rows(found: Identification) -> list[str]:
 def fit_rows(found: Identification) -> list[str]:
     """Lines of how well the model explains the measurement."""
     held, known = found.held_out, found.rig.uncertainty
-    verdict = "explains" if found.is_explained else "does not explain"
+    verdict = "explains" if found.chi2 <= MAX_CHI2 else "does not explain"
     rows = [f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
+    if not found.is_known_well:
+        rows.append(
+            f"not known well enough: modes are {found.mode_shift:.1f} standard deviations from "
+            f"those of the rig's plate (at most {MAX_MODE_SHIFT:g})"
+        )
     if held is None:
         return [*rows, *quality_rows(known, beside="nothing is promised")]
     rows += quality_rows(
@@ -157,6 +162,8 @@ def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict
     return {
         "explained": found.is_explained,
         "chi2": found.chi2,
+        "known_well": found.is_known_well,
+        "mode_shift": found.mode_shift,
         "held_out_error": None if found.held_out is None else found.held_out.total,
         "unexplained_error": None if found.held_out is None else found.held_out.unexplained,
         "parameters": [

@@ -24,6 +24,10 @@ from model.structure.modal_elasticity import check_measurable
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
 
+MAX_MODE_SHIFT = 2.0
+"""Root mean square of the shifts of the lowest modes, in standard deviations, beyond which a
+measurement tells too little of a plate: its fields are others, whatever its sensors hear."""
+
 # How far a drive repeats from one day to the next, which no measurement tells.
 _DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 
@@ -39,8 +43,9 @@ class Identification:
     before: the rig as written; rig: with identified values and, where the model explains the
     measurement, their uncertainty; values: of the parameters, gains of sensors among them;
     posterior: their distribution, wider by what paths disagree in; chi2: squared residuals per
-    value; held_out: how well unseen paths are predicted, None where there are too few; seed: of the
-    contacts that a promise draws.
+    value; mode_shift: rms by which the lowest modes had to shift, in standard deviations; held_out:
+    how well unseen paths are predicted, None where there are too few; seed: of the contacts that a
+    promise draws.
     """
 
     before: Rig
@@ -48,6 +53,7 @@ class Identification:
     values: Values
     posterior: Posterior
     chi2: float
+    mode_shift: float
     held_out: HeldOutPaths | None
     fitted: FittedModel
     seed: int
@@ -55,7 +61,12 @@ class Identification:
     @property
     def is_explained(self) -> bool:
         """Whether the model explains the measurement, so that answers may rely on it."""
-        return self.chi2 <= MAX_CHI2
+        return self.chi2 <= MAX_CHI2 and self.is_known_well
+
+    @property
+    def is_known_well(self) -> bool:
+        """Whether modes are those of the rig's plate, so that fields between sensors are, too."""
+        return self.mode_shift <= MAX_MODE_SHIFT
 
 
 def identify(
@@ -73,8 +84,8 @@ def identify(
     setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
-    misfit = chi2(fitted)
-    is_explained = misfit <= MAX_CHI2
+    misfit, mode_shift = chi2(fitted), _mode_shift(fitted)
+    is_explained = misfit <= MAX_CHI2 and mode_shift <= MAX_MODE_SHIFT
     if is_explained:
         _check_gains(rig, measurement, values, fitted.space)
     posterior = Posterior.of(fitted.space, fitted.best)
@@ -99,10 +110,17 @@ def identify(
         values,
         posterior,
         misfit,
+        mode_shift,
         held_out,
         fitted,
         seed,
     )
+
+
+def _mode_shift(fitted: FittedModel) -> float:
+    """Root mean square of the shifts of modes in standard deviations, 0 without any."""
+    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
+    return float(np.sqrt((shifts**2).mean())) if len(shifts) else 0.0
 
 
 def _check(rig: Rig, measurement: Measurement) -> None:

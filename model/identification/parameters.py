@@ -59,7 +59,7 @@ _LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
 
 KINDS = {
     "thickness": Kind(_BUILT.thickness, drift=0.01),
-    "modulus": Kind(0.02, sheet=0.07, bound=math.log(3.0)),
+    "modulus": Kind(_BUILT.modulus, sheet=0.07, bound=math.log(3.0)),
     "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3, sheet=0.10, bound=math.log(10.0)),
     "damping": Kind(math.log(_BUILT.damping)),
     # Of one ERA beside that of all.

@@ -74,9 +74,9 @@ class Posterior:
     ) -> Uncertainty:
         """What a rig states of itself after it was identified.
 
-        before: its own, of which the fingers stay; its common_gain, which no fit narrows, counts
-        beside what is unknown of the gains' mean. gain, phase_deg: how far drives repeat; field:
-        what the model leaves unexplained of fields, relative.
+        before: its own, of which fingers and harmonics stay; its common_gain, which no fit narrows,
+        counts beside what is unknown of the gains' mean. gain, phase_deg: how far drives repeat;
+        field: what the model leaves unexplained of fields, relative.
         """
         mean = _rows(self.space, "gain").mean(axis=0, keepdims=True)
         rms = {kind: _rms(std) for kind, std in self.stds().items()}
@@ -84,12 +84,14 @@ class Posterior:
         return Uncertainty.clipped(
             gain=math.hypot(rms["gain"], gain),
             phase_deg=math.hypot(math.degrees(rms["phase"]), phase_deg),
-            thickness=rms["frequency"],
+            **Uncertainty.of_frequency(rms["frequency"]),
             stiffness=rms["stiffness"],
             damping=math.exp(damping),
             fingertip=before.fingertip,
             common_gain=math.hypot(before.common_gain, self.std_of(mean)[0]),
             field=field,
+            place=rms["place"],
+            harmonic=before.harmonic,
         )
 
 

@@ -27,6 +27,7 @@ from model.config.units import (
     SLEW,
     STIFFNESS,
     TIME,
+    Dimension,
 )
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.key_types import (
@@ -281,9 +282,9 @@ class AmplifierSection(Section):
     """
 
 
-def _within(key: str) -> Quantity:
+def _within(key: str, unit: Dimension = RATIO) -> Quantity:
     """The bounds of a parameter of an `Uncertainty`."""
-    return Quantity(RATIO, at_least=BOUNDS[key][0], at_most=BOUNDS[key][1])
+    return Quantity(unit, at_least=BOUNDS[key][0], at_most=BOUNDS[key][1])
 
 
 class UncertaintySection(Section):
@@ -314,6 +315,15 @@ class UncertaintySection(Section):
     """Of the acceleration at a finger by each ERA, relative to its root mean square over the plate:
     what no other key says of the plate.
     """
+
+    modulus: Annotated[float, _within("modulus")] = Uncertainty.modulus
+    """Of the plate's modulus of elasticity, relative; known where `thickness` is 0."""
+
+    place: Annotated[float, _within("place", LENGTH)] = Uncertainty.place
+    """Of each ERA, along x and along y."""
+
+    harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic
+    """Second harmonic of each ERA's motion as a share of its own amplitude, of any phase."""
 
 
 class FingertipSection(Section):

@@ -14,8 +14,13 @@ BOUNDS = {
     "fingertip": (0.0, 1.0),
     "common_gain": (0.0, 0.5),
     "field": (0.0, 0.5),
+    "modulus": (0.0, 0.1),
+    "place": (0.0, 0.01),
+    "harmonic": (0.0, 0.2),
 }
 """What a rig may state of each parameter: exactly known, and the most."""
+
+_RELATIVE = ("gain", "thickness", "modulus", "stiffness", "common_gain", "field", "harmonic")
 
 MAX_UNCERTAINTY = 1000.0
 """Of any of them, also in a study of plates beyond BOUNDS."""
@@ -29,8 +34,11 @@ class Uncertainty:
     relative; stiffness: of each ERA, relative; damping: a factor, of the ERAs' damping and of the
     plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
     of all channels together, relative; field: of what an ERA alone does at a finger, relative to
-    its root mean square over the plate, beside all others. The defaults are those of a plate as
-    built from its drawing and not measured.
+    its root mean square over the plate, beside all others; modulus: of the plate's modulus of
+    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
+    [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
+    amplitude, of any phase. The defaults are those of a plate as built from its drawing and not
+    measured.
     """
 
     gain: float = 0.05
@@ -41,6 +49,9 @@ class Uncertainty:
     fingertip: float = 0.5
     common_gain: float = 0.0
     field: float = 0.0
+    modulus: float = 0.02
+    place: float = 0.001
+    harmonic: float = 0.01
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -85,13 +96,14 @@ class Uncertainty:
         """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
         percents = [
             f"{key.replace('_', ' ')} {100 * getattr(self, key):.3g} %"
-            for key in ("gain", "thickness", "stiffness", "common_gain", "field")
+            for key in _RELATIVE
             if getattr(self, key)
         ]
         others = [
             f"phase {self.phase_deg:.3g}°" if self.phase_deg else "",
             f"damping x {self.damping:.4g}" if self.damping > 1 else "",
             f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
+            f"place {1e3 * self.place:.3g} mm" if self.place else "",
         ]
         return ", ".join([*percents, *filter(None, others)]) or "none"
 
@@ -102,3 +114,19 @@ class Uncertainty:
         Relative to the mean of all, whose amplitude is smaller by exp(-p² / 2); p in radians.
         """
         return (1 + self.gain**2) * math.exp(math.radians(self.phase_deg) ** 2) - 1
+
+    @property
+    def elasticity(self) -> float:
+        """Of the modulus, relative: it is known where the thickness is, as a plate that stays."""
+        return self.modulus if self.thickness > 0 else 0.0
+
+    @property
+    def frequency(self) -> float:
+        """Of the plate's natural frequencies, relative: as the thickness and the modulus' root."""
+        return math.hypot(self.thickness, self.elasticity / 2)
+
+    @staticmethod
+    def of_frequency(std: float) -> dict[str, float]:
+        """Thickness and modulus, as uncertain as each other, of that of natural frequencies."""
+        each = std / math.hypot(1.0, 0.5)
+        return {"thickness": each, "modulus": each}

@@ -8,12 +8,13 @@ less than 1e-3 over 2 %.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.answer.fingers import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
+from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.draws import over_fingertips
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
@@ -21,6 +22,7 @@ from model.structure.attachments import (
     attached_stiffness,
     coupled_forces,
     fingertip_loads,
+    footprints_of,
 )
 from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.table.table import LocalizationTable, read_fingertips
@@ -33,7 +35,9 @@ class Plates:
 
     thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
     load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
-    deviation (d, contacts): of the response at each finger, in errors of the field.
+    deviation (d, contacts): of the response at each finger, in errors of the field; modulus (d,):
+    of elasticity. Further, places (d, eras, 2): by how far each ERA is off [m]; harmonic (d, eras):
+    complex second harmonic of each ERA's motion, relative to its own.
     """
 
     thickness: FloatArray
@@ -43,6 +47,9 @@ class Plates:
     load: FloatArray
     gain: ComplexArray
     deviation: ComplexArray
+    modulus: FloatArray
+    places: FloatArray
+    harmonic: ComplexArray
 
 
 def draw_plates(
@@ -59,7 +66,12 @@ def draw_plates(
         return rng.standard_normal((count, *shape))
 
     phase = math.radians(uncertainty.phase_deg)
-    real, imaginary = normal(contact_count), normal(contact_count)
+
+    def complex_normal(size: int) -> ComplexArray:
+        real, imaginary = normal(size), normal(size)
+        return np.asarray(math.sqrt(0.5) * (real + 1j * imaginary))
+
+    deviation = complex_normal(contact_count)
     common = np.exp(uncertainty.common_gain * normal(1))
     return Plates(
         thickness=1 + uncertainty.thickness * normal(),
@@ -70,7 +82,10 @@ def draw_plates(
         gain=common
         * (1 + uncertainty.gain * normal(era_count))
         * np.exp(1j * phase * normal(era_count)),
-        deviation=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary)),
+        deviation=deviation,
+        modulus=1 + uncertainty.elasticity * normal(),
+        places=uncertainty.place * normal(era_count, 2),
+        harmonic=uncertainty.harmonic * complex_normal(era_count),
     )
 
 
@@ -88,9 +103,10 @@ class LevelAndContrast:
 def felt_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> LevelAndContrast:
-    """What fingers feel of an excitation on plates; powers of its tones add."""
+    """What fingers feel of an excitation on plates; powers of its tones and harmonics add."""
     rows, power = powers_on(table, placed, excitation, plates)
     sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
+    sensed += harmonics_on(table, placed, excitation, plates)
     weights = read_fingertips(table, placed.contacts).fine_weights
     (means,), (loudest,) = over_fingertips(sensed[None], weights)
     count = len(placed.targets)
@@ -109,6 +125,22 @@ def powers_on(
     """
     rows, found = _responses(table, *touched(table, placed), excitation, plates)
     return rows, np.abs(found) ** 2
+
+
+def harmonics_on(
+    table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
+) -> FloatArray:
+    """Power to threshold of an excitation's second harmonics on plates (points, d).
+
+    At the points of `powers_on`.
+    """
+    discs, fingers = touched(table, placed)
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    at = table.at_harmonics.plate, table.rows_of(frequencies), bases[:, None]
+    distorted = replace(plates, gain=plates.gain * plates.harmonic)
+    found = accelerations_on(table, discs, fingers, *at, distorted)[:, :, 0]
+    over = np.abs(found) ** 2 / table.harmonic_thresholds[at[1], None].astype(float) ** 2
+    return np.asarray(over.sum(axis=1).T)
 
 
 def amplitudes_on(
@@ -141,7 +173,8 @@ def _responses(
     """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = table.rows_of(frequencies)
-    found = accelerations_on(table, discs, fingers, rows, bases[:, None], plates)[:, :, 0]
+    at = table.attached, rows, bases[:, None]
+    found = accelerations_on(table, discs, fingers, *at, plates)[:, :, 0]
     weights = np.abs(bases) / [era.stroke for era in table.eras]
     size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))
     deviation = np.repeat(plates.deviation, discs.shape[1], axis=1)
@@ -152,17 +185,19 @@ def accelerations_on(
     table: LocalizationTable,
     discs: FloatArray,
     fingers: Sequence[FingertipLoad],
+    attached: AttachedPlate,
     rows: IntArray,
     bases: ComplexArray,
     plates: Plates,
 ) -> ComplexArray:
     """Acceleration (d, m, c, points) [m/s²] for base motions (m, c, eras) [m].
 
-    At rows (m,) of the table's frequencies and points of shapes discs (k, p, r), each finger at the
-    first point of its disc; without the deviation of the field.
+    At rows (m,) of the frequencies of the attached plate, whose ERAs move as at the table's, and
+    points of shapes discs (k, p, r), each finger at the first point of its disc; without the
+    deviation of the field.
     """
-    check_scales(table.plate, plates.thickness)
-    w, eras = table.attached.omega[rows], table.eras
+    check_scales(table.plate, plates.thickness, plates.modulus)
+    w, eras = attached.omega[rows], table.eras
     k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
     damping = plates.damping[:, None, None] * c
     springs = plates.stiffness[:, None] * k + 1j * w[:, None] * damping
@@ -171,18 +206,32 @@ def accelerations_on(
     resting = attached_stiffness(w, table.masses, fingers)
     at_eras = springs - (w**2)[:, None] * bolts
     stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
-    nominal = table.attached.modal[rows]
+    nominal = attached.modal[rows]
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
-    modal = modal_receptance(lossy, w, plates.thickness)[:, :, None]
+    stiffer = np.asarray(plates.modulus[:, None, None] * lossy, dtype=complex)
+    modal = modal_receptance(stiffer, w, plates.thickness)[:, :, None]
     shapes = np.vstack([table.attachment_shapes, discs[: len(fingers), 0]])
-    receptance = np.asarray((modal * shapes) @ shapes.T, dtype=complex)
+    shapes = np.repeat(shapes[None], len(plates.places), axis=0)
+    shapes[:, : len(eras)] += _shifts(table, plates.places)
+    shapes = shapes[:, None]
+    receptance = np.asarray((modal * shapes) @ shapes.swapaxes(2, 3), dtype=complex)
     gains = np.array([era.gain(table.frequencies[rows]) for era in eras]).T
     driven = (springs * plates.gain[:, None] * gains)[:, :, None] * bases
-    still = ((0, 0), (0, 0), (0, 0), (0, len(shapes) - len(eras)))
+    still = ((0, 0), (0, 0), (0, 0), (0, shapes.shape[2] - len(eras)))
     forces = coupled_forces(receptance, stiffness, np.pad(driven, still).swapaxes(2, 3))
     moved = modal * (forces.swapaxes(2, 3) @ shapes)
     found = -(w**2)[:, None, None] * (moved @ discs.reshape(-1, discs.shape[-1]).T)
     return np.asarray(found)
+
+
+def _shifts(table: LocalizationTable, places: FloatArray) -> FloatArray:
+    """By how much the shapes at ERAs change that are off by places (d, n, 2) [m], (d, n, r)."""
+    known = footprints_of(table.eras)
+    moved = np.repeat(known[None], len(places), axis=0)
+    sides = np.array([table.plate.length, table.plate.width])
+    moved[:, :, :2] = np.clip(moved[:, :, :2] + places, 0.0, sides)
+    there = table.shapes_at(moved.reshape(-1, known.shape[1]))
+    return np.asarray(there.reshape(*moved.shape[:2], -1) - table.shapes_at(known))
 
 
 _ERA_KEYS = ("stiffness", "damping", "bolt_mass")

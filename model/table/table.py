@@ -21,7 +21,12 @@ from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray,
 from model.compiled.kernels import kernels, run
 from model.compiled.structures import GivenRaster
 from model.drive_modes.switched import highest_levels
-from model.ensemble.attached_plate import AttachedPlate, PlateOnEras, attach
+from model.ensemble.attached_plate import (
+    AttachedPlate,
+    PlateOnEras,
+    at_harmonics,
+    attach,
+)
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
 from model.ensemble.touched_by_kernel import touch
@@ -37,6 +42,7 @@ from model.finger.grid import Grid
 from model.finger.perception import (
     decibels,
     detection_threshold,
+    highest_known,
     is_background,
     sensitivities,
 )
@@ -44,7 +50,13 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import fingerprint_of
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
+from model.structure.attachments import (
+    Era,
+    Fingertip,
+    PointLoad,
+    fingertip_loads,
+    footprints_of,
+)
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
@@ -304,6 +316,23 @@ class LocalizationTable:
         return level_db_sl + decibels(factors.min(axis=1))
 
     @cached_property
+    def harmonic_sensitivities(self) -> Float32Array:
+        """`sensitivities` at twice all frequencies; beyond the data of a set those at its end."""
+        twice = np.minimum(2 * self.frequencies, min(map(highest_known, self.threshold_sets)))
+        return sensitivities(twice, self.threshold_sets, self.threshold).astype(np.float32)
+
+    @cached_property
+    def harmonic_thresholds(self) -> NDArray[np.float32]:
+        """Detection thresholds [m/s²] at twice all frequencies, (f,).
+
+        Infinite beyond the data of the set, to 1 kHz, where nothing is felt.
+        """
+        twice = 2 * self.frequencies
+        highest = highest_known(self.threshold)
+        found = detection_threshold(np.minimum(twice, highest), self.threshold)
+        return np.where(twice <= highest, found, np.inf).astype(np.float32)
+
+    @cached_property
     def modal_dispersion(self) -> Dispersion | None:
         """Change of the eigenvalues with frequency, None where they do not."""
         if not len(self.dispersion_frequencies):
@@ -313,6 +342,9 @@ class LocalizationTable:
     @cached_property
     def attached(self) -> AttachedPlate:
         """The plate with its ERAs and masses at the drive frequencies."""
+        return self._attached(self.frequencies)
+
+    def _attached(self, frequencies: FloatArray) -> AttachedPlate:
         return attach(
             self.plate,
             self.omega,
@@ -322,7 +354,7 @@ class LocalizationTable:
             masses=self.masses,
             fingertip=self.fingertip,
             uncertainty=self.uncertainty,
-            frequencies=self.frequencies,
+            frequencies=frequencies,
             dispersion=self.modal_dispersion,
             clocks=self.clocks,
         )
@@ -331,7 +363,15 @@ class LocalizationTable:
     def on_eras(self) -> PlateOnEras:
         """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
-        return PlateOnEras.of(self.attached, *sorted(counts))
+        found = PlateOnEras.of(self.attached, *sorted(counts))
+        return found.with_places(self._shifts_of_eras) if self.uncertainty.place > 0 else found
+
+    @cached_property
+    def at_harmonics(self) -> PlateOnEras:
+        """The same at twice the drive frequencies, of those thicknesses that come first there."""
+        twice = self._attached(2 * self.frequencies)
+        counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.bases}
+        return PlateOnEras.of(at_harmonics(self.attached, twice), *sorted(counts))
 
     @cached_property
     def error_power(self) -> Float32Array:
@@ -339,11 +379,39 @@ class LocalizationTable:
 
         Of discretisation, and of what else the rig's uncertainty says of fields.
         """
-        gram = self.shapes.T @ self.shapes / np.float32(self.raster.point_count)
-        modal = self._modal_fields(())
-        mean_square = np.einsum("fer,rs,fes->fe", modal.conj(), gram, modal, optimize=True).real
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
-        return np.asarray(error**2 * mean_square, dtype=np.float32)
+        found = error**2 * self._mean_square(self.on_eras.fields)
+        return np.asarray(found, dtype=np.float32)
+
+    @property
+    def _shifts_of_eras(self) -> FloatArray:
+        """By how much the shapes at ERAs change as these are off along x and y, (n, 2, r)."""
+        distance = self.uncertainty.place
+        known, (length, width) = footprints_of(self.eras), self.raster.points[-1]
+        ends = np.repeat(known[:, None, None], 4, axis=1).reshape(len(known), 2, 2, -1)
+        for axis, side in enumerate((length, width)):
+            ends[:, axis, :, axis] += [distance, -distance]
+            ends[:, axis, :, axis].clip(0.0, side, out=ends[:, axis, :, axis])
+        shapes = self.shapes_at(ends.reshape(-1, 3)).reshape(*ends.shape[:3], -1)
+        apart = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=-1, keepdims=True)
+        return np.asarray((shapes[:, :, 0] - shapes[:, :, 1]) * (distance / apart))
+
+    @cached_property
+    def search_error_power(self) -> Float32Array:
+        """The same with second harmonics, as if they were at the drive frequency: for searches."""
+        if not self.uncertainty.harmonic:
+            return self.error_power
+        share = self.uncertainty.harmonic * (self.thresholds / self.harmonic_thresholds)[:, None]
+        power = share**2 * self._mean_square(self.at_harmonics.fields)
+        return np.asarray(self.error_power + power, dtype=np.float32)
+
+    def _mean_square(self, fields: Complex64Array) -> FloatArray:
+        """Mean square over the plate of fields in its coordinates (..., r), (...)."""
+        return np.asarray(np.vecdot(fields, fields @ self._gram).real, dtype=float)
+
+    @cached_property
+    def _gram(self) -> Float32Array:
+        return np.asarray(self.shapes.T @ self.shapes / np.float32(self.raster.point_count))
 
     @cached_property
     def _everywhere(self) -> tuple[FloatArray, Complex64Array, Complex64Array]:

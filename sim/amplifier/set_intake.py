@@ -37,7 +37,8 @@ class SetIntake:
         """Take a part but the last at a time [s]; returns whether it is kept."""
         token, under_way = part["token"], self._under_way(now)
         is_newer = token != under_way and is_newer_token(token, under_way)
-        if not (is_newer_token(token, self.committed) and (is_newer or token == under_way)):
+        is_under_way = token == under_way and self._staged is None
+        if not (is_newer_token(token, self.committed) and (is_newer or is_under_way)):
             return False
         if is_newer:
             self._staged = None

@@ -29,6 +29,7 @@ from sim.amplifier.clock import AmplifierClock, StraightClock
 from sim.amplifier.contract import Amplifier
 from sim.bench.sensing import REACH, Probe, Sensing
 from sim.bench.straight_clocks import StraightClocks
+from sim.plant import second_harmonic
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
 from sim.plant.imperfections import Imperfections, PlateErrors, realised
@@ -362,8 +363,9 @@ class Bench:
     def _motion(self, index: int, playing: Voices, clock: StraightClock) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         stroke, delay = self.rig.eras[index].stroke, self._delays[index]
-        motion = motion_of(playing, clock, stroke=stroke, delay=delay)
-        return realised(motion, self._errors[index])
+        errors = self._errors[index]
+        moving = [*playing, *second_harmonic.of_voices(playing, errors.harmonic)]
+        return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""

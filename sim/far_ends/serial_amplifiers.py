@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import (
     BROADCAST,
     BY_NUMBER,
@@ -70,6 +71,9 @@ class SerialAmplifiers(FarEnd):
                 return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
             payload = self._payload(frame, amplifier, now)
         except Refusal as refusal:
+            words = unpack_words(frame.payload[: len(frame.payload) & ~1])
+            if frame.version == VERSION and is_earlier_part(frame.type, words):
+                return None
             payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)

@@ -4,7 +4,7 @@ From rest the bases move exactly as commanded, along shaped onsets or a ramp. Th
 each layer is played alone, which keeps a finger's own apart from those of others.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -34,6 +34,7 @@ from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.from_rest import from_rest
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import base_amplitudes
+from sim.plant import second_harmonic
 from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.loaded_plates import LoadedPlate
@@ -90,12 +91,13 @@ class Vibration:
     """What one layer, or signals of all ERAs, do alone at all fingers.
 
     frequencies (f,) [Hz], none of signals; fingers: numbers of those that it is for; records: of
-    all fingers, one after the other.
+    all fingers, one after the other; harmonics (f,) [Hz]: of ERAs that have some.
     """
 
     frequencies: tuple[float, ...]
     fingers: tuple[int, ...]
     records: tuple[Record, ...]
+    harmonics: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +220,10 @@ class Playback:
     def _levels(self, number: int) -> tuple[FloatArray, FloatArray]:
         """Levels (1 + w,) of a finger's own layers and of all others: steady, then over time."""
         powers = np.array(
-            [self._powers(each.records[number], each.frequencies) for each in self.vibrations]
+            [
+                self._powers(each.records[number], sorted({*each.frequencies, *each.harmonics}))
+                for each in self.vibrations
+            ]
         )
         is_own = np.array([number in each.fingers for each in self.vibrations])
         own, others = (np.sqrt(powers[some].sum(axis=0)) for some in (is_own, ~is_own))
@@ -262,7 +267,8 @@ def play(
     plate, layers that the rig cannot play, and a duration out of range.
     """
     check_fingers(fingers, rig.plate)
-    driven = [_bases(layer, rig.eras) for layer in layers]
+    shares = {era.name: imperfections.errors_of(era.name, rig).harmonic for era in rig.eras}
+    driven = [_bases(layer, rig.eras, shares) for layer in layers]
     terms = [term for bases in driven for motion in bases for term in motion]
     settled = max([term.start for term in terms], default=0.0)  # of the last, which goes on
     loaded = _plant_under(rig, reduced, fingers, imperfections).loaded
@@ -285,7 +291,9 @@ def play(
             duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(points)
         )
         records = _records(rig, fingers, times, felt)
-        vibrations.append(Vibration(tuple(frequencies.tolist()), layer.fingers, records))
+        driven_at = tuple(frequencies.tolist())
+        harmonics = tuple([2 * each for each in driven_at]) if any(shares.values()) else ()
+        vibrations.append(Vibration(driven_at, layer.fingers, records, harmonics))
     return Playback(tuple(vibrations), settled, rig.threshold)
 
 
@@ -351,12 +359,15 @@ def _records(
     )
 
 
-def _bases(layer: Layer, eras: Sequence[Era]) -> Bases:
-    """Motion of the bases when a layer starts, its side bands included."""
+def _bases(layer: Layer, eras: Sequence[Era], harmonics: Mapping[str, complex]) -> Bases:
+    """Motion of the bases when a layer starts, its side bands included.
+
+    harmonics: second harmonic of each ERA, relative to its motion, by name.
+    """
     voices = [
         shaped(each.onset, eras)
         if each.onset
         else ramped_onset(each.excitation, eras, ramp=each.ramp)
-        for each in layer.voices
+        for each in (*layer.voices, *second_harmonic.of_layer(layer, harmonics))
     ]
     return tuple(tuple(chain.from_iterable(each)) for each in zip(*voices, strict=True))

@@ -1,8 +1,8 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
 Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
-from the rig's, fingers that do not weigh alike, and crystals of the amplifiers. Not modelled:
-distortion, drifting errors of channels, ERAs in other places.
+from the rig's and stand elsewhere, fingers that do not weigh alike, and crystals of the amplifiers.
+ERAs move with a second harmonic. Not modelled: other distortion, drifting errors of channels.
 """
 
 import cmath
@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.protocol.table import CLOCK_TURN
 from model.answer.fingers import Finger
-from model.arrays import ComplexArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
@@ -39,15 +39,19 @@ _CRYSTAL, _WARM_UP = 50e-6, 1e-6  # 50 ppm, and 1 ppm/s either way
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """Errors of one channel: gain factor, phase [rad]."""
+    """Errors of one channel: gain factor, phase [rad].
+
+    harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.second_harmonic`).
+    """
 
     gain: float = 1.0
     phase: float = 0.0
+    harmonic: complex = 0j
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not all(math.isfinite(value) for value in (self.gain, self.phase)):
-            raise InputError(f"{self}: gain and phase must be finite numbers")
+        if not all(cmath.isfinite(value) for value in (self.gain, self.phase, self.harmonic)):
+            raise InputError(f"{self}: gain, phase and harmonic must be finite numbers")
         if self.gain < 0:
             raise InputError(f"{self}: gain must not be negative")
 
@@ -61,8 +65,8 @@ class ChannelErrors:
 class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
-    stiffness: by ERA; era_damping: of all ERAs; masses: on the plate beside the rig's; mesh: on
-    which it is solved, None for the rig's.
+    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; masses:
+    on the plate beside the rig's; mesh: on which it is solved, None for the rig's.
     """
 
     thickness: float = 1.0
@@ -70,6 +74,7 @@ class PlateErrors:
     loss_factor: float = 1.0
     era_damping: float = 1.0
     stiffness: Mapping[str, float] = field(default_factory=dict)
+    places: Mapping[str, Point] = field(default_factory=dict)
     masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
 
@@ -77,8 +82,11 @@ class PlateErrors:
         """The rig whose plate and ERAs have these errors."""
 
         def of(era: Era) -> Era:
+            x, y = np.add((era.x, era.y), self.places.get(era.name, (0.0, 0.0)))
             return replace(
                 era,
+                x=float(np.clip(x, 0.0, rig.plate.length)),
+                y=float(np.clip(y, 0.0, rig.plate.width)),
                 stiffness=self.stiffness.get(era.name, 1.0) * era.stiffness,
                 damping=self.era_damping * era.damping,
             )
@@ -189,7 +197,25 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
         stiffness={era.name: relative(std.stiffness) for era in rig.eras},
         mesh=_other_mesh(rig),
     )
+    # Numbers of their own, so that all else of a seed stays.
+    rng = np.random.default_rng([seed, crc32(b"modulus, places, harmonics")])
+    plate = replace(
+        plate,
+        modulus=relative(std.elasticity),
+        places=_places(rig, std.place * rng.standard_normal((len(rig.eras), 2))),
+    )
+    real, imaginary = rng.standard_normal((2, len(channels))) * (std.harmonic * math.sqrt(0.5))
+    channels = {
+        channel: replace(errors, harmonic=complex(*both))
+        for (channel, errors), both in zip(
+            channels.items(), zip(real, imaginary, strict=True), strict=True
+        )
+    }
     return _drawn(rig, channels, plate, seed)
+
+
+def _places(rig: Rig, off: FloatArray) -> dict[str, Point]:
+    return {era.name: (x, y) for era, (x, y) in zip(rig.eras, off.tolist(), strict=True)}
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
@@ -206,6 +232,8 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
     )
     plate = PlateErrors(
         thickness=max(float(drawn.thickness[0]), _MIN_FACTOR),
+        modulus=max(float(drawn.modulus[0]), _MIN_FACTOR),
+        places=_places(rig, drawn.places[0]),
         loss_factor=float(drawn.loss[0]),
         era_damping=float(drawn.damping[0]),
         stiffness={
@@ -215,8 +243,10 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
         mesh=_other_mesh(rig),
     )
     channels = {
-        rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain))
-        for era, gain in zip(rig.eras, drawn.gain[0].tolist(), strict=True)
+        rig.wiring[era.name]: ChannelErrors(*cmath.polar(gain), harmonic)
+        for era, gain, harmonic in zip(
+            rig.eras, drawn.gain[0].tolist(), drawn.harmonic[0].tolist(), strict=True
+        )
     }
     return _drawn(rig, channels, plate, seed)
 

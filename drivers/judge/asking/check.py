@@ -182,10 +182,13 @@ async def greeted(client: Client) -> Values:
 
 async def identified(client: Client, level: float) -> Subject:
     """Identify the amplifier at the far end of a client; raises Violation."""
-    identity = await greeted(client)
-    answer = await client.exchange(MESSAGES["GetCaps"].number, ())
-    expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
-    can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
+    if client.known is None:
+        identity = await greeted(client)
+        answer = await client.exchange(MESSAGES["GetCaps"].number, ())
+        expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
+        can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
+        client.known = identity, can
+    identity, can = client.known
     return Subject(client, identity, Capabilities(can), level)
 
 

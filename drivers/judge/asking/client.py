@@ -157,6 +157,7 @@ class Client(ABC):
     """One amplifier at an address of a line.
 
     heard: messages that no request was waiting for, but Events; order: all, as they came.
+    known: its identity and capabilities, once they were read.
     reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
     in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
     request and a reply by their words; transit: of the longest reply; pace: how much of that it
@@ -189,6 +190,7 @@ class Client(ABC):
         self.address = address
         self.heard: list[Heard] = []
         self.order: list[Heard] = []
+        self.known: tuple[Values, Values] | None = None
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit, self.pace = 0.0, 1.0
@@ -248,19 +250,20 @@ class Client(ABC):
 
         Every address is asked where a broadcast would reach it, else until one is free.
         """
-        wait = max(self.quiet, REACTION + self.transit) if self.has_broadcasts else GATEWAY_TIMEOUT
-        for address in range(self.addresses, 0, -1) if not self.free else ():
-            if address == self.address:
-                continue
+        if self.free:
+            return
+        wait = REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT
+        asked = [each for each in range(self.addresses, 0, -1) if each != self.address]
+        for address in asked:
             self.write(self.question(address))
             found = await self.next(lambda each: True, wait)
             if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
                 self._others.add(address)
-            if address not in self._others:
-                self.free = self.free or address
-                if not self.has_broadcasts:
-                    break
+            if not (self.has_broadcasts or address in self._others):
+                break
+        await asyncio.sleep(self.quiet)  # in which a late one is heard
         self.heard.clear()
+        self.free = next((each for each in asked if each not in self._others), 0)
         expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
 

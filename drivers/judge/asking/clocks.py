@@ -13,7 +13,7 @@ from registry import clock
 
 _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_READINGS, _APART = 30, 0.03  # of one state; s between two at most
+_READINGS, _APART = 12, 0.03  # of one state; s between two at most
 _MAX_DURATION = 3.0  # s; in which a rate must show
 _SHIFTS = 1, 0x4000, 0xC001
 
@@ -60,19 +60,31 @@ def clock_shifts(subject: Subject) -> Rows:
 
 @driving(_PLACE)
 async def clock_rate(subject: Subject) -> None:
-    """It runs faster by the rate of a Ping until the next, and by none once it is disarmed."""
+    """It runs faster by the rate of a Ping until the next, and by none unless it is armed."""
     _require_known(subject)
     width = max(subject.exchange_time, subject.client.transit)
-    duration = max(0.5, 1.5 * width / (_HIGHEST * RATE - DRIFT))
+    duration = max(0.35, 1.5 * width / (_HIGHEST * RATE - DRIFT))
     require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
-    async def steer(rate: int) -> None:
+    async def read() -> None:
         end = clock.now() + duration
         while clock.now() < end:
-            await subject.request("Ping", rate=rate)
+            await subject.request("GetStatus")
             await asyncio.sleep(_APART / 2)
         await _expect_steady(subject)
 
-    disarm: Rows = (send("Disarm", ramp=0), subject.settle)
-    rates = (partial(steer, each) for each in (_HIGHEST, _LOWEST))
-    await subject.run([subject.arm, *rates, *disarm, partial(steer, _LOWEST)])
+    fast, slow = (send("Ping", rate=each) for each in (_HIGHEST, _LOWEST))
+    changing_nothing: Rows = (
+        *(send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"), subject.one()),
+        *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"], shift=1)),
+    )
+    falls_silent = send("Disarm", ramp=subject.ramp), slow, subject.settle
+    trips = subject.starve, subject.shortest_watchdog / 1000, subject.settle, slow
+    await subject.run(
+        [
+            *(subject.arm, fast, *changing_nothing, read, slow, read),
+            *(fast, send("Stop", ramp=0), slow, read, subject.clear),
+            *(subject.arm, subject.one(), fast, *falls_silent, slow, read),
+            *(partial(subject.arm, 0.0), fast, *trips, read),
+        ]
+    )

@@ -15,7 +15,7 @@ from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 2.0  # s; in which errors of a phase add up
+_LONG = 1.2  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _PAUSE = 0.004  # s; between the sets of voices, at least
 _BIT_15 = 1 << 15  # ms
@@ -81,11 +81,11 @@ def after(subject: Subject) -> Rows:
         require_in_time(subject.shown.outputs.waits(answer.when), "the onset may have ended")
 
     return [
-        (first, newer, waiting, achieved),
+        (first, newer, waiting, send("Arm", watchdog=subject.can["watchdog_max"]), achieved),
         (subject.one(), waiting),
-        (first, waiting, layer(0), 0.25),
-        (first, waiting, subject.one(level=0.75), 0.25),
-        (first, waiting, send("Silence", ramp=0), 0.25),
+        (first, waiting, layer(0), 0.2),
+        (first, waiting, subject.one(level=0.75), 0.2),
+        (first, waiting, send("Silence", ramp=0), 0.2),
     ]
 
 
@@ -94,7 +94,11 @@ def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
     long, short = subject.long_onset, subject.envelope(0.02, 0.5)
     last = len(subject.channels) - 1
-    both = [subject.tone(0, 0.5, onset=long), subject.tone(last, 0.5, onset=short)]
+    both, exchanged = (
+        [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
+        for each, other in ((long, short), (short, subject.short_onset))
+    )
+    named = tuple(subject.tone(each, 0.25) for each in sorted({0, last}))
     waiting = layer(0, subject.tone(last, 0.25), after=True, ramp=20)
     rising = subject.one(level=0.5, ramp=subject.ramp)
     unshaped = subject.one(subject.tone(0, 0.5, onset=replace(subject.envelope(0.1), knots=())))
@@ -103,7 +107,9 @@ def after_the_last_onset(subject: Subject) -> Rows:
     return [
         # A channel that is not named falls silent with what waited.
         (layer(0, *both[: last + 1]), waiting),
-        (layer(0, *reversed(both[: last + 1])), waiting),
+        (layer(0, *exchanged[1 - min(last, 1) :]), replace(waiting, commands=named)),
+        # One that is released is not waited for.
+        (subject.one(subject.tone(0, 0.5, ending=long)), layer(0), waiting),
         (play(subject.one(level=0.5), shaped), waiting),
         (rising, waiting),
         (unshaped, waiting),
@@ -121,11 +127,17 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     beside = layer(1, subject.beside(1, 0.25), after=True)
     ends = replace(half, valid_for=subject.lasting(60), ramp=20)
     renewed = layer(0, renew=True, valid_for=subject.lasting(1000))
+    # Its end comes with that of its onset, by whole samples and binary fractions.
+    quarter = subject.envelope(0.0625, *[1.0] * 3)
+    is_quarter = (quarter.step, len(quarter.knots)) == (625, 3) and subject.slowness == 1
+    together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
+    sooner = replace(other, commands=(replace(other.commands[0], onset=subject.short_onset),))
     return [
         (half, timed),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
-        (play(half, other), play(timed, beside)),
+        (play(half, sooner), play(timed, beside)),
+        *([(together, timed)] if is_quarter else []),
         (ends, timed, 0.25 * subject.slowness),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
     ]
@@ -136,7 +148,7 @@ def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
     whole, times = subject.whole(), {subject.ramp, 20, subject.can["ramp_max"]}
     rises = [[replace(whole, ramp=time)] for time in times]
-    return [*rises, *([whole, layer(0, ramp=time)] for time in times)]
+    return [*rises, *([whole, layer(0, ramp=time)] for time in (subject.ramp, 20))]
 
 
 @driving(_PLACE)
@@ -197,14 +209,16 @@ def endings(subject: Subject) -> Rows:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
-    tone = subject.tone(last, ending=subject.envelope(0.05, 0.25, 0.75j))
+    tone = subject.tone(last, ending=subject.envelope(0.04, 0.25, 0.75j, 0.5))
+    unshaped = replace(tone, ending=subject.envelope(0.1))
     first, quiet = layer(0, tone), subject.tone(last, 0.0)
     replaced = replace(quiet, onset=subject.envelope(0.1))
     return [
         (first, layer(0)),
-        (first, layer(0, quiet)),
+        (first, layer(0, replace(quiet, ending=subject.envelope(0.02, 1.0)))),  # its own counts
         (first, layer(0, subject.tone(0, 0.0))),
         (layer(0, tone, valid_for=100),),
+        (layer(0, unshaped), layer(0)),
         (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
         (first, layer(0, replaced, ramp=ramp)),
         (first, layer(0, subject.tone(last, keep=True), ramp=ramp), layer(0, ramp=ramp)),
@@ -225,8 +239,9 @@ def endings_amid(subject: Subject) -> Rows:
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
         (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
-        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp)),
-        (subject.one(subject.tone(ending=ending)), layer(0), part, layer(0, ramp=long)),
+        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 20)),
+        (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
+        (layer(0, towards_0), half, send("Silence", ramp=long)),
     ]
 
 
@@ -320,10 +335,15 @@ async def voices(subject: Subject) -> None:
     await subject.follow()
 
 
+def _fading(subject: Subject) -> int:
+    """Return a ramp [ms] that is longer than the sets of as many voices as are tried."""
+    return min(subject.lasting(450), int(subject.can["ramp_max"]))
+
+
 @driving(_PLACE)
 def voices_of_layers(subject: Subject) -> Rows:
     """It cuts fades only: what lasts on all layers plays on while others fade."""
-    ramp, share = subject.can["ramp_max"], 1 / (2 * len(subject.layers))
+    ramp, share = _fading(subject), 1 / (2 * len(subject.layers))
     others = subject.layers[1:]
     count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
     near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
@@ -342,7 +362,7 @@ def voices_of_layers(subject: Subject) -> Rows:
 def voices_of_channels(subject: Subject) -> Rows:
     """It counts the voices of each channel by itself: fades of others cut none of it."""
     require(len(subject.channels) > 1, "it has one channel")
-    ramp, count = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES)
+    ramp, count = _fading(subject), min(subject.can["voices"], _MAX_VOICES)
     onset = subject.envelope(0.0001)  # at its level at once
     tones = [
         [

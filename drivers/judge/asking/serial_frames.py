@@ -4,7 +4,6 @@ import asyncio
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import cast
 
 from cobs import cobs
@@ -165,21 +164,22 @@ async def damaged_frames(subject: Subject) -> None:
     for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
         for what, data in subject.client.damaged(number, sent):
             await subject.client.expect_silence(data, f"message {number} with {what}")
-            await subject.run([partial(subject.request, "GetStatus"), subject.ping])
+            await subject.request("GetStatus")
+            await subject.ping()
 
 
 @driving(_PLACE)
 async def doubled_frames(subject: Subject) -> None:
     """It carries a frame that comes twice, or late, out as one of its token, or not at all."""
     await subject.arm()
-    sets = [layer(0, subject.tone(0, each), valid_for=500) for each in (0.5, 1.0)]
+    sets = [layer(0, subject.tone(0, each), valid_for=250) for each in (0.5, 1.0)]
     made = [subject.words_of(each) for each in sets]
     frames = [subject.client.request(_SET, words) for _, words in made]
     for (part, _), data in zip(made, frames, strict=True):
         began = clock.now()
         await subject.client.send(data)
         subject.played(part, When(began, clock.now()))
-    for at, pause in ((0, 0.0), (1, 0.5), (1, 0.0)):
+    for at, pause in ((0, 0.0), (1, 0.25), (1, 0.0)):
         await subject.client.send(frames[at])
         await subject.run([subject.ping, pause])
 

@@ -11,7 +11,7 @@ from drivers.judge.asking.material import Material, Rows, Send, layer, play, sen
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
-from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, STAGED_LIFE
+from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, MESSAGES, STAGED_LIFE
 
 _PLACE = "protocol.md#sets"
 _SHAPED = COMMAND.words + 2 * ENVELOPE.words  # of a command with two empty envelopes
@@ -110,6 +110,8 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
         *({"token": token} for token in (5, 4, 8, 5 + 0x8000)),
         {"parts": count + 1},
     ]
+    head = MESSAGES["Set"].request.pack({"session": subject.next_session, **second.values})
+    nameless = [0, *head[1:]], [head[0], 0, *head[2:]]
     refused: list[tuple[Values, str]] = [
         *(({"index": count}, "BAD_VALUE"), ({"index": count, "token": 10}, "BAD_VALUE")),
         *(({"index": 255, "token": 10}, "BAD_VALUE"), ({"parts": 1, "index": 0}, "BAD_VALUE")),
@@ -118,6 +120,7 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
     return [
         *(subject.arm, play(subject.one(), token=5), last, first),
         *(_with(second, **each) for each in dropped),
+        *(partial(subject.client.part, MESSAGES["Set"].number, each) for each in nameless),
         *(_with(last, code=code, **each) for each, code in refused),
         _with(last, token=5),
         last,
@@ -203,11 +206,12 @@ def sets_expire(subject: Subject) -> Rows:
     first, *others, last = _cut(subject, *long_set(subject), token=3)
     shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)
     return [
-        *(subject.arm, stage(subject.one()), shorter, send("Commit", token=1)),
-        *(stage(subject.one()), 1.1 * STAGED_LIFE, send("Commit", token=2, code=_OLD)),
-        *(first, 0.6 * STAGED_LIFE),
+        # One that is confirmed once more lives no longer.
+        *(subject.arm, subject.one(), stage(subject.one()), shorter, stage(subject.one(), token=2)),
+        *(1.03 * STAGED_LIFE - shorter, send("Commit", token=2, code=_OLD)),
+        *(first, 0.55 * STAGED_LIFE),
         *others,
-        *(last, 0.5 * STAGED_LIFE, send("Commit", token=3, code=_OLD), last),
+        *(last, 0.48 * STAGED_LIFE, send("Commit", token=3, code=_OLD), last),
         *others,
-        *(0.6 * STAGED_LIFE, first, 0.5 * STAGED_LIFE, last),
+        *(0.55 * STAGED_LIFE, first, 0.48 * STAGED_LIFE, last),
     ]

@@ -10,7 +10,7 @@ from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, s
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
-from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
+from drivers.protocol.table import COMMAND, ENVELOPE, LAYER, QUANTITIES
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8
@@ -57,6 +57,10 @@ async def achieved(subject: Subject) -> None:
         await subject.request("GetAchieved", layer=number)
     for number in subject.layers:
         await subject.request("GetAchieved", layer=number)
+    # What fades is not listed, nor its layer once that is over.
+    for one in (subject.one(subject.tone(frequency=subject.other)), layer(0)):
+        await subject.play(replace(one, ramp=subject.ramp))
+        await subject.request("GetAchieved", layer=0)
 
 
 @driving("protocol.md#messages")
@@ -91,12 +95,8 @@ def _part(words: list[int], code: str = "BAD_VALUE", *channels: int | None, **va
 
 
 def _flawed_tones(subject: Subject) -> Iterator[Command]:
-    """Yield commands beyond the limits of their channel, or the envelopes that there can be."""
-    low, high = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
-    count, knot = subject.can["knots"], (100, 0)
-    shapes = [Envelope(step, (knot,)) for step in {low - 1, high + 1} - {0, 1001}]
-    shapes += [Envelope(low, (knot,) * (count + 1))] if count < 32 else []
-    yield from (subject.tone(onset=shape) for shape in shapes)
+    """Yield commands beyond the limits of their channel."""
+    low = subject.can["envelope_step_min"]
     to_0 = partial(replace, level=0, onset=Envelope(low, ()))  # drives all the same
     for number, limits in enumerate(subject.can["limits"]):
         own, loud = subject.tone(number), limits["level_max"] + 1
@@ -112,6 +112,21 @@ def _flawed_tones(subject: Subject) -> Iterator[Command]:
             )
 
 
+def _flawed_shapes(subject: Subject) -> Iterator[list[int]]:
+    """Yield words of sets whose onset, or an ending that is never played, cannot be played."""
+    low, high = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
+    count, knot = subject.can["knots"], (100, 0)
+    wrong = (_LEVEL + 1, 0), (100, _PHASE.maximum + 1), (100, 0x10000 + _PHASE.minimum - 1)
+    bare = Envelope(low, ())
+    for tone in (subject.tone(0, 0.5, onset=bare), subject.tone(0, 0.0, ending=bare)):
+        start = pack_layers([layer(0, tone)])[: -ENVELOPE.words]
+        yield from ([*start, 0, step] for step in (low - 1, high + 1))
+        yield [*start, count + 1, low, *knot * (count + 1)]
+        if count > 1:
+            yield from ([*start, 2, low, *each, *knot] for each in wrong)
+            yield [*start, 2, low, *knot, *wrong[0]]
+
+
 def _flawed_sets(subject: Subject) -> Iterator[Send]:
     """Yield sets that must be refused: beside a good layer, and as words that no set can have."""
     tone, good = subject.tone(), layer(1, subject.tone(0, 0.5))
@@ -125,17 +140,18 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
     for layer_set in (
         *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
         *([layer(layers, tone)] if layers < 16 else []),
-        *([layer(0, tone, ramp=ramp + 1)] if ramp < 1000 else []),
     ):
         yield _part(pack_layers([good, layer_set]))
-    if ramp < 1000:
-        yield _part(pack_layers([good, layer(0, ramp=ramp + 1, renew=True)]))
-        yield _part(pack_layers([good, layer(0, tone, tone, ramp=ramp + 1)]))
+    above = {"ramp": ramp + 1, "valid_for": QUANTITIES["valid_for"].maximum + 1}
+    for headed in (layer(0, tone, tone), layer(0), layer(0, renew=True)):
+        for name, number in above.items():
+            start = pack_layers([good, headed])
+            start[len(pack_layers([good])) + LAYER.places[name]] = number
+            yield _part(start)
     words = pack_layers([layer(0, tone)])
     head, command = LAYER.places, COMMAND.places
     for at, word, named in (
         (head["layer"], words[head["layer"]] | 1 << 15, (None,)),
-        *((head[name], QUANTITIES[name].maximum + 1, (None,)) for name in ("ramp", "valid_for")),
         *(
             (LAYER.words + command[name], word, (0,))
             for name, word in (
@@ -147,22 +163,20 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         ),
     ):
         yield _part([*words[:at], word, *words[at + 1 :]], "BAD_VALUE", *named)
-    if subject.can["knots"]:
-        shaped = pack_layers([layer(0, subject.tone(onset=subject.envelope(0.01, 0.5)))])
-        for phase in (_PHASE.maximum + 1, 0x10000 + _PHASE.minimum - 1):
-            yield _part([*shaped[:-1], phase], "BAD_VALUE", 0)
-        yield _part([*shaped[:-2], _LEVEL + 1, 0], "BAD_VALUE", 0)
+    yield from (_part(each, "BAD_VALUE", 0) for each in _flawed_shapes(subject))
+    yield _part([*words[:-2], 0, _PHASE.maximum + 1], "BAD_VALUE", 0)
     for wrong in (words[:-1], [*words, 0], [words[head["count"]] + 1, *words[1:]]):
         yield _part(wrong, "BAD_LENGTH")
     # Of two flaws it names the first: length, layer, channel, then the channel's words.
-    beyond = [*words[: head["ramp"]], 1001, *words[head["ramp"] + 1 :]]
+    long = [*words[: head["ramp"]], 1001, *words[head["ramp"] + 1 :]]
     loud = [*words[LAYER.words : -2], _LEVEL + 1, words[-1]]
     two = [words[0] + 1, *words[1 : LAYER.words]]
-    yield _part(beyond[:-1], "BAD_LENGTH")
-    yield _part([two[0], *beyond[1:], *words[LAYER.words :]], "BAD_VALUE")
+    yield _part(long[:-1], "BAD_LENGTH")
+    yield _part([two[0], *long[1:], *words[LAYER.words :]], "BAD_VALUE")
     yield _part([*two, *words[LAYER.words :], *loud], "BAD_CHANNEL", 0)
     yield _part([*two, *loud, *words[LAYER.words :]], "BAD_VALUE", 0)
-    yield _part([*words[: LAYER.words], *loud, *words], "BAD_VALUE", 0)
+    for then in (words, words[:-1]):
+        yield _part([*words[: LAYER.words], *loud, *then], "BAD_VALUE", 0)
 
 
 @driving(_PLACE)
@@ -172,12 +186,11 @@ def all_or_nothing(subject: Subject) -> Rows:
         row
         for token, each in enumerate(_flawed_sets(subject), 2)
         for row in (
-            replace(each, values={**each.values, "token": token, "now": 1}),
-            replace(each, values={**each.values, "token": token, "now": 0}),
-            send("Commit", token=token, code="BAD_TOKEN"),
+            replace(each, values={**each.values, "token": token, "now": token % 2}),
+            *([] if token % 2 else [send("Commit", token=token, code="BAD_TOKEN")]),
         )
     ]
-    last, silent = len(flawed) // 3 + 2, pack_layers([layer(0)])
+    last, silent = len(flawed) + 2, pack_layers([layer(0)])
     return [
         subject.arm,
         subject.one(),

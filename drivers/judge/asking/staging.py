@@ -7,7 +7,6 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.judge.outputs import LATE
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
 from drivers.protocol.table import COMMAND, LAYER
 from registry import clock
@@ -32,7 +31,9 @@ def stage_and_commit(subject: Subject) -> Rows:
         subject.follow,
         *again,
         *again,
-        play(subject.one(), token=2, code=("", _OLD)),
+        *(stage(subject.one(level=0.75), token=3), send("Commit", token=2)),
+        send("Commit", token=3),
+        play(subject.one(), token=2, code=_OLD),
     ]
 
 
@@ -93,8 +94,9 @@ def committed_together(subject: Subject) -> Rows:
 @driving(_PLACE)
 async def starts_at_its_moment(subject: Subject) -> None:
     """It starts a set as its clock comes to the moment of its Commit, at once beyond 0.5 s."""
-    soon, beyond = min(0.1 * subject.slowness, 0.4), 1.1 * MAX_AHEAD
-    for duration in (soon, 0.95 * MAX_AHEAD, beyond, -0.1, 0.0):
+    soon = min(0.1 * subject.slowness, 0.4)
+    beyond = 1.01 * MAX_AHEAD + 2 * min(subject.exchange_time, 1.0)
+    for duration in (soon, 0.99 * MAX_AHEAD, beyond, -0.1, 0.0):
         await subject.in_time(partial(_starts, subject, duration))
     present = subject.shown.clock.present
     over_the_end = (HIGH_WORDS - present - round(0.05 / HIGH_TIME)) % HIGH_WORDS
@@ -113,7 +115,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     while clock.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
         since = ahead(shown["clock"], at * HIGH_STEPS)
-        if is_ahead and not -_NEAR < since < LATE + _NEAR:
+        if is_ahead and abs(since) > _NEAR:
             what = f"whether it plays {1e3 * since:.1f} ms behind its moment, by its clock"
             expect_equal(shown["levels"][0] > 0, since > 0, what)
         await asyncio.sleep(_NEAR)
@@ -132,16 +134,23 @@ async def _commit(subject: Subject, duration: float) -> int:
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
-    left = min(0.2 * subject.slowness, 0.4)
+    left = min(0.1 * subject.slowness, 0.4)
     waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
+    first, *_ = subject.parts(half, token=2, now=0, count=3)
     ends: list[Rows] = [
-        *([send(name, ramp=0)] for name in ("Silence", "Disarm", "Stop")),
+        *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
         [play(half)],
-        [stage(half), send("Commit", token=2)],
+        # It starts before what comes for its own layer.
+        [stage(subject.one(level=0.5)), send("Commit", token=2)],
+        [send("Set", **first)],
         [stage(half), partial(_commit, subject, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
-    return [[*waits, *each, 1.25 * left] for each in ends]
+    trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
+    later = [waits[0], partial(_commit, subject, min(3 * left, 0.45)), *trips, 2 * left]
+    # No status is read as it starts.
+    unseen = stage(subject.one(ramp=subject.ramp)), partial(_commit, subject, left)
+    return [*([*waits, *each, 1.25 * left] for each in ends), later, [*unseen, 1.25 * left]]

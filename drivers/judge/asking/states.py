@@ -7,12 +7,12 @@ from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require, require_in_time
-from drivers.judge.asking.material import Rows, layer, play, send, stage
+from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.judge.states import FADE
 from drivers.protocol.clock import ahead
-from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED, QUANTITIES
 from registry import clock
 
@@ -95,10 +95,17 @@ def sessions(subject: Subject) -> Rows:
         send("Ping", session=0, code="BAD_VALUE"),
         *(send("Disarm", ramp=0), subject.settle),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
-        *(subject.arm, play(quarter, session=own, code="WRONG_SESSION")),
+        partial(_arm_as, subject, own ^ 0x100),
+        play(quarter, session=own, code="WRONG_SESSION"),
         *(send("Stop", ramp=0), subject.settle, subject.clear),
         send("Arm", watchdog=maximum, code="WRONG_SESSION"),
+        partial(_arm_as, subject, (own ^ 0x100) + 1),
     ]
+
+
+async def _arm_as(subject: Subject, session: int) -> None:
+    subject.client.session = session - 1
+    await subject.arm()
 
 
 @driving(_STATES)
@@ -121,11 +128,16 @@ def stop(subject: Subject) -> Rows:
 
 @driving(_STATES)
 def stop_ramps(subject: Subject) -> Rows:
-    """It falls silent along the ramp of a Stop or Disarm, a raised cosine, then is off."""
-    long, refused = min(500, subject.can["ramp_max"]), play(subject.one(), code=_WRONG)
-    stops = [(subject.whole(), send("Stop", ramp=each)) for each in (subject.ramp, long, 0xFFFF)]
-    ramps = subject.ramp, 0xFFFF
-    return [*stops, *((subject.whole(), send("Disarm", ramp=each), refused) for each in ramps)]
+    """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
+    whole, refused = subject.whole(), play(subject.one(), code=_WRONG)
+    amid = partial(subject.follow, 0.35 * subject.slowness)
+    (stop, longest_stop), (disarm, longest_disarm) = (
+        [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
+    )
+    return [
+        *((whole, stop), (whole, disarm, refused), (whole, longest_stop, amid, disarm)),
+        (whole, longest_disarm, refused, amid, stop),
+    ]
 
 
 @driving(_STATES)
@@ -145,8 +157,8 @@ def silence_never_later(subject: Subject) -> Rows:
 def stop_ends_all(subject: Subject) -> Rows:
     """It ends fades, onsets, endings, waiting sets and all layers by Stop, skipping endings."""
     subject.require_ramp()
-    stopped = send("Stop", ramp=10), 0.05, subject.clear
-    return [(*rows, *stopped) for rows in subject.transitions(subject.can["ramp_max"])]
+    stopped = send("Stop", ramp=10)
+    return [(*rows, stopped) for rows in subject.transitions(subject.can["ramp_max"])]
 
 
 @driving(_STATES)
@@ -165,7 +177,7 @@ def stops_are_numbered(subject: Subject) -> Rows:
 def clear_too_early(subject: Subject) -> Rows:
     """It stays stopped by a Clear amid its fade."""
     subject.require_ramp()
-    ramp = subject.can["ramp_max"]
+    ramp = subject.ramp
     slow = send("Stop", ramp=ramp)
     return [subject.arm, subject.one(), slow, subject.clear, ramp / 1000 + 0.02, subject.clear]
 
@@ -186,7 +198,7 @@ def silence(subject: Subject) -> Rows:
     ]
 
 
-async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
+async def _trips(subject: Subject, time: float, *sets: Row) -> None:
     """Play sets and starve it: it trips at its time [s], is silent 5 ms later, and lists it."""
     await subject.run(
         [
@@ -196,13 +208,21 @@ async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
             0.8 * time,
             subject.settle,
             send("GetFaults"),
-            play(*sets[:1], code="WRONG_STATE"),
+        ]
+    )
+
+
+async def _trips_for_good(subject: Subject, time: int) -> None:
+    """Have it trip after a time [ms]: it plays and arms no more until it is cleared."""
+    await _trips(subject, time / 1000, subject.whole(), stage(subject.one(level=0.5)))
+    arm = partial(send, "Arm", watchdog=time)
+    await subject.run(
+        [
+            play(subject.one(), code=_WRONG),
             0.05,
-            send("Arm", session=77, watchdog=round(1000 * time), code="WRONG_STATE"),
+            arm(session=77, code=_WRONG),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
-            send("Disarm", ramp=0),
-            subject.clear,
-            send("Arm", watchdog=round(1000 * time), code="WRONG_SESSION"),
+            *(send("Disarm", ramp=0), subject.clear, arm(code="WRONG_SESSION")),
         ]
     )
 
@@ -211,7 +231,7 @@ async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
 async def watchdog(subject: Subject) -> None:
     """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
     for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
-        await subject.in_time(partial(_trips, subject, time / 1000, subject.whole()))
+        await subject.in_time(partial(_trips_for_good, subject, time))
 
 
 @driving(_SESSIONS)
@@ -259,7 +279,7 @@ async def trips_amid_fades(subject: Subject) -> None:
 async def watchdog_unread(subject: Subject) -> None:
     """It trips at its time though nothing is asked of it, and lists the fault with its age."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    await asyncio.sleep(subject.shown.watchdog + 0.4)
+    await asyncio.sleep(subject.shown.watchdog + 0.2)
     await subject.run([send("GetFaults")])
 
 
@@ -272,7 +292,7 @@ def what_feeds(subject: Subject) -> Rows:
         *(send("Commit", token=2), send("Commit", token=2), send("Set", **long)),
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
-    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.1, feed))]
+    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.05, feed))]
 
 
 @driving(_SESSIONS)
@@ -280,7 +300,8 @@ def what_does_not_feed(subject: Subject) -> Rows:
     """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
-    first, *_ = subject.parts(*long_set(subject), token=7, now=0, count=3)
+    made = long_set(subject)
+    first, *_ = subject.parts(*made, token=7, now=0, count=3)
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
     idle: Rows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
@@ -295,13 +316,16 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
         send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
+        send("GetAchieved", raw=[16], code="BAD_VALUE"),
         partial(subject.client.exchange, 63, ()),
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
     collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
     rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
-    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected]
+    whole = [send("Set", **each) for each in subject.parts(*made, token=8, now=0, count=3)]
+    staged: Rows = (*whole, 0.02, whole[0])  # which is dropped
+    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected, *staged]
 
 
 @driving(_SESSIONS)
@@ -325,4 +349,5 @@ async def fault_list(subject: Subject) -> None:
     """It lists faults, the newest first, by their ages, also after they were cleared."""
     for _ in range(2):
         await _trips(subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
+        await subject.clear()
     await subject.run([send("GetFaults"), 0.1, send("GetFaults")])

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import (
     BY_NUMBER,
     EVENT,
@@ -178,7 +179,8 @@ class _Node:
         try:
             kind, words = message.type, self._words(message, now)
         except Refusal as refusal:
-            kind, words = NAK, nak_of(refusal, message.type) if message.number else []
+            has_reply = message.number and not is_earlier_part(message.type, message.words)
+            kind, words = NAK, nak_of(refusal, message.type) if has_reply else []
         if words:
             self._put(REPLY + sender, *segments(message.number, kind, words))
         if self.number != sender:

@@ -72,22 +72,23 @@ async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> N
 
 @in_virtual_time
 async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() -> None:
-    """Each keeps its layer and what it feels keeps its frequency, unless 3 dB more are promised."""
+    """Each keeps its layer and its frequency; what is led to a better answer follows."""
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
         before = {number: one.content for number, one in fingers.applied[-1].contents.items()}
         count = len(fingers.committed)
         fingers.at[3] = ABOVE
-        await fingers.hold(0.5)
+        await fingers.hold(0.09)
         (sent,) = begun(fingers.committed[count:])
         assert sorted(one.layer for one in sent) == [0, 1, 2]
         after = {number: one.content for number, one in fingers.applied[-1].contents.items()}
         for number, content in before.items():
             assert after[number].targets[0][0].key == content.targets[0][0].key
         assert [each.held_back for each in fingers.applied[-1].targets] == [None] * 3
-        kept = [n for n, content in before.items() if after[n].frequency == content.frequency]
+        for number, content in before.items():
+            assert after[number].frequency == content.frequency
         for one in sent:
             keeps = {command.keep_phase for command in one.commands}
-            assert keeps == {one.layer in kept}
+            assert keeps == {one.layer in before}
 
 
 @in_virtual_time
@@ -116,7 +117,7 @@ async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> 
 
 @in_virtual_time
 async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
-    """On a way along which others promise 3 dB more: they play within 0.2 s of rest, once."""
+    """On a way along which others promise 2 dB more: these are led to once it rests, in steps."""
     async with fingers_on(table(), LAYOUT, at={1: (0.12, 0.10), 2: RIGHT}, held=0.5) as fingers:
         before, count = _frequencies(fingers.applied[-1]), len(fingers.applied)
 
@@ -128,11 +129,11 @@ async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
         assert len(sliding) >= 5
         assert {_frequencies(each) for each in sliding} == {before}
         slid = asyncio.get_running_loop().time()
-        await fingers.hold(0.8)
-        (rested,) = fingers.applied[count + len(sliding) :]
-        assert rested.time - slid <= 0.2
-        assert _frequencies(rested) != before
-        assert _worst(rested) >= _worst(sliding[-1]) + 3
+        await fingers.hold(1.5)
+        first, *_, rested = fingers.applied[count + len(sliding) :]
+        assert 0.05 <= first.time - slid <= 0.2
+        assert {*_frequencies(rested)} != {*before}
+        assert _worst(rested) >= _worst(sliding[-1]) + 2
 
 
 @in_virtual_time
@@ -233,7 +234,7 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
     Nor does it count as felt once one of the others lifts.
     """
     renewal = Layers.renewal
-    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.8) as fingers:
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
 
         def not_one(all_layers: Layers, now: float) -> Sets:
@@ -410,7 +411,7 @@ async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
         count, begin = len(fingers.committed), loop.time()
         fingers.at[3] = ABOVE
         await fingers.hold(0.3)
-        (start, is_driven), (end, is_still_driven) = (
+        (start, is_driven), (end, is_still_driven), *_ = (  # then what others are led to
             (at, any(command.level for command in one.commands))
             for at, _, layers in fingers.committed[count:]
             for one in layers

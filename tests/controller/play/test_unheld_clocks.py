@@ -29,7 +29,7 @@ from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 from virtual_loop import in_virtual_time
 
-IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 CRYSTALS = {"a": Crystal(), "b": Crystal(error=40e-6)}
 WIRE = Wire("serial", speed=921_600, shared=True, line_kind="prompt")
 

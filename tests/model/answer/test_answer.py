@@ -16,7 +16,7 @@ from model.answer.search_in_c import choose_tones
 from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
-from model.study.exact_plates import Plates, draw_plates, powers_on
+from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
 from model.table.file import save_table
 from model.table.table import read_fingertips
 from only import drives, only, wants
@@ -38,6 +38,7 @@ def given(table, found, quiet, plates):
         rows, power = powers_on(table, placed, layer.excitation, plates)
         frequency = table.frequencies[rows]
         sensed = power[0] / detection_threshold(frequency) ** 2
+        sensed = sensed + harmonics_on(table, placed, layer.excitation, plates)
         powers.append(sensed.reshape(count, points, -1))
     power = np.array(powers)
     own = [tips.fine_weights[j] @ np.sqrt(power[j, j]) for j in range(len(layers))]
@@ -63,6 +64,9 @@ def as_modelled(fingers):
         np.ones((1, fingers)),
         np.ones((1, 4)),
         np.zeros((1, fingers)),
+        one,
+        np.zeros((1, 4, 2)),
+        np.zeros((1, 4)),
     )
 
 
@@ -140,9 +144,14 @@ def test_two_contents_of_one_frequency_are_said_to_be_near():
 
 
 def test_contents_of_one_frequency_may_meet_in_phase():
-    """At a finger, amplitudes of one frequency add, powers of two: 3, 4 and 12 make 7² + 12²."""
+    """At a finger, amplitudes of one frequency add, powers of two: 3, 4 and 12 make 7² + 12².
+
+    Powers of second harmonics add to these.
+    """
     power = np.array([3.0, 12.0, 4.0])[:, None, None, None] ** 2
-    assert loudest_power(power, np.array([5, 2, 5]), 0) == pytest.approx(193)
+    harmonics = np.array([2.0, 3.0, 0.5])[:, None, None]
+    assert loudest_power(power, 0 * harmonics, np.array([5, 2, 5]), 0) == pytest.approx(193)
+    assert loudest_power(power, harmonics, np.array([5, 2, 5]), 0) == pytest.approx(198.5)
 
 
 def test_a_tone_of_the_same_frequency_may_cancel_part_of_ones_own():

@@ -40,7 +40,7 @@ def dense_score(
     With errors of the gains and of the thickness only, whose plates are solved anew, and one quiet
     finger; the best weights are an eigenvector. ERAs at places (n, 2) [m] are like the first.
     """
-    plate, std = rig.plate, rig.uncertainty.thickness
+    plate, std = rig.plate, rig.uncertainty.frequency
     plates = [
         solve_free_plate(
             replace(plate, thickness=h * plate.thickness),
@@ -246,7 +246,9 @@ def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
     pairs = [np.array([[0.06, 0.05], [0.2, 0.15]]), np.array([[0.1, 0.15], [0.25, 0.05]])]
     scores, answers = [], []
     for field in (0.02, 0.05):
-        known = Uncertainty(0.005, 0.5, 0.002, 0.01, 1.1, 0.5, field=field)
+        known = Uncertainty(
+            *(0.005, 0.5, 0.002, 0.01, 1.1, 0.5), field=field, modulus=0.0, place=0.0, harmonic=0.0
+        )
         some = replace(rig(), uncertainty=known)
         scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs, eras=some.eras)
         places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))

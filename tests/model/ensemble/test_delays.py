@@ -23,7 +23,8 @@ from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
 from paper_table import contact_sets, smooth_rig
 
-IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0}
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 ERAS = tuple(era.name for era in smooth_rig().eras)
 WIRING = {name: Channel("ab"[number % 2], number) for number, name in enumerate(ERAS)}
 """Each amplifier has two ERAs of the four at the corners."""
@@ -45,7 +46,14 @@ def clocks(**errors: float) -> ClockErrors:
 
 def test_two_equal_halves_leave_what_their_delay_says() -> None:
     """2 sin(pi f t) of one half, t apart, and in the mean square 2 (exp(p²) - 1) of the mean's."""
-    known = {"masses": 0, "gain": 0.0, "phase": 0.0, "common_gain": 0.0, "thicknesses": 1}
+    known = {
+        "masses": 0,
+        "gain": 0.0,
+        "phase": 0.0,
+        "common_gain": 0.0,
+        "harmonic": 0.0,
+        "thicknesses": 1,
+    }
     draws, off = draw(2, 1, count=200, seed=8, **known), ClockErrors((0, 1), (20e-6, 20e-6))
     gains = delayed(draws, off, (1.0, 250.0), 8).gains.astype(complex)
     delays = -np.angle(1 + gains[0, :2]) / (2 * math.pi)  # [s], by the phase at 1 Hz
@@ -61,7 +69,14 @@ def test_two_equal_halves_leave_what_their_delay_says() -> None:
 
 def test_eras_of_one_amplifier_are_late_together() -> None:
     """Their factors are one number, and those of the other amplifier another."""
-    known = {"masses": 1, "gain": 0.0, "phase": 0.0, "common_gain": 0.0, "thicknesses": 1}
+    known = {
+        "masses": 1,
+        "gain": 0.0,
+        "phase": 0.0,
+        "common_gain": 0.0,
+        "harmonic": 0.0,
+        "thicknesses": 1,
+    }
     draws = draw(4, 2, count=64, seed=1, **known)
     gains = delayed(draws, clocks(a=1e-4, b=2e-4), (100.0,), 1).gains[0]
     assert (gains[0] == gains[2]).all()
@@ -192,7 +207,14 @@ def test_amplifiers_that_are_held_play_together_beside_one_that_is_not() -> None
 
 def test_plates_of_the_promise_are_the_same_but_for_the_clocks() -> None:
     """Only gains differ, and these by factors of magnitude 1."""
-    known = {"masses": 0, "gain": 0.05, "phase": 0.1, "common_gain": 0.0, "thicknesses": 40}
+    known = {
+        "masses": 0,
+        "gain": 0.05,
+        "phase": 0.1,
+        "common_gain": 0.0,
+        "harmonic": 0.0,
+        "thicknesses": 40,
+    }
     exact = draw(4, 1, count=PROMISED_DRAWS.count, seed=PROMISED_DRAWS.seed, **known)
     off = delayed(exact, clocks(a=1e-4, b=1e-4), (100.0, 200.0), PROMISED_DRAWS.seed)
     for name in ("loss", "damping", "own", "errors", "node"):

@@ -381,5 +381,6 @@ def test_uncertainty_is_shown_to_three_digits() -> None:
     """What an identification leaves uncertain has no digits in a report beyond those known."""
     shown = str(Uncertainty(gain=0.0101507, phase_deg=1.00303, damping=1.03340))
     assert shown == (
-        "gain 1.02 %, thickness 2 %, stiffness 10 %, phase 1°, damping x 1.033, fingertip x 1.6"
+        "gain 1.02 %, thickness 2 %, modulus 2 %, stiffness 10 %, harmonic 1 %, phase 1°, "
+        "damping x 1.033, fingertip x 1.6, place 1 mm"
     )

@@ -16,7 +16,7 @@ from model.rig.uncertainty import Uncertainty
 from model.study.clock_costs import ClockCost, clock_cost
 from paper_table import smooth_rig
 
-IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 RIG = """
 plate: {length: 305 mm, width: 229 mm, thickness: 1.5 mm, material: aluminium}
 mesh: 6x5 Q4

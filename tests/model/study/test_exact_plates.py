@@ -22,6 +22,8 @@ from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
 
+PLACES_OFF = np.array([[1.0, 0.5], [-1.0, 0.8], [-0.6, -1.2], [0.9, -0.7]])  # inwards
+
 PLATES = Plates(
     thickness=np.array([1.0, 1.02, 0.98]),
     loss=np.array([1.0, 2.0, 0.5]),
@@ -33,6 +35,9 @@ PLATES = Plates(
         dtype=complex,
     ),
     deviation=np.zeros((3, 3), dtype=complex),
+    modulus=np.array([1.0, 0.96, 1.03]),
+    places=1e-3 * np.array([np.zeros((4, 2)), PLACES_OFF, -0.5 * PLACES_OFF]),
+    harmonic=np.zeros((3, 4), dtype=complex),
 )
 
 
@@ -43,13 +48,21 @@ def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
     contact mass of each finger.
     """
     plate = replace(
-        rig.plate,
+        rig.plate.scaled(modulus=PLATES.modulus[number]),
         thickness=rig.plate.thickness * PLATES.thickness[number],
         loss_factor=rig.plate.loss_factor * PLATES.loss[number],
     )
     eras = [
-        replace(era, stiffness=era.stiffness * k, damping=era.damping * PLATES.damping[number])
-        for era, k in zip(rig.eras, PLATES.stiffness[number], strict=True)
+        replace(
+            era,
+            x=min(max(era.x + x, 0.0), plate.length),
+            y=min(max(era.y + y, 0.0), plate.width),
+            stiffness=era.stiffness * k,
+            damping=era.damping * PLATES.damping[number],
+        )
+        for era, k, (x, y) in zip(
+            rig.eras, PLATES.stiffness[number], PLATES.places[number], strict=True
+        )
     ]
     places = (TARGET, *QUIET)
     fingers = [
@@ -86,7 +99,7 @@ def test_felt_on_agrees_with_the_direct_solve(targets, mode):
     found = 20 * np.log10(contrast)
     solved = [directly(smooth_rig(), layer, number, targets=targets) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
-    assert np.ptp(solved) > 0.3  # the plates do differ
+    assert np.ptp(solved) > 0.15  # the plates do differ
 
 
 def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve():
@@ -104,7 +117,7 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     np.testing.assert_allclose(found, solved, atol=0.15)
     assert predicted.contrast_db == pytest.approx(solved[0], abs=0.15)
     alike = [directly(smooth_rig(), layer, number) for number in range(3)]
-    assert np.abs(np.subtract(alike, solved)).max() > 0.4
+    assert np.abs(np.subtract(alike, solved)).max() > 0.2
 
 
 def test_discretisation_error_enters_the_contrast_of_plates():
@@ -157,6 +170,9 @@ def test_draw_plates_has_the_spreads_of_the_uncertainty():
         (np.log(plates.damping), math.log(1.5)),
         (np.log(plates.loss), math.log(1.5)),
         (np.log(plates.load), 0.5),
+        (plates.modulus, 0.02),
+        (plates.places, 0.001),
+        (plates.harmonic, 0.01),
     ]
     for values, std in expected_stds:
         assert values.std() == pytest.approx(std, rel=0.04)

@@ -90,6 +90,21 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     assert abs(shares[3] - turned) < 1e-6 * abs(turned)
 
 
+def test_imperfections_second_harmonic_is_another_tone(two_amplifiers: Rig) -> None:
+    """A tenth of the motion at twice its frequency and phase, from its onset on, as if played."""
+    share = cmath.rect(0.1, math.radians(40))
+    errors = Imperfections({Channel("left", 0): ChannelErrors(harmonic=share)})
+    drive = {"left": (Tone(0, 110.0, 0.5, 25.0), Tone(1, 170.0, 0.2))}
+    _, distorted = played(two_amplifiers, errors, drive, until=0.2)
+    _, plain = played(two_amplifiers, PERFECT, drive, until=0.2)
+    _, harmonic = played(
+        two_amplifiers, PERFECT, {"left": (Tone(0, 220.0, 0.05, 2 * 25.0 + 40.0),)}, until=0.2
+    )
+    largest = np.abs(harmonic).max()
+    assert_allclose(distorted - plain, harmonic, rtol=0, atol=1e-3 * largest)
+    assert largest > 0.05 * np.abs(plain).max()
+
+
 def test_imperfections_skew_shifts_the_phase(two_amplifiers: Rig) -> None:
     """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
     drive = {"right": (Tone(0, 110.0, 0.5),)}
@@ -133,7 +148,16 @@ def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> Non
 
 def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> None:
     """Over five hundred plates every parameter has the rig's deviations, none follows another."""
-    std = Uncertainty(0.0, 0.0, thickness=0.01, stiffness=0.2, damping=1.3, fingertip=0.4)
+    std = Uncertainty(
+        *(0.0, 0.0),
+        thickness=0.01,
+        stiffness=0.2,
+        damping=1.3,
+        fingertip=0.4,
+        modulus=0.02,
+        place=0.003,
+        harmonic=0.1,
+    )
     drawn = [
         draw_imperfections(replace(coarse_rig, uncertainty=std), seed=seed) for seed in range(500)
     ]
@@ -147,12 +171,20 @@ def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> N
                 *(one.plate.stiffness[name] for name in names),
                 np.log(one.load_of("1", Fingertip()).stiffness / 1000),
                 np.log(one.load_of("2", Fingertip()).phalanx_mass / 0.005),
+                one.plate.modulus,
+                *(1e2 * at for name in names for at in one.plate.places[name]),
+                *(each.harmonic.real for each in one.channels.values()),
+                *(each.harmonic.imag for each in one.channels.values()),
             )
             for one in drawn
         ]
     )
-    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0])
-    spreads = np.array([0.01, np.log(1.3), np.log(1.3), 0.2, 0.2, 0.2, 0.2, 0.4, 0.4])
+    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0, 1] + 16 * [0])
+    spreads = np.array(
+        [0.01, np.log(1.3), np.log(1.3), 0.2, 0.2, 0.2, 0.2, 0.4, 0.4, 0.02]
+        + 8 * [0.3]
+        + 8 * [0.1 * math.sqrt(0.5)]
+    )
     assert_allclose(found.mean(axis=0), centres, atol=0.15 * spreads.max(), rtol=0.01)
     assert_allclose(found.std(axis=0), spreads, rtol=0.1)
     alike = np.corrcoef(found.T) - np.eye(len(spreads))
@@ -173,13 +205,23 @@ def test_draw_imperfections_of_a_known_rig_has_none(coarse_rig: Rig) -> None:
 
 def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) -> None:
     """A thicker plate on a softer ERA, all damped more, vibrates as one that was built so."""
-    errors = PlateErrors(thickness=1.03, loss_factor=1.5, era_damping=2.0, stiffness={"SE": 0.8})
+    errors = PlateErrors(
+        thickness=1.03,
+        modulus=0.97,
+        loss_factor=1.5,
+        era_damping=2.0,
+        stiffness={"SE": 0.8},
+        places={"SE": (-0.002, 0.001), "SW": (-0.001, 0.004)},
+    )
+    places = {"SE": (0.3028, 0.001), "SW": (0.0, 0.004)}  # none is off the plate
     built = replace(
         coarse_rig,
-        plate=replace(coarse_rig.plate, thickness=0.001545, loss_factor=0.015),
+        plate=replace(coarse_rig.plate.scaled(modulus=0.97), thickness=0.001545, loss_factor=0.015),
         eras=tuple(
             replace(
                 era,
+                x=places.get(era.name, (era.x, era.y))[0],
+                y=places.get(era.name, (era.x, era.y))[1],
                 damping=2 * era.damping,
                 stiffness=13_600.0 if era.name == "SE" else 17_000.0,
             )

@@ -1,0 +1,137 @@
+"""What a rig check says of plates with a fault, which another solver computes.
+
+    python -m benchmarks.identification.causes [--plates 5] [--noise 0.01]
+
+Hidden plates are those of `benchmarks.identification.hidden`, read by eight accelerometers at 16
+tones with noise, scales off by 1 % and places by 0.5 mm. It counts the plates of which the check
+says what is wrong, and of which it says that anything is.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffness
+from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
+from benchmarks.setting import RIG, use_one_thread
+from model.calibration.responses import Responses
+from model.diagnosis.diagnosis_report import as_json
+from model.diagnosis.verdict import Verdict, diagnose
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+
+FREQUENCIES = np.linspace(45.0, 495.0, 16)
+SENSORS = np.array(
+    [
+        *([0.07, 0.15], [0.37, 0.08], [0.94, 0.12], [0.14, 0.44]),
+        *([0.62, 0.41], [0.91, 0.57], [0.31, 0.80], [0.96, 0.93]),
+    ]
+) * (LENGTH, WIDTH)
+_SCALE, _OFF = 0.01, 0.5e-3
+_SHIFTED = 30e-3  # m
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: of which kind of hidden plate, what it does, and whether a verdict says so."""
+
+    kind: str
+    is_named: Callable[[Verdict], bool]
+    taper: float = 0.0
+    mass: float = 0.0
+    has_finger: bool = False
+    change: Callable[[Complexes], Complexes] = lambda values: values
+    shift: float = 0.0
+
+
+def _beyond(kind: str) -> Callable[[Verdict], bool]:
+    def is_named(verdict: Verdict) -> bool:
+        beyond = as_json(verdict)["plate"]["beyond"]
+        return beyond is not None and beyond["kind"] == kind
+
+    return is_named
+
+
+def _states(state: str) -> Callable[[Verdict], bool]:
+    return lambda verdict: state in verdict.channels[1].states
+
+
+def _at(factor: float) -> Callable[[Complexes], Complexes]:
+    """The second channel at a share of its amplitude."""
+    return lambda values: values * np.array([1.0, factor, 1.0, 1.0])[:, None]
+
+
+FAULTS = {
+    "none": Fault("plain", lambda verdict: verdict.is_well),
+    "none, with form errors and 3 g": Fault("form", lambda verdict: verdict.is_well),
+    "bonded frame": Fault("frame", _beyond("unnamed")),
+    "thickness ± 3 % from end to end": Fault("plain", _beyond("thickness"), taper=0.03),
+    "10 g": Fault("plain", _beyond("mass"), mass=10e-3),
+    "30 g": Fault("plain", _beyond("mass"), mass=30e-3),
+    "a resting finger": Fault("plain", _beyond("finger"), has_finger=True),
+    "ERA at 70 %": Fault("plain", _states("weak"), change=_at(0.7)),
+    "ERA at 35 %": Fault("plain", _states("weak"), change=_at(0.35)),
+    "inverted": Fault("plain", _states("inverted"), change=_at(-1.0)),
+    "dead": Fault("plain", _states("dead"), change=_at(1e-4)),
+    "swapped": Fault("plain", _states("other ERA"), change=lambda values: values[:, [0, 2, 1, 3]]),
+    "a sensor 30 mm from its place": Fault(
+        "plain", lambda verdict: not verdict.is_well, shift=_SHIFTED
+    ),
+}
+"""Faults by name."""
+
+
+def measured(fault: Fault, seed: int, *, noise: float = 0.01) -> Responses:
+    """Responses of a hidden plate with a fault, in which drives gain what the plate's do."""
+    rng = np.random.default_rng([seed, 93])
+    mounted, size = draw(fault.kind, seed).mounted, np.array([LENGTH, WIDTH])
+    at, angle = rng.uniform(0.1, 0.9, 2) * size, rng.uniform(0, 2 * np.pi)
+    if fault.taper:
+        taper = fault.taper * np.cos(angle), fault.taper * np.sin(angle)
+        mounted = replace(mounted, plate=replace(mounted.plate, taper=taper))
+    if fault.mass:
+        mounted = replace(mounted, masses=np.array([[*at, fault.mass]]))
+    true = SENSORS + _OFF * rng.standard_normal(SENSORS.shape)
+    true[3] += fault.shift * np.array([np.cos(angle), np.sin(angle)])
+    true = np.clip(true, 0, [mounted.plate.length, mounted.plate.width])
+    fingers = at[None] if fault.has_finger else None
+    clean = np.array([_heard(mounted, float(f), true, fingers) for f in FREQUENCIES])
+    heard = clean * (1 + _SCALE * rng.standard_normal(len(SENSORS)))
+    values = fault.change(np.asarray(heard, dtype=complex))
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    white = rng.standard_normal((2, *values.shape))
+    values = values + noise * rms * (white[0] + 1j * white[1]) / np.sqrt(2)
+    names = tuple(f"P{number}" for number in range(1, 1 + len(SENSORS)))
+    return Responses(names, SENSORS, FREQUENCIES, values)
+
+
+def _heard(mounted: Mounted, frequency: float, points: Reals, fingers: Reals | None) -> Complexes:
+    """Responses (e, s) at a frequency, without the gains of the plate's drives."""
+    loads = np.array([finger_stiffness(frequency, np.ones(4))], dtype=complex)
+    own = replace(mounted, gain=np.ones(len(mounted.gain), dtype=complex))
+    return own.accelerations(frequency, points, fingers=fingers, loads=loads).T
+
+
+def verdict_on(rig: Rig, name: str, seed: int, *, noise: float = 0.01) -> Verdict:
+    """The check's verdict on a hidden plate with a fault by name."""
+    return diagnose(rig, measured(FAULTS[name], seed, noise=noise), has_form=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.identification.causes")
+    parser.add_argument("--plates", type=int, default=5)
+    parser.add_argument("--noise", type=float, default=0.01)
+    options = parser.parse_args()
+    use_one_thread()
+    rig, count = load_rig(RIG), options.plates
+    print("| fault | named | exit status 1 |\n|---|---|---|")
+    for name, fault in FAULTS.items():
+        of = [verdict_on(rig, name, seed, noise=options.noise) for seed in range(1, 1 + count)]
+        named, failed = sum(map(fault.is_named, of)), sum(not each.is_well for each in of)
+        print(f"| {name} | {named} of {count} | {failed} of {count} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

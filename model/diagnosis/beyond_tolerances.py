@@ -1,0 +1,175 @@
+"""What of a plate is beyond tolerances: a mass, a finger, its thickness, or something unnamed.
+
+A plate is matched once more with form errors, each held by its tolerance (`KINDS` in
+`model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
+sides, Poisson's ratio, single modes. They explain what builders and rulers do. What lies on the
+plate is sought where it would explain most beside all of them, and named if it then explains it; of
+the rest each kind of form error is judged by its sum of squares. A plate that is thinner at one end
+moves more there, by as much as it is thinner: scales of sensors rise along it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+from scipy.special import chdtri
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
+from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.variable_projection import (
+    project_gains,
+    projection_slopes,
+    responses_of,
+    row_rms,
+)
+from model.choice import best_by
+from model.diagnosis.plate_match import Match, match_plate
+from model.finger.grid import Grid
+from model.identification.derivatives import by_mass_at
+from model.identification.least_squares import single_changes
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
+
+MAX_ERROR = 0.05
+"""Share of a response that form errors leave unexplained at most, if they explain the plate."""
+
+_NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit is weighted by
+_FIRST_NOISE = 0.02
+_SCANNED = Grid(16, 12)
+_HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
+_LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
+_CLEAR = 40.0  # of half the sum of squares
+_UNLIKELY = 0.01
+
+_THICKNESS = "thickness"
+_WORDS = {
+    "place": "places of ERAs",
+    "mode_shifts": "natural frequencies",
+    "sensor_scale": "scales of sensors",
+    "sensor_place": "places of sensors",
+    "foreign_mass": "distribution of mass",
+    "side": "length and width",
+    "poisson": "Poisson's ratio",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BeyondTolerances:
+    """What is not as written.
+
+    load: what lies on the plate, None for nothing; farthest: the form error that would have to be
+    largest, in words, and its rms in standard deviations, 0 where none is too large; error: of the
+    response, unexplained; taper: how much thicker the plate is at the ends of x and of y than in
+    the middle, relative, None where that is not what is farthest.
+    """
+
+    load: PointLoad | FingertipLoad | None
+    farthest: str
+    deviation: float
+    error: float
+    taper: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FormMatch:
+    """A plate matched with form errors, and what of it is beyond tolerances, None for nothing."""
+
+    match: Match
+    beyond: BeyondTolerances | None
+
+
+def match_with_form(
+    plate: SensedPlate, observation: Responses, values: ComplexArray, drives: Sequence[int]
+) -> FormMatch:
+    """Match values (f, e, s) of channels that drive ERAs with form errors, and with a load."""
+
+    def matched(load: Support | None, noise: float) -> Match:
+        rig = plate.rig
+        if load is not None:
+            rig = replace(rig, masses=(*rig.masses, load))  # type: ignore[arg-type]
+        sensed = sensed_plate(rig, observation.points, observation.frequencies, has_form=True)
+        return match_plate(sensed, values, drives=drives, model_error=noise)
+
+    noise = float(np.clip(matched(None, _FIRST_NOISE).error, *_NOISE))
+    best, load = matched(None, noise), None
+    for each in _loads(best, values, drives, noise):
+        found = matched(each, noise)
+        if found.cost < best.cost - _CLEAR:
+            best, load = found, each
+    if load is not None:
+        return FormMatch(best, BeyondTolerances(load, "", 0.0, best.error))
+    rises, slopes = _along_plate(best, observation.points)
+    farthest, deviation = _farthest(best, rises)
+    if best.error <= MAX_ERROR and not deviation:
+        return FormMatch(best, None)
+    taper = slopes if farthest == _THICKNESS else None
+    return FormMatch(best, BeyondTolerances(None, farthest, deviation, best.error, taper))
+
+
+def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:
+    """The kind of form error that is least likely, and its rms in standard deviations."""
+    space = match.plate.model.space
+    kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
+    found = [("", 0.0)]
+    for words, own in (kinds | {_THICKNESS: rises}).items():
+        squares = float(own @ own)
+        if squares > chdtri(len(own), _UNLIKELY):
+            found.append((words, float(np.sqrt(squares / len(own)))))
+    return best_by(found, lambda each: each[1])
+
+
+def _along_plate(match: Match, points: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
+    """What of the scales of sensors rises along the sides (2,), in standard deviations.
+
+    And the thickness that does this, relative, at the ends of x and of y.
+    """
+    space, plate = match.plate.model.space, match.plate.rig.plate
+    scales = match.x[space.groups["sensor_scale"]]
+    along = 2 * points / [plate.length, plate.width] - 1
+    basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
+    off = along - along.mean(axis=0)
+    x, y = -np.linalg.lstsq(off, scales * space.std[space.groups["sensor_scale"]])[0]
+    return basis.T @ scales, (float(x), float(y))
+
+
+def _loads(
+    match: Match, values: ComplexArray, drives: Sequence[int], noise: float
+) -> list[PointLoad | FingertipLoad]:
+    """A mass and a finger where each would explain most, if it is of a size that counts."""
+    plate, of_eras = match.plate, list(drives)
+    model, mass = plate.model, plate.rig.plate.mass
+    tip = plate.rig.fingertip or Fingertip()
+    searched = model.space.uncertain & ~model.space.of("gain")
+    found, by_x = responses_of(model, match.x, searched)
+    points = _SCANNED.centres(plate.rig.plate)
+    by_mass = by_mass_at(model.at(match.x), points).transpose(3, 0, 2, 1)[:, :, of_eras]
+    found, by_x = found[:, of_eras], by_x[:, :, of_eras]
+    kept = np.isfinite(values) & ~match.outliers
+    weight = kept / (noise * row_rms(values, kept)[:, :, None])
+    _, left = project_gains(found, values, weight)
+
+    def real(slopes: ComplexArray) -> FloatArray:
+        """Derivatives (2 m, n) of all residuals."""
+        own = projection_slopes(found, slopes, values, weight)[1][:, kept].T
+        return np.concatenate([own.real, own.imag])
+
+    residual = np.concatenate([left[kept].real, left[kept].imag])
+    J = real(by_x)
+    H = linalg.cho_factor(J.T @ J + np.eye(J.shape[1]))
+    residual = residual - J @ linalg.cho_solve(H, J.T @ residual + match.x[searched])
+    of_finger = -tip.dynamic_stiffness(model.omega) / model.omega**2
+    heaviest: list[PointLoad | FingertipLoad] = []
+    for factor, unit in ((np.ones(len(model.omega)), mass), (of_finger, 1.0)):
+        columns = real(unit * factor[:, None, None] * by_mass)
+        beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
+        ranked = single_changes(-(residual @ columns), (columns * beside).sum(axis=0), 1.0)
+        if not ranked:
+            continue
+        number, size = ranked[0]
+        x, y = points[number].tolist()
+        if unit == mass and size >= _HEAVY:
+            heaviest.append(PointLoad(x, y, mass=size * mass))
+        elif unit == 1.0 and size >= _LIGHT:
+            heaviest.append(FingertipLoad(x, y, tip.multiplied(min(size, _FIRM))))
+    return heaviest

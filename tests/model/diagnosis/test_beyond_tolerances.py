@@ -1,0 +1,48 @@
+"""What lies on a plate or is beyond tolerances, on plates that another solver computes."""
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.causes import FAULTS, verdict_on
+from model.diagnosis.diagnosis_report import as_json, verdict_rows
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's rig."""
+    return load_rig(example_rig_path())
+
+
+@pytest.mark.parametrize("name", ["none", "none, with form errors and 3 g"])
+def test_diagnose_passes_plates_within_tolerances(rig, name):
+    """Places, scales of sensors and a light mass as builders leave them are no fault."""
+    assert verdict_on(rig, name, 1).is_well
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("bonded frame", "UNNAMED"),
+        ("thickness ± 3 % from end to end", "THICKNESS"),
+        ("a resting finger", "FINGER"),
+        ("10 g", "MASS"),
+    ],
+)
+def test_diagnose_names_what_is_beyond_tolerances(rig, name, word):
+    """Each is what it is, and fails the check though the plate matches."""
+    verdict = verdict_on(rig, name, 1)
+    assert FAULTS[name].is_named(verdict)
+    assert verdict.plate_matches
+    assert not verdict.is_well
+    assert [row.partition(":")[0] for row in verdict_rows(verdict)] == [word]
+
+
+def test_diagnose_places_and_weighs_a_mass(rig):
+    """10 g within 1 g, and within a centimetre and a half of where it lies."""
+    verdict = verdict_on(rig, "10 g", 2)
+    beyond = as_json(verdict)["plate"]["beyond"]
+    at = np.random.default_rng([2, 93]).uniform(0.1, 0.9, 2) * [0.3048, 0.2286]
+    assert beyond["mass_kg"] == pytest.approx(0.010, abs=1e-3)
+    assert np.hypot(beyond["x_m"] - at[0], beyond["y_m"] - at[1]) < 0.015

@@ -304,7 +304,7 @@ def _predictions(
         f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
         "apart"
     )
-    by_set = tuple(table.levels_by_set(0.0, layer.excitation).tolist())
+    by_set = tuple(map(float, table.levels_by_set(0.0, layer.excitation)))
     predictions: list[Prediction] = []
     for (contact, target), felt in zip(targets, sensations, strict=True):
         predictions.append(

@@ -118,11 +118,11 @@ async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> 
 @in_virtual_time
 async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
     """On a way along which others promise 2 dB more: these are led to once it rests, in steps."""
-    async with fingers_on(table(), LAYOUT, at={1: (0.12, 0.10), 2: RIGHT}, held=0.5) as fingers:
+    async with fingers_on(table(), LAYOUT, at={1: (0.034, 0.089), 2: RIGHT}, held=2.0) as fingers:
         before, count = _frequencies(fingers.applied[-1]), len(fingers.applied)
 
         def slide(since: float) -> None:
-            fingers.at[1] = (0.12 - 0.2 * since, 0.10 - 0.175 * since)
+            fingers.at[1] = (0.034 + 0.144 * since, 0.089 - 0.109 * since)
 
         await fingers.hold(0.4, slide)
         sliding = fingers.applied[count:]

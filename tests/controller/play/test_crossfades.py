@@ -174,11 +174,10 @@ async def test_after_a_leave_weights_are_led_within_their_layers() -> None:
         assert worst(after) >= worst(left) + 0.5
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_every_step_keeps_30_hz_between_all_that_sounds(seed: int) -> None:
-    """Four sets of three fingers anywhere, of whom the third has come last, or has left."""
-    rng, found = np.random.default_rng([seed, 5]), 0
-    for number in range(4):
+def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
+    """Twelve sets of three fingers anywhere, of whom the third has come last, or has left."""
+    rng, found = np.random.default_rng(5), 0
+    for number in range(12):
         places = random_contacts(rng, 3, table().plate, margin=0.013)
         targets = [(each, Target(each.key, 14.0)) for each in contacts_at(*places)]
         before = chosen_for(targets[:2], playable()) if number % 2 else None
@@ -199,7 +198,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds(seed: int) -> None:
                 assert all(abs(after[key] - each) >= 30 for each in beside.values())
                 found += 1
             beside = after
-    assert found
+    assert found >= 3
 
 
 def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:

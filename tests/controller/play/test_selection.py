@@ -16,7 +16,6 @@ from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.fingers import Finger, Stimulus
-from model.arrays import FloatArray
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable
@@ -46,9 +45,9 @@ class Table:
     def prepare(self, mode: str) -> None:
         """Do nothing."""
 
-    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> FloatArray:
-        """By its only set of thresholds."""
-        return np.array([level_db_sl])
+    def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> list[float]:
+        """The same by its only set of thresholds."""
+        return [level_db_sl]
 
     def answer(self, fingers: Sequence[Finger], **others: Any) -> Answer:
         """One of a frequency that names how often it was asked, at the level asked for."""

@@ -45,7 +45,7 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     rows = np.array(tones.rows)
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
-    frequencies, at_harmonics = table.frequencies[rows], table.harmonic_thresholds[rows]
+    frequencies, at_harmonics = table.frequencies[rows], table.compared_harmonic_thresholds[rows]
     factors, of_harmonics = (
         (tones.gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
         for each, at in ((table.thresholds[rows], frequencies), (at_harmonics, 2 * frequencies))

@@ -102,10 +102,13 @@ class FingersOnPlate:
         return means, loudest + harmonics
 
     def harmonics(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
-        """Squared amplitude to threshold of second harmonics at fingers, (m, k, 1 + d)."""
+        """Squared amplitude to threshold of second harmonics at fingers, (m, k, 1 + d).
+
+        To `compared_harmonic_thresholds`.
+        """
         if self.at_harmonics is None:
             return np.zeros((len(rows), len(self.tips.few), 1 + by.count), dtype=np.float32)
-        tips, threshold = self.tips, self.table.harmonic_thresholds[rows]
+        tips, threshold = self.tips, self.table.compared_harmonic_thresholds[rows]
         found = self.at_harmonics.harmonics(by, rows, weights, tips.few, tips.few_weights)
         return np.asarray(found / np.square(threshold)[:, None, None])
 

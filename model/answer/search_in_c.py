@@ -150,7 +150,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         frequencies=table.frequencies,
         sensitivities=table.sensitivities.T,
         search_error=table.search_error_power,
-        harmonic_threshold=table.harmonic_thresholds,
+        harmonic_threshold=table.compared_harmonic_thresholds,
         harmonic_sensitivities=table.harmonic_sensitivities.T,
     )
     if uncertainty.harmonic > 0:

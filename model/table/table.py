@@ -316,13 +316,7 @@ class LocalizationTable:
         return level_db_sl + decibels(factors.min(axis=1))
 
     @cached_property
-    def harmonic_sensitivities(self) -> Float32Array:
-        """`sensitivities` at twice all frequencies; beyond the data of a set those at its end."""
-        twice = np.minimum(2 * self.frequencies, min(map(highest_known, self.threshold_sets)))
-        return sensitivities(twice, self.threshold_sets, self.threshold).astype(np.float32)
-
-    @cached_property
-    def harmonic_thresholds(self) -> NDArray[np.float32]:
+    def harmonic_thresholds(self) -> Float32Array:
         """Detection thresholds [m/s²] at twice all frequencies, (f,).
 
         Infinite beyond the data of the set, to 1 kHz, where nothing is felt.
@@ -331,6 +325,30 @@ class LocalizationTable:
         highest = highest_known(self.threshold)
         found = detection_threshold(np.minimum(twice, highest), self.threshold)
         return np.where(twice <= highest, found, np.inf).astype(np.float32)
+
+    @cached_property
+    def compared_harmonic_thresholds(self) -> Float32Array:
+        """Those at twice all frequencies as low as any set has them beside its own at these, (f,).
+
+        By them a search compares second harmonics with the tones that they are of.
+        """
+        return np.asarray(self.harmonic_thresholds / self._harmonic_excess.max(axis=0))
+
+    @cached_property
+    def harmonic_sensitivities(self) -> Float32Array:
+        """As `sensitivities`, of harmonics to `compared_harmonic_thresholds`, (s, f)."""
+        excess = self._harmonic_excess
+        return np.asarray(self.sensitivities * excess / excess.max(axis=0))
+
+    @property
+    def _harmonic_excess(self) -> Float32Array:
+        """How much higher harmonics stand above their tones by each set than the first, (s, f).
+
+        Beyond the data of a set by the thresholds at their end.
+        """
+        twice = np.minimum(2 * self.frequencies, min(map(highest_known, self.threshold_sets)))
+        found = sensitivities(twice, self.threshold_sets, self.threshold) / self.sensitivities
+        return found.astype(np.float32)
 
     @cached_property
     def modal_dispersion(self) -> Dispersion | None:
@@ -401,7 +419,8 @@ class LocalizationTable:
         """The same with second harmonics, as if they were at the drive frequency: for searches."""
         if not self.uncertainty.harmonic:
             return self.error_power
-        share = self.uncertainty.harmonic * (self.thresholds / self.harmonic_thresholds)[:, None]
+        thresholds = self.thresholds / self.compared_harmonic_thresholds
+        share = self.uncertainty.harmonic * thresholds[:, None]
         power = share**2 * self._mean_square(self.at_harmonics.fields)
         return np.asarray(self.error_power + power, dtype=np.float32)
 

@@ -138,13 +138,14 @@ def test_frequencies_are_apart_and_within_their_bands():
 
 
 def test_what_plays_already_is_kept_away_from():
-    """By 30 Hz, short or not: as in the better of the bands that are left; else it is said."""
+    """By 30 Hz, short or not: as in a band that is left, hardly a worse one; else it is said."""
     table = smooth_table()
     for duration in (None, 0.04):
         own = Finger(NEAR, Stimulus(20, (60, 300), duration))
         (layer,) = answer(table, [own], [FAR]).layers
         avoided = layer.frequency
-        (other,) = answer(table, [own], [FAR], avoided_hz=[avoided]).layers
+        found = answer(table, [own], [FAR], avoided_hz=[avoided])
+        (other,) = found.layers
         assert abs(other.frequency - avoided) >= 30
         bands = [(60, avoided - 30), (avoided + 30, 300)]
         parts = [
@@ -152,8 +153,9 @@ def test_what_plays_already_is_kept_away_from():
             for band in bands
             if band[0] < band[1]
         ]
-        best = max(parts, key=lambda each: each.promised_worst_db)
-        assert other.frequency == best.layers[0].frequency
+        assert other.frequency in [each.layers[0].frequency for each in parts]
+        best = max(each.promised_worst_db for each in parts)
+        assert found.promised_worst_db >= best - 1  # chosen by other drawn plates
         narrow = Finger(NEAR, Stimulus(20, (avoided - 5, avoided + 5), duration))
         near = answer(table, [narrow], [FAR], avoided_hz=[avoided])
         assert (near.layers[0].frequency, len(near.applied)) == (avoided, 1)

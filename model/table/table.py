@@ -330,7 +330,7 @@ class LocalizationTable:
     def compared_harmonic_thresholds(self) -> Float32Array:
         """Those at twice all frequencies as low as any set has them beside its own at these, (f,).
 
-        By them a search compares second harmonics with the tones that they are of.
+        By them candidates are compared; what weights are found by takes the rig's own.
         """
         return np.asarray(self.harmonic_thresholds / self._harmonic_excess.max(axis=0))
 
@@ -419,8 +419,7 @@ class LocalizationTable:
         """The same with second harmonics, as if they were at the drive frequency: for searches."""
         if not self.uncertainty.harmonic:
             return self.error_power
-        thresholds = self.thresholds / self.compared_harmonic_thresholds
-        share = self.uncertainty.harmonic * thresholds[:, None]
+        share = self.uncertainty.harmonic * (self.thresholds / self.harmonic_thresholds)[:, None]
         power = share**2 * self._mean_square(self.at_harmonics.fields)
         return np.asarray(self.error_power + power, dtype=np.float32)
 

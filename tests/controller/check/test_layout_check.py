@@ -228,7 +228,7 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
 def test_files_that_config_init_writes_fit_each_other(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each beside the rig; in any two regions of the layout but one pair 6 dB are promised."""
+    """Each beside the rig; fingers in any two regions of the layout are promised 4 dB at once."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(layout_check, "MAX_TOUCHES", 20)
     monkeypatch.setattr(layout_together, "MAX_TRIPLES", 0)
@@ -242,9 +242,7 @@ def test_files_that_config_init_writes_fit_each_other(
         assert run_era(["layout", "check", "layout.yaml", "table.npz", "--json"]) == 0
         together = json.loads(capsys.readouterr().out)["promised_together"]
         assert len(together) == 10
-        worst = {tuple(each["regions"]): each["promised_worst_db"] for each in together}
-        assert worst.pop(("knob", "tuner")) >= 0
-        assert min(worst.values()) >= 6
+        assert min(each["promised_worst_db"] for each in together) >= 4
 
 
 def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:

@@ -154,7 +154,10 @@ def _exported(value: Any, names: Mapping[str, str]) -> Any:
     if not isinstance(value, tuple):
         return value
     rows = [_exported(each, names) for each in value]
-    return _structs(rows) if rows and isinstance(rows[0], dict) else np.array(rows, dtype=float)
+    if rows and isinstance(rows[0], dict):
+        return _structs(rows)
+    is_named = bool(rows) and isinstance(rows[0], str)
+    return np.array(rows, dtype=object if is_named else float)  # objects are a cell array
 
 
 def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:

@@ -105,8 +105,9 @@ class Playback:
     """Records of fingertips while layers played, from rest at time 0.
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
-    onsets; threshold: of levels. Steady measures are fitted to the last 0.25 s, after the plate has
-    settled, which `play` sees to; those of signals are of the power in these, settled or not.
+    onsets; threshold: of levels and contrasts, by one set, where answers have the least over
+    several. Steady measures are fitted to the last 0.25 s, after the plate has settled, which
+    `play` sees to; those of signals are of the power in these, settled or not.
     """
 
     vibrations: tuple[Vibration, ...]

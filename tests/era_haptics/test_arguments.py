@@ -24,6 +24,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "plate": SHEET, "eras": {"SW": SPRING}, "amplifiers": {"main": {"url": "sim://"}},
         "masses": {}, "mesh": "auto", "limits": {}, "uncertainty": era.Uncertainty(),
         "fingertip": era.Fingertip(), "threshold": "vibrotactile-probe",
+        "promised_thresholds": ["pressing-fingertip"],
     },
     era.save_rig: {"rig": RIG, "path": "rig.yaml"},
     era.load_table: {"path": "t.npz", "rig": RIG},

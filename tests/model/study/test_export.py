@@ -59,6 +59,16 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     assert struct.eras[2].x_m == 0.3048
 
 
+def test_export_mat_holds_names_of_sets_as_a_cell_array(table, tmp_path):
+    """A column of strings, of one set too, beside the set of levels."""
+    for names in (("pressing-fingertip", "vibrotactile-probe"), ("pressing-fingertip",)):
+        export_mat(replace(table, promised_thresholds=names), tmp_path / "t.mat")
+        struct = loadmat(tmp_path / "t.mat", struct_as_record=False)["table"][0, 0]
+        assert struct.threshold.tolist() == ["vibrotactile-probe"]
+        assert struct.promised_thresholds.shape == (len(names), 1)
+        assert [each.item() for each in struct.promised_thresholds.flat] == list(names)
+
+
 def test_export_mat_holds_layers_and_air(table, tmp_path):
     """A laminate is a struct with its layers, each with its material and rows by frequency."""
     metal, rows = table.plate.material, ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))

@@ -17,6 +17,7 @@ from controller.api.jsonrpc import RpcError
 from controller.demo.run import layout_of_people
 from controller.effects.strengths import MAX_NAMES
 from daemon_bench import DaemonBench, ready_daemon
+from drivers.protocol.table import QUANTITIES
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -31,6 +32,7 @@ FADE, WINDOW, STEP = 0.100, 0.050, 0.001  # s
 LOWER = 10 ** (-6 / 20)  # of -6 dB
 STEEPEST = (1 - LOWER) * math.pi / 2 * STEP / FADE
 """Largest change of an envelope of 1 along the raised cosine, within a step."""
+LEVEL_STEP = 1 / QUANTITIES["level"].per_unit
 
 
 @cache
@@ -119,7 +121,8 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_pat
             assert len(moving) == 5
             for course in moving:
                 changes = np.diff(course / course[-1] * last) * math.copysign(1, last - first)
-                slack = 0.1 if course is moving[-1] else 0.01
+                rounded = LEVEL_STEP / np.abs(course).min() / (1 - LOWER)
+                slack = 0.1 if course is moving[-1] else 0.01 + rounded
                 assert -slack * STEEPEST <= changes.min()
                 assert changes.max() <= (1 + slack) * STEEPEST
 

@@ -112,6 +112,7 @@ OTHERS: dict[str, Any] = {
     "modes": [[1.02, 1.1]],
     "by_frequency": [[1, 1, 0.1], [900, 2.1, 0.1]],
     "closed": True,
+    "promised_thresholds": ["vibrotactile-probe"],
     "mesh": "13x9 Legendre",
     "eras": {each: RIGS["plain"]["eras"][each] for each in "WEN"},
     "at": [0.05, 0.15],

@@ -33,6 +33,7 @@ from model.table.table import LocalizationTable
 from model.transients.base_motion import BaseEnvelope, shaped
 from only import only
 from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.plant import second_harmonic
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
@@ -201,9 +202,13 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float
     plant = Plant(reduce_plate(real.plate, real.mesh, footprints_of(real.eras)), real.eras)
     plant.set_contacts(truth.resting(situation))
     assert pattern.onset is not None
-    bases = shaped(pattern.onset, real.eras)
-    for number, (era, terms) in enumerate(zip(real.eras, bases, strict=True)):
-        plant.set_input(number, realised(terms, truth.drawn.channels[truth.rig.wiring[era.name]]))
+    errors = {name: truth.drawn.channels[channel] for name, channel in truth.rig.wiring.items()}
+    shares = {name: each.harmonic for name, each in errors.items()}
+    onsets = [each.onset or {} for each in (pattern, *second_harmonic.of_layer(pattern, shares))]
+    every = zip(*[shaped(onset, real.eras) for onset in onsets], strict=True)
+    for number, (era, parts) in enumerate(zip(real.eras, every, strict=True)):
+        terms = [term for part in parts for term in part]
+        plant.set_input(number, realised(terms, errors[era.name]))
     discs = {place: truth.fingertip(place) for place in situation.fingers.values()}
     shapes = plant.reduced.at(np.concatenate(list(discs.values())))
     _, samples = plant.advance(ONSET, sample_rate=SAMPLE_RATE, shapes=shapes)

@@ -88,12 +88,14 @@ class FingersOnPlate:
     ) -> tuple[Float32Array, Float32Array]:
         """Mean amplitude over each fingertip, and power at its loudest point, of c drives.
 
-        With the second harmonics in the latter.
+        With the second harmonics in the latter, as strong beside their tone as by any set of
+        thresholds: of one frequency that is the least contrast of all sets.
 
         owners (m,): the drive of each tone, ascending; both (c, k, 1 + d).
         """
         starts = np.flatnonzero(np.diff(owners, prepend=-1))
-        harmonics = np.add.reduceat(self.harmonics(by, rows, weights), starts)
+        rise = self.table.harmonic_rise[rows][:, None, None]
+        harmonics = np.add.reduceat(rise * self.harmonics(by, rows, weights), starts)
         if len(rows) == 1 + owners[-1]:
             sensed = self.drawn(by, rows, weights)
             return sensed.means, sensed.loudest + harmonics

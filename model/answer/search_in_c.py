@@ -152,6 +152,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         search_error=table.search_error_power,
         harmonic_threshold=table.harmonic_thresholds,
         harmonic_sensitivities=table.harmonic_sensitivities.T,
+        harmonic_rise=table.harmonic_rise,
     )
     if uncertainty.harmonic > 0:
         rules.at_harmonics = addressof(plates_structure(table.at_harmonics))

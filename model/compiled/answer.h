@@ -23,6 +23,7 @@ typedef struct {
     const int *rim, *group;        /* (n) of each ERA */
     const float *threshold, *error, *shares, *frequencies; /* (f); (f, n); (f, n, n) or NULL, as of `grouped`; (f) [Hz] */
     const float *sensitivities, *harmonic_sensitivities; /* (f, sets) by which amplitudes to a set's are higher, and at 2 f */
+    const float *harmonic_rise; /* (f) of power, to the tone's, by the set by which it is most */
     const float *search_error, *harmonic_threshold;        /* (f, n) error and harmonics, of searches; (f) */
     const plates *at_harmonics;                            /* at twice the frequencies; NULL without harmonics */
 } rules;

@@ -3,7 +3,8 @@
 #include "promise.h"
 
 /* What candidates do on the plates that judge: amplitude at their targets (count, draws), at a gain to the level if
- * there are several contents, and power at the loudest point of each finger (count, k, draws). */
+ * there are several contents, and power at the loudest point of each finger (count, k, draws), as by
+ * `FingersOnPlate.felt`. */
 SHARED void judge(float *own, float *loudest, const candidates *from, const plates *on, const rules *by,
                   const question *of, const float *columns, arena *memory) {
     const draws *draws = of->judging;
@@ -22,6 +23,7 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
         value *found = values(memory, points), *force = values(memory, on->b + k + 1);
         for (size_t tone = 0; tone < some; tone++) {
             const size_t each = first + tone, content = from->content[each];
+            const float rise = by->harmonic_rise[from->rows[each]];
             for (size_t group = 1; group < groups; group++) {
                 size_t at_plate, plates = plates_of(draws, group, &at_plate);
                 sense(sensed, &drawn, tone, group, found, force);
@@ -36,7 +38,7 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
                 for (size_t finger = 0; finger < k; finger++) {
                     lanes highest = {0};
                     for (size_t i = finger * fine; i < (finger + 1) * fine; i++) highest = larger(highest, sensed[i]);
-                    highest += harmonics[(tone * k + finger) * groups + group];
+                    highest += rise * harmonics[(tone * k + finger) * groups + group];
                     memcpy(loudest + (each * k + finger) * count + at_plate - 1, &highest, plates * sizeof(float));
                 }
             }

@@ -91,7 +91,9 @@ class Rules(Structure):
         ("several", WeightSearch),
         ("within", 3 * WeightSearch),
         *_fields(i="groups sets", p="rim group threshold error shares frequencies sensitivities"),
-        *_fields(p="harmonic_sensitivities search_error harmonic_threshold at_harmonics"),
+        *_fields(
+            p="harmonic_sensitivities harmonic_rise search_error harmonic_threshold at_harmonics"
+        ),
     ]
 
 

@@ -322,6 +322,12 @@ class LocalizationTable:
         return sensitivities(twice, self.threshold_sets, self.threshold).astype(np.float32)
 
     @cached_property
+    def harmonic_rise(self) -> Float32Array:
+        """How much more power harmonics have to a tone by the set that says most, (f,)."""
+        rise = (self.harmonic_sensitivities / self.sensitivities).max(axis=0)
+        return np.asarray(np.square(rise))
+
+    @cached_property
     def harmonic_thresholds(self) -> NDArray[np.float32]:
         """Detection thresholds [m/s²] at twice all frequencies, (f,).
 

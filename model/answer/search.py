@@ -10,7 +10,8 @@ chosen by the worst finger on drawn plates; the promise is of other draws, the s
 and for a quiet finger the weakest content counts, over all contents. An only content has the tone
 of the highest contrast at its level. Contents differ in frequency, so that this depends on whose
 thresholds their amplitudes are above: the least over the table's sets of thresholds counts, of
-combinations as of the promise. Weights of a content, of one frequency, do not depend on the set.
+combinations as of the promise. Weights of a content, of one frequency, do not depend on the set;
+its second harmonics do, and candidates are judged by the set to which these are loudest.
 
 `model.answer.search_in_c` finds them in C, `model.answer.search_in_numpy` in numpy.
 """

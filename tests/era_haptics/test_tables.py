@@ -158,7 +158,8 @@ def test_draw_answer_shows_fingers_and_levels() -> None:
 
 def test_draw_contents_colours_each_finger_by_its_content() -> None:
     """The plate under a finger has the hue of its ring; its promise is beside it; a panel each."""
-    frequencies, grid = np.array([60.0, 120.0, 250.0]), era.Grid(4, 3)
+    # At 90 and 120 Hz both fingers are served by all sets of thresholds; at 60 and 120 Hz by one.
+    frequencies, grid = np.array([60.0, 90.0, 120.0, 250.0]), era.Grid(4, 3)
     table = build_table(PLATE.rig, frequencies=frequencies, grid=grid, drive_mode="phased")
     answer = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (TARGET, QUIET[0])])
     figure = era.draw_contents(table, answer)

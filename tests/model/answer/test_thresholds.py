@@ -108,6 +108,22 @@ def test_searching_for_the_least_costs_less_than_promising_it():
     assert np.mean(unsearched) > np.mean(cost) + 1
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_an_only_content_has_the_frequency_that_promises_most_by_every_set():
+    """Of all one by one, but for half a decibel; not one whose second harmonic pressing tells.
+
+    Of a tone its harmonic alone depends on the set: that of 50 Hz is felt by pressing fingertips.
+    """
+    of, quiet = table(*THRESHOLDS), [Finger((0.16, 0.06))]
+    found = answer(of, [wants((0.08, 0.06))], quiet)
+    each = {
+        hertz: answer(of, [wants((0.08, 0.06), (hertz, hertz))], quiet).promised_worst_db
+        for hertz in of.frequencies.tolist()
+    }
+    assert found.promised_worst_db > max(each.values()) - 0.5
+    assert found.promised_worst_db > each[50.0] + 6
+
+
 def test_levels_are_above_the_rigs_own_thresholds():
     """Another set beside it changes neither the level nor, of one content alone, the contrast."""
     one, every = (

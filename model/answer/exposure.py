@@ -42,12 +42,12 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     tones, contents = found.tones, found.contents
     if not tones.rows:
         return [0.0] * len(contents.places)
-    rows = np.array(tones.rows)
+    rows, gains = np.array(tones.rows), np.array(tones.gains)
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
     frequencies, at_harmonics = table.frequencies[rows], table.compared_harmonic_thresholds[rows]
     factors, of_harmonics = (
-        (tones.gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
+        (gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
         for each, at in ((table.thresholds[rows], frequencies), (at_harmonics, 2 * frequencies))
     )
     power = fingers.powers(*drawn) * factors.astype(np.float32)[:, None, None, None]

@@ -253,8 +253,8 @@ class Client(ABC):
         if self.free:
             return
         wait = REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT
-        others = [each for each in range(self.addresses, 0, -1) if each != self.address]
-        for address in others:
+        addresses = [each for each in range(self.addresses, 0, -1) if each != self.address]
+        for address in addresses:
             self.write(self.question(address))
             found = await self.next(lambda each: True, wait)
             if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
@@ -263,7 +263,7 @@ class Client(ABC):
                 break
         await asyncio.sleep(self.quiet)  # in which a late one is heard
         self.heard.clear()
-        self.free = next((each for each in others if each not in self._others), 0)
+        self.free = next((each for each in addresses if each not in self._others), 0)
         expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
 

@@ -131,12 +131,12 @@ def stop_ramps(subject: Subject) -> Rows:
     """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
     whole, refused = subject.whole(), play(subject.one(), code=_WRONG)
     amid = partial(subject.follow, 0.35 * subject.slowness)
-    (stop, slow_stop), (disarm, slow_disarm) = (
+    (stop, slowest_stop), (disarm, slowest_disarm) = (
         [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
     )
     return [
-        *((whole, stop), (whole, disarm, refused), (whole, slow_stop, amid, disarm)),
-        (whole, slow_disarm, refused, amid, stop),
+        *((whole, stop), (whole, disarm, refused), (whole, slowest_stop, amid, disarm)),
+        (whole, slowest_disarm, refused, amid, stop),
     ]
 
 

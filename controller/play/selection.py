@@ -266,10 +266,11 @@ class Selector:
         if lasting:
             takes_long = not is_alone(lasting, intended.protected)
         is_rested = is_due and is_kept and takes_long
-        velocities = [each.motion.velocity(now) for each in intended.contacts]
-        if is_rested and (new or self._playing(now) or any(map(any, velocities))):
-            self._rest_again(now)
-            is_rested = False
+        if is_rested:
+            velocities = [each.motion.velocity(now) for each in intended.contacts]
+            if new or self._playing(now) or any(map(any, velocities)):
+                self._rest_again(now)
+                is_rested = False
         if is_rested and self._steps:
             self._lead(now)
             return

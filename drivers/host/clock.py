@@ -225,6 +225,8 @@ class HeldClock:
         rate, bend = self._line.rate, self._line.bend
         aged = [(time - at, lead) for at, lead in self._lowest]
         count = max(len(aged) // 2, min(len(aged), 2))
+        # Marks share what scatters; what is likely would bend each line as its crystal is not.
+        is_common = self._is_by_marks(time)
         for _ in range(_ROUNDS):  # what leads are at that time
             above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])[:count]
             mean = middle = breadth = scatter = slope = curve = wide = 0.0
@@ -238,8 +240,7 @@ class HeldClock:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            # Marks share what scatters; what is likely would bend each line as its crystal is not.
-            own = 0.0 if self._is_by_marks(time) else off_line / count
+            own = 0.0 if is_common else off_line / count
             square, error = middle**2 - breadth / count, own + _LEAST**2
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
             tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth

@@ -30,7 +30,7 @@ WORTH, WORTH_OF_WEIGHTS = 2.0, 0.5
 """How much more [dB] the worst finger must be promised for other frequencies, or weights alone."""
 
 _SHORT_OF = 1.0  # dB; by which a finger may feel less of its own then
-_SAME = 0.01  # of the largest amplitude of two drives: nobody feels the difference
+_SAME = 0.01  # of the largest amplitude of two drives: a difference that is not felt
 
 _Voices = Mapping[ContactKey, tuple[Content, ...]]
 """What fingers feel: a content, and its side bands, by the finger whose content it is."""
@@ -87,7 +87,7 @@ class Crossfades:
     def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:
         """What plays after each step to contents, the best first; none where none may follow.
 
-        One that may follow is in nobody's way after: no other order goes on where this one ends.
+        One that may follow hinders no other after: no other order goes on where this one ends.
         """
         left, steps, before = {**led}, list[Selection](), -math.inf
         while left:

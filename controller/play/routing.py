@@ -155,7 +155,7 @@ class SetBuilder:
     def build_fall(
         self, number: int, excitation: physics.Excitation, *, ramp: float, playing: Drive
     ) -> PlateLayer:
-        """Build the set by which a layer falls along a ramp [s] to what nobody feels, and ends.
+        """Build the set by which a layer falls along a ramp [s] to below any threshold, and ends.
 
         Not to silence, on the way to which no later set could end it sooner, as under a finger that
         lifts. playing: what each ERA plays now in this layer.

@@ -81,7 +81,7 @@ async def test_fingers_that_land_apart_come_to_the_promise_of_those_that_land_to
 
 @in_virtual_time
 async def test_one_content_rises_in_a_layer_of_its_own_and_the_other_falls_later() -> None:
-    """Along 300 ms both, the other 81 ms later, to what nobody feels; then it has ended."""
+    """Along 300 ms both, the other 81 ms later, to below any threshold; then it has ended."""
     async with fingers_on(table(), WHOLE) as fingers:
         count = await apart(fingers, then=0.6)
         fades = [each for each in fingers.committed[count:] if each[2][0].ramp == 300]

@@ -15,12 +15,9 @@ With --report, the page docs/measured/identification.md is written as well.
 
 import argparse
 from itertools import product
-from pathlib import Path
 
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
-
-PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
 
 
 def main() -> None:
@@ -41,7 +38,7 @@ def main() -> None:
     from benchmarks.identification.hidden import FAMILY
     from benchmarks.identification.plates import FREQUENCIES, outcome
     from benchmarks.identification.server import hidden_plates
-    from benchmarks.identification.tables import contrasts, fits, kept_or_refused, promises
+    from benchmarks.identification.tables import PAGE, contrasts, fits, kept_or_refused, promises
     from model.rig.file import load_rig
 
     rig = load_rig(RIG)

@@ -16,7 +16,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from benchmarks.identification.answers import answer, known_table, table_of
 from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffness
 from benchmarks.identification.plates import FREQUENCIES
 from benchmarks.identification.server import truth_of
+from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Mounted
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
@@ -38,7 +38,6 @@ from model.structure.attachments import Fingertip
 from model.table.following import table_following
 from model.table.table import LocalizationTable
 
-PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
 MINUTES_BETWEEN = 0.2
 MOUNT_AT, STICKER_AT = 20.0, 40.0
 JUDGED_AT = (19.8, 23.0, 39.8, 43.0, 59.8)

@@ -1,12 +1,15 @@
 """Tables of what was reached beside the goals."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks.identification.coverage import share_in_region, share_within
 from benchmarks.identification.hidden import SETS
 from benchmarks.identification.plates import QUIET, WAYS, Outcome
+
+PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
 
 PLATE_KEEPS = 0.86
 """Share of answers from which a plate counts as one that keeps, of few that are nine of ten."""

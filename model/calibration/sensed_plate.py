@@ -4,6 +4,7 @@ The forward model of an identification (`model.identification.forward`) with mod
 of the plate, and stiffness, damping and bolt mass of each ERA. The free plate is solved once.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +13,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import VALUE_UNITS, space_by_sheets
+from model.identification.parameters import KINDS, VALUE_UNITS, space_by_sheets
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -124,6 +125,29 @@ class SensedPlate:
         """The fitted values at z in their units (n,)."""
         rig = self.rig_at(z)
         return np.array([row.of(rig) for row in self.rows])
+
+    def deviations(self, z: FloatArray) -> FloatArray:
+        """The fitted values at z (n,), in standard deviations of rigs as this one is written.
+
+        That is the larger of what data sheets leave and what its `uncertainty` states. Losses vary
+        by factors: of more than the rig has, the logarithm counts.
+        """
+        stated, std = self.rig.uncertainty, self.model.space.std[self.numbers]
+        factor = math.log(stated.damping)
+        of_kind = {
+            "modulus": math.hypot(2 * stated.thickness, stated.modulus),
+            "loss_factor": factor,
+            "stiffness": math.hypot(stated.stiffness, stated.thickness),
+            "damping": math.hypot(factor, KINDS["damping_each"].std),
+        }
+        own = np.array([row.of(self.rig) for row in self.rows])
+        spread = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
+        is_lossy = (own > 0) & [row.kind in _KINDS for row in self.rows]
+        unit = std / np.where(is_lossy, own, 1.0)
+        size = unit * z[self.numbers]
+        is_more = is_lossy & (size > 0)
+        size, unit = (np.where(is_more, np.log1p(np.abs(each)), each) for each in (size, unit))
+        return np.asarray(size / np.maximum(unit, spread))
 
     def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
         """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""

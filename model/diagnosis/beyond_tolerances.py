@@ -4,7 +4,8 @@ A plate is matched once more with form errors, each held by its tolerance (`KIND
 `model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
 sides, Poisson's ratio, single modes. They explain what builders and rulers do. What lies on the
 plate is sought where it would explain most beside all of them, and named if it then explains it; of
-the rest each kind of form error is judged by its sum of squares. A plate that is thinner at one end
+the rest each kind of form error is judged by its sum of squares, at equal shares of a stated false
+alarm. A plate that is thinner at one end
 moves more there, by as much as it is thinner: scales of sensors rise along it.
 """
 
@@ -25,7 +26,7 @@ from model.calibration.variable_projection import (
     row_rms,
 )
 from model.choice import best_by
-from model.diagnosis.plate_match import Match, match_plate
+from model.diagnosis.plate_match import FALSE_ALARM, Match, match_plate
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.least_squares import single_changes
@@ -40,7 +41,6 @@ _SCANNED = Grid(16, 12)
 _HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
 _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _CLEAR = 40.0  # of half the sum of squares
-_UNLIKELY = 0.01
 
 _THICKNESS = "thickness"
 _WORDS = {
@@ -112,9 +112,10 @@ def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:
     space = match.plate.model.space
     kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
     found = [("", 0.0)]
-    for words, own in (kinds | {_THICKNESS: rises}).items():
+    kinds[_THICKNESS] = rises
+    for words, own in kinds.items():
         squares = float(own @ own)
-        if squares > chdtri(len(own), _UNLIKELY):
+        if squares > chdtri(len(own), FALSE_ALARM / len(kinds)):
             found.append((words, float(np.sqrt(squares / len(own)))))
     return best_by(found, lambda each: each[1])
 

@@ -5,7 +5,6 @@ outlier rejection whole sensors. Each check here looks for one such error alone,
 would leave free, and names it.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -75,14 +74,14 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     if observation.measured.any() and not (np.abs(observation.values) > 0).any():
         raise InputError("measured responses must not all be zero; check that ERAs were driven")
     # Values of the plate that are off are what a calibration is for.
-    verdict = diagnose(rig, observation, max_deviation=math.inf, check=_check_claims)
+    verdict = diagnose(rig, observation, false_alarm=0.0, check=_check_claims)
     _check_wiring(verdict)
     _check_size(verdict)
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
     return Screening(
         np.array(["dead" in channel.states for channel in verdict.channels]),
         np.isin(responses.sensors, [each.name for each in verdict.bad_sensors if each.is_mute]),
-        verdict.match.z,
+        verdict.match.x[verdict.match.plate.numbers],
     )
 
 

@@ -6,8 +6,8 @@ from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
-from model.diagnosis.plate_match import MAX_FIT_ERROR, NOTICEABLE_DB
-from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
+from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR, NOTICEABLE_DB
+from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
 from model.structure.attachments import PointLoad
@@ -153,7 +153,7 @@ def _plate_rows(verdict: Verdict) -> list[str]:
 
 def explains(explanation: Explanation) -> bool:
     """Whether the rest of the rig is then within its priors."""
-    return explanation.match.error <= MAX_FIT_ERROR and explanation.match.worst <= MAX_DEVIATION
+    return explanation.match.error <= MAX_FIT_ERROR and explanation.match.chance >= FALSE_ALARM
 
 
 def channel_table(verdict: Verdict) -> list[str]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fit import without_outliers
@@ -23,6 +24,9 @@ from model.choice import best_along, best_by
 from model.rig.rig import Rig
 
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
+FALSE_ALARM = 0.01
+"""Share of plates as written that are called another for a value, and as many for their form."""
+
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
@@ -33,8 +37,8 @@ _MAX_OUTLIERS = 0.05  # of all values; of a plate 3 % longer than its rig's a te
 class Match:
     """The best fit of a plate.
 
-    plate: of the rig; x (p,): all its parameters; z (n,): deviation of each of its fitted values in
-    standard deviations of its prior; gains (e,): magnitude of each channel, NaN if not used; cost:
+    plate: of the rig; x (p,): all its parameters; z (n,): deviation of each of its fitted values as
+    `SensedPlate.deviations`; gains (e,): magnitude of each channel, NaN if not used; cost:
     half the sum of squares of robust residuals and of z; error, median_error: rms and median of
     residuals relative to the rms of their row; responses (f, e, s) of the ERAs; predicted (f, e,
     s): of those that the channels drive, with gains; outliers (f, e, s): mask of values that no
@@ -57,6 +61,11 @@ class Match:
     def worst(self) -> float:
         """The largest of |z|."""
         return float(np.abs(self.z).max())
+
+    @property
+    def chance(self) -> float:
+        """In how many of all plates as written a value is at least as far off, at most."""
+        return float(2 * len(self.z) * ndtr(-self.worst))
 
 
 def match_plate(
@@ -119,7 +128,7 @@ def match_plate(
         plate.rig_at(z),
         plate,
         z,
-        z[plate.numbers],
+        plate.deviations(z),
         gains,
         best.cost,
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,

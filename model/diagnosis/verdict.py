@@ -32,6 +32,7 @@ from model.diagnosis.diagnosis_screening import (
     usable_sensors,
 )
 from model.diagnosis.plate_match import (
+    FALSE_ALARM,
     MAX_FIT_ERROR,
     MODEL_ERROR,
     Match,
@@ -43,7 +44,6 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig
 
 WEAK, STRONG = 0.8, 1.25  # gain of a channel: 2 dB either way, four times what a drive varies
-MAX_DEVIATION = 3.0  # standard deviations of a parameter's prior
 _LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
@@ -115,13 +115,13 @@ def diagnose(
     rig: Rig,
     observation: Responses,
     *,
-    max_deviation: float = MAX_DEVIATION,
+    false_alarm: float = FALSE_ALARM,
     check: Check | None = None,
     has_form: bool = False,
 ) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
-    max_deviation: of a parameter of the plate, in standard deviations of its prior; check: that
+    false_alarm: share of plates as written of which a value may be called wrong; check: that
     responses are what they claim, before channels are judged by their size; has_form: whether the
     plate may have form errors, and what is beyond them is sought, by sensors of known scale.
     Raises InputError for fewer than three usable sensors or four frequencies.
@@ -170,7 +170,7 @@ def diagnose(
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [each.name for each in off])
         again = diagnose(
-            rig, observation.without(wrong), max_deviation=max_deviation, has_form=has_form
+            rig, observation.without(wrong), false_alarm=false_alarm, has_form=has_form
         )
         return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
     form: FormMatch | None = None
@@ -178,7 +178,7 @@ def diagnose(
         form = match_with_form(plate, observation, values, drives)
         if form.match.error <= MAX_ERROR:
             match = form.match
-    matches = match.error <= MAX_FIT_ERROR and match.worst <= max_deviation
+    matches = match.error <= MAX_FIT_ERROR and match.chance >= false_alarm
     explanations: Sequence[Explanation] = ()
     fitted = match
     if not matches:

@@ -70,8 +70,9 @@ def main() -> None:
     if options.report:
         run = f"python -m benchmarks.identification --plates {options.plates} --sets {options.sets}"
         rounds = f" --rounds {options.rounds}" if options.rounds != 4 else ""
+        first = f" --first {options.first}" if options.first != 1 else ""
         which = f" --kinds {options.kinds} --sensors {options.sensors}" if is_outside else ""
-        printed = f"Printed by `{run}{which}{rounds} --report`."
+        printed = f"Printed by `{run}{first}{which}{rounds} --report`."
         write_parts(PAGE, {part: f"{printed}\n\n{text}" for part, text in texts.items()})
 
 

@@ -80,7 +80,7 @@ def kept_or_refused(outcomes: Sequence[Outcome]) -> str:
     """By kind of plate and number of sensors how many are refused, and how the others keep."""
     lines = [
         "Plates refused; of the others the share of answers, weightless and loaded, whose promise "
-        "is kept (least of a plate), and plates that keep nine of ten levels:",
+        "is kept (tenth percentile and least of plates), and plates that keep nine of ten levels:",
         "",
         "| | sensors | plates, refused | contrast | level | plates that keep level |",
         "|---|---|---|---|---|---|",
@@ -91,7 +91,11 @@ def kept_or_refused(outcomes: Sequence[Outcome]) -> str:
             of = [each for each in every if each.sensors == sensors]
             own = [each for each in of if each.is_explained]
             shares = [[_kept(each, what) for each in own] for what in ("contrast", "level")]
-            cells = [f"{100 * np.mean(of):.0f} % ({100 * min(of):.0f} %)" for of in shares if of]
+            cells = [
+                "{:.0%} ({:.0%}, {:.0%})".format(np.mean(of), np.percentile(of, 10), min(of))
+                for of in shares
+                if of
+            ]
             if own:
                 cells.append(f"{sum(share >= PLATE_KEEPS for share in shares[1])} of {len(own)}")
             row = [NAMES[kind], str(sensors), f"{len(of)}, {len(of) - len(own)}"]

@@ -92,7 +92,7 @@ def kept_or_refused(outcomes: Sequence[Outcome]) -> str:
             own = [each for each in of if each.is_explained]
             shares = [[_kept(each, what) for each in own] for what in ("contrast", "level")]
             cells = [
-                "{:.0%} ({:.0%}, {:.0%})".format(np.mean(of), np.percentile(of, 10), min(of))
+                f"{np.mean(of):.0%} ({np.percentile(of, 10):.0%}, {min(of):.0%})"
                 for of in shares
                 if of
             ]

@@ -42,13 +42,13 @@ _HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
 _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _CLEAR = 40.0  # of half the sum of squares
 
-_THICKNESS = "thickness"
+_THICKNESS, _MASS = "thickness", "distribution of mass"
 _WORDS = {
     "place": "places of ERAs",
     "mode_shifts": "natural frequencies",
     "sensor_scale": "scales of sensors",
     "sensor_place": "places of sensors",
-    "foreign_mass": "distribution of mass",
+    "foreign_mass": _MASS,
     "side": "length and width",
     "poisson": "Poisson's ratio",
 }
@@ -111,6 +111,8 @@ def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:
     """The kind of form error that is least likely, and its rms in standard deviations."""
     space = match.plate.model.space
     kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
+    # Foreign mass may be one lump, whose weight is then all that is unknown of it.
+    kinds[_MASS] = np.array([np.sqrt((kinds[_MASS] ** 2).mean())])
     found = [("", 0.0)]
     kinds[_THICKNESS] = rises
     for words, own in kinds.items():

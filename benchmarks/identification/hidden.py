@@ -32,7 +32,6 @@ class Hidden:
     mounted: Mounted
     sensor_gain: Complexes
     inside_gain: Complexes
-    truth: dict[str, float]
 
     def measured(
         self, frequencies: Reals, rng: np.random.Generator, sensors: int = len(CORNERS)
@@ -87,13 +86,6 @@ def draw(kind: str, seed: int) -> Hidden:
     corners = np.where(CORNERS > 0, sides, 0.0)
     at = corners + np.where(CORNERS > 0, -inwards, inwards)
     damping = 2 * DAMPING_RATIO * np.sqrt(STIFFNESS * LENGTH * WIDTH * THICKNESS * DENSITY / n)
-    truth = {"thickness": np.log(thick), "loss factor": np.log(lossy)}
-    truth |= {f"stiffness {i}": np.log(stiff[i]) for i in range(n)}
-    truth |= {f"damping {i}": np.log(damped * each[i]) for i in range(n)}
-    truth |= {f"gain {i}": np.log(abs(gain[i])) for i in range(n)}
-    truth |= {f"phase {i}": np.angle(gain[i]) for i in range(n)}
-    truth |= {f"sensor gain {i}": np.log(abs(sensor[i])) for i in range(n)}
-    truth |= {f"sensor phase {i}": np.angle(sensor[i]) for i in range(n)}
     mounted = Mounted(
         plate,
         at,
@@ -105,7 +97,7 @@ def draw(kind: str, seed: int) -> Hidden:
         LOSS * lossy,
         exponent,
     )
-    return Hidden(mounted, sensor, inside, {key: float(value) for key, value in truth.items()})
+    return Hidden(mounted, sensor, inside)
 
 
 def _parts(

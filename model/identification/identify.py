@@ -84,16 +84,15 @@ def identify(
     setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
-    misfit, mode_shift = chi2(fitted), _mode_shift(fitted)
-    is_explained = misfit <= MAX_CHI2 and mode_shift <= MAX_MODE_SHIFT
-    if is_explained:
+    posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
+    found = Identification(*(rig, rig, values, posterior, chi2(fitted), shift, None, fitted, seed))
+    if found.is_explained:
         _check_gains(rig, measurement, values, fitted.space)
-    posterior = Posterior.of(fitted.space, fitted.best)
     unknown = unknowns(setting, fitted, posterior)
     if unknown:
         raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
     held_out, uncertainty = hold_out(fitted, progress=progress), rig.uncertainty
-    if is_explained:
+    if found.is_explained:
         uncertainty = posterior.uncertainty(
             uncertainty,
             gain=_DRIVE_GAIN,
@@ -104,17 +103,8 @@ def identify(
         covariance = posterior.covariance + held_out.disagreement
         posterior = replace(posterior, covariance=covariance)
     progress(1 + SHARE, 1 + SHARE)
-    return Identification(
-        rig,
-        rig_with(rig, values, uncertainty),
-        values,
-        posterior,
-        misfit,
-        mode_shift,
-        held_out,
-        fitted,
-        seed,
-    )
+    known = rig_with(rig, values, uncertainty)
+    return replace(found, rig=known, posterior=posterior, held_out=held_out)
 
 
 def _mode_shift(fitted: FittedModel) -> float:

@@ -89,3 +89,26 @@ def test_lower_bounds_are_no_loss_and_no_damping(solved, loss_factor):
     values = other.values(other.model.space.lower)
     is_factor = [row.is_factor for row in other.rows]
     np.testing.assert_allclose(values[np.logical_not(is_factor)], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        # ln 3 / ln 1.7, since 70 % is what sheets leave; -0.5 / 0.7; ln 1.2 / (0.1² + 0.02²)^½
+        (RIG.uncertainty, (2.070, -0.714, 1.788)),
+        # ln 3 / (ln² 3 + 0.2²)^½, -0.5 of that, ln 1.2 / (0.3² + 0.02²)^½
+        (replace(RIG.uncertainty, damping=3.0, stiffness=0.3), (0.984, -0.448, 0.606)),
+    ],
+    ids=["as sheets leave", "as the rig states"],
+)
+def test_deviations_are_those_of_factors_where_losses_are_more(solved, stated, expected):
+    """A damper three times as strong, one half as strong, and a spring 20 % stiffer."""
+    plate = solved.of(replace(RIG, uncertainty=stated))
+    z = np.zeros(plate.model.space.size)
+    z[plate.model.space.groups["damping_added"]] = 2.0 / 0.7, -0.5 / 0.7, 0.0, 0.0
+    z[plate.model.space.groups["stiffness"]] = 0.0, 0.0, np.log(1.2) / 0.1, 0.0
+    by_name = dict(zip([row.name for row in plate.rows], plate.deviations(z), strict=True))
+    first, second, third, _ = (era.name for era in RIG.eras)
+    found = [by_name[f"{first} damping"], by_name[f"{second} damping"]]
+    found.append(by_name[f"{third} stiffness"])
+    np.testing.assert_allclose(found, expected, atol=1e-3)

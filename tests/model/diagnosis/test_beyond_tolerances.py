@@ -19,7 +19,7 @@ def rig() -> Rig:
     ("name", "seed"), [("none", 112), ("none", 113), ("none, with form errors and 3 g", 119)]
 )
 def test_diagnose_passes_plates_within_tolerances(rig, name, seed):
-    """Dampers at four times what is written, as one plate in a hundred has, and a lump of 3 g."""
+    """Dampers at 2.3 to 3.8 times what is written, of a spread by 1.5, and 3 g in one place."""
     assert verdict_on(rig, name, seed).is_well
 
 

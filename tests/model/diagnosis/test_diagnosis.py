@@ -321,7 +321,7 @@ def test_diagnose_names_a_sensor_with_a_loose_contact(coarse_rig, built):
 
 
 def test_chance_counts_all_values(coarse_rig, built):
-    """3.385 standard deviations are those of 1 normal number in 1400, and of 1 in 100 sets of 14."""
+    """3.385 standard deviations are 1 normal number in 1400, and 1 in 100 sets of 14."""
     plate = sensed_plate(coarse_rig, built.points, built.frequencies)
     match = match_plate(plate, built.values, drives=range(4))
     assert replace(match, z=3.385 * np.eye(14)[3]).chance == pytest.approx(0.01, rel=0.01)

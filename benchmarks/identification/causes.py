@@ -20,7 +20,6 @@ from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.calibration.responses import Responses
-from model.diagnosis.diagnosis_report import as_json
 from model.diagnosis.verdict import Verdict, diagnose
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -50,11 +49,7 @@ class Fault:
 
 
 def _beyond(kind: str) -> Callable[[Verdict], bool]:
-    def is_named(verdict: Verdict) -> bool:
-        beyond = as_json(verdict)["plate"]["beyond"]
-        return beyond is not None and beyond["kind"] == kind
-
-    return is_named
+    return lambda verdict: verdict.beyond is not None and verdict.beyond.kind == kind
 
 
 def _is_loose(verdict: Verdict) -> bool:

@@ -70,19 +70,21 @@ class BeyondTolerances:
     error: float
     taper: tuple[float, float] | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class FormMatch:
-    """A plate matched with form errors, and what of it is beyond tolerances, None for nothing."""
-
-    match: Match
-    beyond: BeyondTolerances | None
+    @property
+    def kind(self) -> str:
+        """Its name in reports."""
+        if self.load is None:
+            return "unnamed" if self.taper is None else "thickness"
+        return "mass" if isinstance(self.load, PointLoad) else "finger"
 
 
 def match_with_form(
     plate: SensedPlate, observation: Responses, values: ComplexArray, drives: Sequence[int]
-) -> FormMatch:
-    """Match values (f, e, s) of channels that drive ERAs with form errors, and with a load."""
+) -> tuple[Match, BeyondTolerances | None]:
+    """Match values (f, e, s) of channels that drive ERAs with form errors, and with a load.
+
+    Return also what of the plate is beyond tolerances, None for nothing.
+    """
 
     def matched(load: Support | None, noise: float) -> Match:
         rig = plate.rig
@@ -98,13 +100,13 @@ def match_with_form(
         if found.cost < best.cost - _CLEAR:
             best, load = found, each
     if load is not None:
-        return FormMatch(best, BeyondTolerances(load, "", 0.0, best.error))
+        return best, BeyondTolerances(load, "", 0.0, best.error)
     rises, slopes = _along_plate(best, observation.points)
     farthest, deviation = _farthest(best, rises)
     if best.error <= MAX_ERROR and not deviation:
-        return FormMatch(best, None)
+        return best, None
     taper = slopes if farthest == _THICKNESS else None
-    return FormMatch(best, BeyondTolerances(None, farthest, deviation, best.error, taper))
+    return best, BeyondTolerances(None, farthest, deviation, best.error, taper)
 
 
 def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:

@@ -237,11 +237,8 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
     load = beyond.load
     x, y = beyond.taper or (None, None)
-    kind = "unnamed" if x is None else "thickness"
-    if load is not None:
-        kind = "mass" if isinstance(load, PointLoad) else "finger"
     return {
-        "kind": kind,
+        "kind": beyond.kind,
         "x_m": None if load is None else load.x,
         "y_m": None if load is None else load.y,
         "mass_kg": load.mass if isinstance(load, PointLoad) else None,

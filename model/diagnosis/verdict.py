@@ -18,12 +18,7 @@ from model.diagnosis.assignment import (
     match_shapes,
     phases_of_drive,
 )
-from model.diagnosis.beyond_tolerances import (
-    MAX_ERROR,
-    BeyondTolerances,
-    FormMatch,
-    match_with_form,
-)
+from model.diagnosis.beyond_tolerances import MAX_ERROR, BeyondTolerances, match_with_form
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
     BadSensor,
@@ -173,11 +168,11 @@ def diagnose(
             rig, observation.without(wrong), false_alarm=false_alarm, has_form=has_form
         )
         return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
-    form: FormMatch | None = None
+    beyond = None
     if has_form:
-        form = match_with_form(plate, observation, values, drives)
-        if form.match.error <= MAX_ERROR:
-            match = form.match
+        with_form, beyond = match_with_form(plate, observation, values, drives)
+        if with_form.error <= MAX_ERROR:
+            match = with_form
     matches = match.error <= MAX_FIT_ERROR and match.chance >= false_alarm
     explanations: Sequence[Explanation] = ()
     fitted = match
@@ -210,7 +205,7 @@ def diagnose(
         plate_difference(rig, plate.responses(), match) if match.error <= MAX_FIT_ERROR else None,
         observation.sensors,
         observation.frequencies,
-        form.beyond if form is not None and matches else None,
+        beyond if matches else None,
     )
 
 

@@ -44,25 +44,26 @@ def table_of(rig: Rig, frequencies: Reals, *, loaded: bool) -> LocalizationTable
 
 def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> LocalizationTable:
     """A table of the plate as it is, and of fingers (k, 4) as they are, if not weightless."""
+    own = truth.mounted
     eras = tuple(
         replace(
             era,
-            x=float(truth.at[n, 0]),
-            y=float(truth.at[n, 1]),
-            stiffness=float(truth.stiffness[n]),
-            damping=float(truth.damping[n]),
-            bolt_mass=float(truth.bolt[n]),
-            gains=((LOSS_FREQUENCY, float(abs(truth.gain[n])), float(np.angle(truth.gain[n]))),),
+            x=float(own.at[n, 0]),
+            y=float(own.at[n, 1]),
+            stiffness=float(own.stiffness[n]),
+            damping=float(own.damping[n]),
+            bolt_mass=float(own.bolt[n]),
+            gains=((LOSS_FREQUENCY, float(abs(own.gain[n])), float(np.angle(own.gain[n]))),),
         )
         for n, era in enumerate(table.eras)
     )
     known = replace(
         table,
         eras=eras,
-        masses=tuple(PointLoad(x, y, mass=mass) for x, y, mass in truth.masses.tolist()),
+        masses=tuple(PointLoad(x, y, mass=mass) for x, y, mass in own.masses.tolist()),
         uncertainty=DRIVES,
-        omega=np.sqrt(truth.eigenvalues),
-        losses=np.zeros(len(truth.eigenvalues)),
+        omega=np.sqrt(own.plate.modes[0]),
+        losses=np.zeros(len(own.plate.modes[0])),
         attachment_shapes=truth.attached,
         shapes=truth.shapes.astype(np.float32),
         discretisation_error=np.zeros(len(table.frequencies)),

@@ -21,20 +21,21 @@ _PLACES = np.array([(0.25, 0.2), (0.5, 0.5), (0.8, 0.4), (0.35, 0.75)])
 def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
     """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
     space, posterior, plate = found.posterior.space, found.posterior, found.before.plate
-    mass = np.log(truth.thickness / plate.thickness)
+    own = truth.mounted
+    mass = np.log(own.plate.thickness / plate.thickness)
     model = found.fitted.problem.model
-    elastic = np.sort(truth.eigenvalues)[3 : 3 + len(model.shifted_modes)]
+    elastic = np.sort(own.plate.modes[0])[3 : 3 + len(model.shifted_modes)]
     solved = model.free
     theory = solved.modes.eigenvalues[model.shifted_modes]
     # Of the plate as written: that solved is of the thickness found.
     theory = theory * (plate.thickness / solved.plate.thickness) ** 2
     theory = theory * plate.material.E / solved.plate.material.E
-    gain = np.log(np.abs(truth.gain))
-    phase = np.angle(truth.gain)
+    gain = np.log(np.abs(own.gain))
+    phase = np.angle(own.gain)
     true = {
         "frequency": np.log(elastic / theory) / 2,
-        "stiffness": np.log(truth.stiffness / [era.stiffness for era in found.before.eras]) - mass,
-        "damping": np.log(truth.damping / [era.damping for era in found.before.eras]) - mass,
+        "stiffness": np.log(own.stiffness / [era.stiffness for era in found.before.eras]) - mass,
+        "damping": np.log(own.damping / [era.damping for era in found.before.eras]) - mass,
         "gain": gain - gain.mean(),
         "phase": phase - phase.mean(),
     }
@@ -44,15 +45,15 @@ def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
         errors[kind] = (estimate - value) / stds[kind]
     places = space.groups["place"]
     written = np.array([(era.x, era.y) for era in found.before.eras])
-    errors["place"] = (
-        space.std[places] * posterior.x[places] - (truth.at - written).ravel()
-    ) / stds["place"]
-    if len(truth.masses) and len(found.values.masses):
-        x, y, weight = truth.masses[0]
+    errors["place"] = (space.std[places] * posterior.x[places] - (own.at - written).ravel()) / stds[
+        "place"
+    ]
+    if len(own.masses) and len(found.values.masses):
+        x, y, weight = own.masses[0]
         at = space.groups["masses"].start
-        own = found.values.masses[0] - [weight, x, y]
+        off = found.values.masses[0] - [weight, x, y]
         std = np.hypot(posterior.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
-        errors["mass"] = own / std
+        errors["mass"] = off / std
     return errors
 
 

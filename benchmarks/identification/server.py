@@ -18,21 +18,14 @@ from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 class Truth:
     """A hidden plate laid open, for what would be answered if it were known.
 
-    eigenvalues (r,), receptance (f, r), attached (n + masses, r), shapes (p, r); at, stiffness,
-    damping, bolt, gain, masses as in `Mounted`; thickness [m].
+    mounted: with its modes; receptance (f, r) of these, their shapes attached (n + masses, r) at ERAs
+    and masses, and shapes (p, r) at points.
     """
 
-    eigenvalues: Reals
+    mounted: Mounted
     receptance: Complexes
     attached: Reals
     shapes: Reals
-    at: Reals
-    stiffness: Reals
-    damping: Reals
-    bolt: Reals
-    gain: Complexes
-    masses: Reals
-    thickness: float
 
 
 class HiddenPlates:
@@ -101,9 +94,9 @@ def _felt(
 ) -> Complexes:
     loads = np.array([finger_stiffness(frequency, each) for each in factors], dtype=complex)
     mounted = _plate(kind, seed).mounted
-    inside = [np.clip(each, 0, [mounted.plate.length, mounted.plate.width]) for each in (points,)]
+    inside = np.clip(points, 0, [mounted.plate.length, mounted.plate.width])
     return mounted.accelerations(
-        frequency, inside[0], fingers=fingers if len(loads) else None, loads=loads
+        frequency, inside, fingers=fingers if len(loads) else None, loads=loads
     )
 
 
@@ -116,17 +109,10 @@ def truth_of(mounted: Mounted, frequencies: Reals, points: Reals) -> Truth:
     plate = mounted.plate
     places = np.vstack([mounted.at, mounted.masses[:, :2]])
     return Truth(
-        plate.modes[0],
+        mounted,
         np.array([mounted.receptance(float(f)) for f in frequencies]),
         plate.shapes(places),
         plate.shapes(np.clip(points, 0, [plate.length, plate.width])),
-        mounted.at,
-        mounted.stiffness,
-        mounted.damping,
-        mounted.bolt,
-        mounted.gain,
-        mounted.masses,
-        plate.thickness,
     )
 
 

@@ -18,8 +18,8 @@ from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 class Truth:
     """A hidden plate laid open, for what would be answered if it were known.
 
-    mounted: with its modes; receptance (f, r) of these, their shapes attached (n + masses, r) at ERAs
-    and masses, and shapes (p, r) at points.
+    mounted: with its modes; receptance (f, r) of these, attached (n + masses, r) their shapes at
+    ERAs and masses, shapes (p, r) those at points.
     """
 
     mounted: Mounted

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.identification.hidden import finger_stiffness
-from benchmarks.identification.server import Truth
-from benchmarks.identification.thin_plate import Complexes, Reals
+from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import Complex64Array
@@ -42,9 +41,13 @@ def table_of(rig: Rig, frequencies: Reals, *, loaded: bool) -> LocalizationTable
     )
 
 
-def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> LocalizationTable:
-    """A table of the plate as it is, and of fingers (k, 4) as they are, if not weightless."""
-    own = truth.mounted
+def known_table(
+    table: LocalizationTable, own: Mounted, shapes: Reals, factors: Reals
+) -> LocalizationTable:
+    """A table of the plate as it is, and of fingers (k, 4) as they are, if not weightless.
+
+    shapes (p, r): of the plate at the table's points.
+    """
     eras = tuple(
         replace(
             era,
@@ -64,15 +67,16 @@ def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> Local
         uncertainty=DRIVES,
         omega=np.sqrt(own.plate.modes[0]),
         losses=np.zeros(len(own.plate.modes[0])),
-        attachment_shapes=truth.attached,
-        shapes=truth.shapes.astype(np.float32),
+        attachment_shapes=own.attached,
+        shapes=shapes.astype(np.float32),
         discretisation_error=np.zeros(len(table.frequencies)),
     )
     # Its loss is not hysteretic, and its fingers are not multiples of one.
     stiffness = [[finger_stiffness(float(f), each) for each in factors] for f in table.frequencies]
+    receptance = np.array([own.receptance(float(f)) for f in table.frequencies])
     square = (2 * np.pi * table.frequencies[:, None]) ** 2
     known.__dict__["attached"] = _UnderKnownFingers(
-        **(vars(known.attached) | {"modal": 1 / truth.receptance + square}),
+        **(vars(known.attached) | {"modal": 1 / receptance + square}),
         fingers=np.array(stiffness, dtype=np.complex64),
     )
     return known

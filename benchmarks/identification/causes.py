@@ -103,7 +103,6 @@ def measured(fault: Fault, seed: int) -> Responses:
         mounted = replace(mounted, masses=np.array([[*at, fault.mass]]))
     true = SENSORS + _OFF * rng.standard_normal(SENSORS.shape)
     true[3] += fault.shift * np.array([np.cos(angle), np.sin(angle)])
-    true = np.clip(true, 0, [mounted.plate.length, mounted.plate.width])
     fingers = at[None] if fault.has_finger else None
     clean = [
         mounted.accelerations(

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.identification.server import HiddenPlates, Truth
-from benchmarks.identification.thin_plate import Reals
+from benchmarks.identification.server import HiddenPlates
+from benchmarks.identification.thin_plate import Mounted, Reals
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.identify import Identification
@@ -18,10 +18,9 @@ _REGION = 5.991  # of two normal numbers
 _PLACES = np.array([(0.25, 0.2), (0.5, 0.5), (0.8, 0.4), (0.35, 0.75)])
 
 
-def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
+def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
     """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
     space, posterior, plate = found.posterior.space, found.posterior, found.before.plate
-    own = truth.mounted
     mass = np.log(own.plate.thickness / plate.thickness)
     model = found.fitted.problem.model
     elastic = np.sort(own.plate.modes[0])[3 : 3 + len(model.shifted_modes)]

@@ -22,7 +22,6 @@ import numpy as np
 from benchmarks.identification.answers import answer, known_table, table_of
 from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffness
 from benchmarks.identification.plates import FREQUENCIES
-from benchmarks.identification.server import truth_of
 from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Mounted
 from benchmarks.page import write_parts
@@ -170,8 +169,8 @@ def _judged(
 ) -> dict[str, list[float]]:
     """Contrast [dB] at the same sets of contacts by the tables and for the plate known."""
     live = tables["live"]
-    truth = truth_of(mounted, live.frequencies, live.raster.points)
-    tables = {**tables, "known": known_table(live, truth, np.zeros((0, 4)))}
+    shapes = mounted.plate.shapes(live.raster.points)
+    tables = {**tables, "known": known_table(live, mounted, shapes, np.zeros((0, 4)))}
     rng, found = np.random.default_rng([seed, 3]), {way: list[float]() for way in tables}
     for _ in range(SETS):
         places = random_contacts(rng, 2, (LENGTH, WIDTH), margin=0.013)

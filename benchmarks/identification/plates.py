@@ -80,8 +80,8 @@ def outcome(
     if identified.held_out:
         found.held_out = identified.held_out.total
         found.unexplained = identified.held_out.unexplained
-    raster = written[False].raster.points
-    truth = plates.truth(kind, seed, FREQUENCIES, raster)
+    truth = plates.truth(kind, seed)
+    shapes = truth.plate.shapes(written[False].raster.points)
     found.errors = parameters_held(identified, truth)
     found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
     is_judged = identified.is_explained or kind in FAMILY
@@ -95,7 +95,7 @@ def outcome(
                 factors = np.exp(LOAD_STD * rng.standard_normal((quiet + 1, 4)))
                 if not loaded:
                     factors = factors[:0]
-                known = known_table(written[loaded], truth, factors)
+                known = known_table(written[loaded], truth, shapes, factors)
                 error = 1 + GAIN * rng.standard_normal(len(rig.eras))
                 turn = np.radians(PHASE_DEG) * rng.standard_normal(len(rig.eras))
                 drives = error * np.exp(1j * turn)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -12,20 +11,6 @@ import numpy as np
 
 from benchmarks.identification.hidden import Hidden, draw, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """A hidden plate laid open, for what would be answered if it were known.
-
-    mounted: with its modes; receptance (f, r) of these, attached (n + masses, r) their shapes at
-    ERAs and masses, shapes (p, r) those at points.
-    """
-
-    mounted: Mounted
-    receptance: Complexes
-    attached: Reals
-    shapes: Reals
 
 
 class HiddenPlates:
@@ -47,10 +32,10 @@ class HiddenPlates:
         """
         return np.asarray(self._ask("felt", kind, seed, frequency, points, fingers, factors))
 
-    def truth(self, kind: str, seed: int, frequencies: Reals, points: Reals) -> Truth:
-        """The plate laid open, with shapes at points (p, 2) [m]."""
-        found = self._ask("truth", kind, seed, frequencies, points)
-        assert isinstance(found, Truth)
+    def truth(self, kind: str, seed: int) -> Mounted:
+        """The plate laid open, with its modes."""
+        found = self._ask("truth", kind, seed)
+        assert isinstance(found, Mounted)
         return found
 
     def _ask(self, *question: object) -> Any:
@@ -94,26 +79,13 @@ def _felt(
 ) -> Complexes:
     loads = np.array([finger_stiffness(frequency, each) for each in factors], dtype=complex)
     mounted = _plate(kind, seed).mounted
-    inside = np.clip(points, 0, [mounted.plate.length, mounted.plate.width])
     return mounted.accelerations(
-        frequency, inside, fingers=fingers if len(loads) else None, loads=loads
+        frequency, points, fingers=fingers if len(loads) else None, loads=loads
     )
 
 
-def _truth(kind: str, seed: int, frequencies: Reals, points: Reals) -> Truth:
-    return truth_of(_plate(kind, seed).mounted, frequencies, points)
-
-
-def truth_of(mounted: Mounted, frequencies: Reals, points: Reals) -> Truth:
-    """A mounted plate laid open at frequencies (f,) [Hz], with shapes at points (p, 2) [m]."""
-    plate = mounted.plate
-    places = np.vstack([mounted.at, mounted.masses[:, :2]])
-    return Truth(
-        mounted,
-        np.array([mounted.receptance(float(f)) for f in frequencies]),
-        plate.shapes(places),
-        plate.shapes(np.clip(points, 0, [plate.length, plate.width])),
-    )
+def _truth(kind: str, seed: int) -> Mounted:
+    return _plate(kind, seed).mounted
 
 
 _ANSWERS: dict[str, Any] = {"measured": _measured, "felt": _felt, "truth": _truth}

@@ -53,7 +53,8 @@ class Line:
         return found
 
     def at(self, x: Reals) -> Reals:
-        """Values of all functions at x (p,), (p, 2 nodes)."""
+        """Values of all functions at x (p,), beyond an end at it, (p, 2 nodes)."""
+        x = np.clip(x, 0.0, self.length)
         element = np.clip((x / self.step).astype(int), 0, self.elements - 1)
         values = self._local(x / self.step - element, 0)
         found = np.zeros((len(x), 2 * (self.elements + 1)))
@@ -150,7 +151,8 @@ class Mounted:
     loss_exponent: float
 
     @cached_property
-    def _attached(self) -> Reals:
+    def attached(self) -> Reals:
+        """Mode shapes at ERAs and masses (n + m, r)."""
         return self.plate.shapes(np.vstack([self.at, self.masses[:, :2]]))
 
     def receptance(self, frequency: float) -> Complexes:
@@ -174,7 +176,7 @@ class Mounted:
         w, n = 2 * np.pi * frequency, len(self.at)
         base = self.stiffness + 1j * w * self.damping
         held: list[Complexes | Reals] = [base - w**2 * self.bolt, -(w**2) * self.masses[:, 2]]
-        shapes = self._attached
+        shapes = self.attached
         if fingers is not None and loads is not None:
             shapes = np.vstack([shapes, self.plate.shapes(fingers)])
             held.append(loads)

@@ -66,7 +66,7 @@ class ShapeMatch:
 def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
     tried = [
-        ShapeMatch(_mac(values, plate.responses(plate.moved(*start))), start)
+        match_responses(plate.responses(plate.moved(*start)), values, start)
         for start in [(0.0, 0.0), *STARTS]
     ]
 
@@ -78,14 +78,11 @@ def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
     return best_by(tried, score)
 
 
-def match_responses(model: ComplexArray, values: ComplexArray) -> ShapeMatch:
+def match_responses(
+    model: ComplexArray, values: ComplexArray, start: tuple[float, float] = (0.0, 0.0)
+) -> ShapeMatch:
     """Compare values (f, e, s) with responses (f, e, s) of one plate."""
-    return ShapeMatch(_mac(values, model), (0.0, 0.0))
-
-
-def _mac(values: ComplexArray, model: ComplexArray) -> FloatArray:
-    """MAC (f, e, e) of each channel with each ERA."""
-    return modal_assurance(values[:, :, None], model[:, None])
+    return ShapeMatch(modal_assurance(values[:, :, None], model[:, None]), start)
 
 
 @dataclass(frozen=True)
@@ -102,6 +99,8 @@ class ChannelPhase:
 
 def phases_of_drive(observation: Responses, predicted: ComplexArray) -> list[ChannelPhase]:
     """Phases relative to the drive; predicted (f, e, s), NaN for channels to be skipped."""
+    if not observation.has_phases:
+        return [ChannelPhase()] * predicted.shape[1]
     found = []
     for channel in range(predicted.shape[1]):
         measured, model = observation.values[:, channel], predicted[:, channel]

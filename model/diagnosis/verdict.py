@@ -188,7 +188,8 @@ def diagnose(
         tried = [match, *(each.match for each in explanations)]
         fitted = best_by(tried, lambda each: -each.cost)
     shapes = match_responses(fitted.responses, values)
-    phases = _phases(observation, fitted, dead)
+    predicted = np.where(fitted.outliers | dead[:, None], np.nan, fitted.predicted)
+    phases = phases_of_drive(observation, predicted)
     channels = tuple(
         _channel(
             rig, number, observation, shapes, drives, fitted, phases[number], bool(dead[number])
@@ -226,13 +227,6 @@ def best_wiring(
         for drives in dict.fromkeys([own, nearest])
     ]
     return best_by(found, lambda each: -each[0].cost - _MIN_COST_REDUCTION * (each[1] != own))
-
-
-def _phases(observation: Responses, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:
-    if not observation.has_phases:
-        return [ChannelPhase()] * len(dead)
-    predicted = np.where(match.outliers | dead[:, None], np.nan, match.predicted)
-    return phases_of_drive(observation, predicted)
 
 
 def _channel(

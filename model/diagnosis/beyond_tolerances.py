@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
 from scipy.special import chdtri
 
 from model.arrays import ComplexArray, FloatArray
@@ -29,7 +28,7 @@ from model.choice import best_by
 from model.diagnosis.plate_match import FALSE_ALARM, Match, match_plate
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
-from model.identification.least_squares import single_changes
+from model.identification.least_squares import Linearization
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 
 MAX_ERROR = 0.05
@@ -160,21 +159,15 @@ def _loads(
         return np.concatenate([own.real, own.imag])
 
     residual = np.concatenate([left[kept].real, left[kept].imag])
-    J = real(by_x)
-    H = linalg.cho_factor(J.T @ J + np.eye(J.shape[1]))
-    residual = residual - J @ linalg.cho_solve(H, J.T @ residual + match.x[searched])
+    fitted = Linearization(match.x[searched], residual, real(by_x))
     of_finger = -tip.dynamic_stiffness(model.omega) / model.omega**2
     heaviest: list[PointLoad | FingertipLoad] = []
-    for factor, unit in ((np.ones(len(model.omega)), mass), (of_finger, 1.0)):
-        columns = real(unit * factor[:, None, None] * by_mass)
-        beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
-        ranked = single_changes(-(residual @ columns), (columns * beside).sum(axis=0), 1.0)
-        if not ranked:
-            continue
-        number, size = ranked[0]
-        x, y = points[number].tolist()
-        if unit == mass and size >= _HEAVY:
+    for number, size in fitted.further(real(mass * by_mass))[:1]:
+        if size >= _HEAVY:
+            x, y = points[number].tolist()
             heaviest.append(PointLoad(x, y, mass=size * mass))
-        elif unit == 1.0 and size >= _LIGHT:
+    for number, size in fitted.further(real(of_finger[:, None, None] * by_mass))[:1]:
+        if size >= _LIGHT:
+            x, y = points[number].tolist()
             heaviest.append(FingertipLoad(x, y, tip.multiplied(min(size, _FIRM))))
     return heaviest

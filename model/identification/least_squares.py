@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.choice import best_first
@@ -151,6 +152,16 @@ class Linearization:
     def gradient(self) -> FloatArray:
         """Half the derivative of the cost, (p,)."""
         return np.asarray(self.jacobian.T @ self.residuals + self.x)
+
+    def further(self, columns: FloatArray) -> list[tuple[int, float]]:
+        """`single_changes` of a standard deviation of 1, beside which all x follow.
+
+        columns (2 n, m): derivatives of the residuals by each.
+        """
+        H, J = linalg.cho_factor(self.information), self.jacobian
+        left = self.residuals - J @ linalg.cho_solve(H, self.gradient)
+        beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
+        return single_changes(-(left @ columns), (columns * beside).sum(axis=0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from model.identification.forward import ForwardModel, Sensor
 from model.identification.least_squares import (
     IdentificationProblem,
     Linearization,
-    single_changes,
     solve,
 )
 from model.identification.measurement import Measurement
@@ -192,15 +191,10 @@ def _scan(
         if kind not in ("masses", "mode_shifts", "mode_losses", "fingers")
     ]
     others = np.flatnonzero(space.of(*kinds))
-    J = now.jacobian[:, others]
     plate, points = model.rig.plate, _SCANNED.centres(model.rig.plate)
     by_mass = by_mass_at(model.at(x), points)[problem.measurement.known] / problem.std[:, None]
     columns = np.concatenate([by_mass.real, by_mass.imag]) * space.std[own]
-    H = linalg.cho_factor(now.information[np.ix_(others, others)])
-    # Of the residuals that the other parameters leave after one step of theirs.
-    left = now.residuals - J @ linalg.cho_solve(H, now.gradient[others])
-    beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
-    heaviest = single_changes(-(left @ columns), (columns * beside).sum(axis=0), 1.0)
+    heaviest = Linearization(x[others], now.residuals, now.jacobian[:, others]).further(columns)
     off = (points - [plate.length / 2, plate.width / 2]) / space.std[own + 1 : own + 3]
     return [(off[number], size) for number, size in heaviest[:_KEPT]]
 

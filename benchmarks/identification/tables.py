@@ -91,11 +91,8 @@ def kept_or_refused(outcomes: Sequence[Outcome]) -> str:
             of = [each for each in every if each.sensors == sensors]
             own = [each for each in of if each.is_explained]
             shares = [[_kept(each, what) for each in own] for what in ("contrast", "level")]
-            cells = [
-                f"{np.mean(of):.0%} ({np.percentile(of, 10):.0%}, {min(of):.0%})"
-                for of in shares
-                if of
-            ]
+            rows = [[np.mean(of), np.percentile(of, 10), min(of)] for of in shares if of]
+            cells = ["{:.0f} % ({:.0f}, {:.0f})".format(*100 * np.array(row)) for row in rows]
             if own:
                 cells.append(f"{sum(share >= PLATE_KEEPS for share in shares[1])} of {len(own)}")
             row = [NAMES[kind], str(sensors), f"{len(of)}, {len(of) - len(own)}"]

@@ -141,13 +141,13 @@ class SensedPlate:
             "damping": math.hypot(factor, KINDS["damping_each"].std),
         }
         own = np.array([row.of(self.rig) for row in self.rows])
-        spread = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
+        of_rig = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
         is_lossy = (own > 0) & [row.kind in _KINDS for row in self.rows]
         unit = std / np.where(is_lossy, own, 1.0)
         size = unit * z[self.numbers]
         is_more = is_lossy & (size > 0)
         size, unit = (np.where(is_more, np.log1p(np.abs(each)), each) for each in (size, unit))
-        return np.asarray(size / np.maximum(unit, spread))
+        return np.asarray(size / np.maximum(unit, of_rig))
 
     def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
         """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""

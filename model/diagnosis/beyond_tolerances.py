@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
@@ -57,15 +57,17 @@ _WORDS = {
 class BeyondTolerances:
     """What is not as written.
 
-    load: what lies on the plate, None for nothing; farthest: the form error that would have to be
-    largest, in words, and its rms in standard deviations, 0 where none is too large; error: of the
-    response, unexplained; taper: how much thicker the plate is at the ends of x and of y than in
-    the middle, relative, None where that is not what is farthest.
+    load: what lies on the plate, None for nothing; farthest: the form error that is least likely,
+    in words; deviation: its rms in standard deviations, 0 where none is too large; chance: in how
+    many of all plates as written one is as unlikely, at most; error: of the response, unexplained;
+    taper: how much thicker the plate is at the ends of x and of y than in the middle, relative,
+    None where that is not what is farthest.
     """
 
     load: PointLoad | FingertipLoad | None
     farthest: str
     deviation: float
+    chance: float
     error: float
     taper: tuple[float, float] | None = None
 
@@ -99,28 +101,28 @@ def match_with_form(
         if found.cost < best.cost - _CLEAR:
             best, load = found, each
     if load is not None:
-        return best, BeyondTolerances(load, "", 0.0, best.error)
+        return best, BeyondTolerances(load, "", 0.0, 1.0, best.error)
     rises, slopes = _along_plate(best, observation.points)
-    farthest, deviation = _farthest(best, rises)
+    farthest, deviation, chance = _farthest(best, rises)
     if best.error <= MAX_ERROR and not deviation:
         return best, None
     taper = slopes if farthest == _THICKNESS else None
-    return best, BeyondTolerances(None, farthest, deviation, best.error, taper)
+    return best, BeyondTolerances(None, farthest, deviation, chance, best.error, taper)
 
 
-def _farthest(match: Match, rises: FloatArray) -> tuple[str, float]:
-    """The kind of form error that is least likely, and its rms in standard deviations."""
+def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
+    """The kind of form error that is least likely, its rms in standard deviations, its chance."""
     space = match.plate.model.space
     kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
     # Foreign mass may be one lump, whose weight is then all that is unknown of it.
     kinds[_MASS] = np.array([np.sqrt((kinds[_MASS] ** 2).mean())])
-    found = [("", 0.0)]
+    found = [("", 0.0, 1.0)]
     kinds[_THICKNESS] = rises
     for words, own in kinds.items():
-        squares = float(own @ own)
-        if squares > chdtri(len(own), FALSE_ALARM / len(kinds)):
-            found.append((words, float(np.sqrt(squares / len(own)))))
-    return best_by(found, lambda each: each[1])
+        chance = len(kinds) * float(chdtrc(len(own), own @ own))
+        if chance < FALSE_ALARM:
+            found.append((words, float(np.sqrt((own**2).mean())), chance))
+    return best_by(found, lambda each: -each[2])
 
 
 def _along_plate(match: Match, points: FloatArray) -> tuple[FloatArray, tuple[float, float]]:

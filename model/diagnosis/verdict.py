@@ -173,7 +173,9 @@ def diagnose(
         with_form, beyond = match_with_form(plate, observation, values, drives)
         if with_form.error <= MAX_ERROR:
             match = with_form
-    matches = match.error <= MAX_FIT_ERROR and match.chance >= false_alarm
+    # Values that stand in for a form error that is less likely say nothing of themselves.
+    is_likely = match.chance >= min(false_alarm, beyond.chance if beyond else 1.0)
+    matches = match.error <= MAX_FIT_ERROR and is_likely
     explanations: Sequence[Explanation] = ()
     fitted = match
     if not matches:

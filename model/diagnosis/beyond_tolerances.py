@@ -5,7 +5,7 @@ A plate is matched once more with form errors, each held by its tolerance (`KIND
 sides, Poisson's ratio, single modes. They explain what builders and rulers do. What lies on the
 plate is sought where it would explain most beside all of them, and named if it then explains it; of
 the rest each kind of form error is judged by its sum of squares, at equal shares of a stated false
-alarm. A plate that is thinner at one end
+alarm, and a thickness at one of its own. A plate that is thinner at one end
 moves more there, by as much as it is thinner: scales of sensors rise along it.
 """
 
@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray
@@ -96,13 +98,14 @@ def match_with_form(
 
     noise = float(np.clip(matched(None, _FIRST_NOISE).error, *_NOISE))
     best, load = matched(None, noise), None
-    for each in _loads(best, values, drives, noise):
+    loads, fitted = _loads(best, values, drives, noise)
+    for each in loads:
         found = matched(each, noise)
         if found.cost < best.cost - _CLEAR:
             best, load = found, each
     if load is not None:
         return best, BeyondTolerances(load, "", 0.0, 1.0, best.error)
-    rises, slopes = _along_plate(best, observation.points)
+    rises, slopes = _along_plate(best, observation.points, fitted)
     farthest, deviation, chance = _farthest(best, rises)
     if best.error <= MAX_ERROR and not deviation:
         return best, None
@@ -119,34 +122,51 @@ def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
     found = [("", 0.0, 1.0)]
     kinds[_THICKNESS] = rises
     for words, own in kinds.items():
-        chance = len(kinds) * float(chdtrc(len(own), own @ own))
+        among = 1 if words == _THICKNESS else len(_WORDS)
+        chance = among * float(chdtrc(len(own), own @ own))
         if chance < FALSE_ALARM:
             found.append((words, float(np.sqrt((own**2).mean())), chance))
     return best_by(found, lambda each: -each[2])
 
 
-def _along_plate(match: Match, points: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
+def _along_plate(
+    match: Match, points: FloatArray, fitted: Linearization
+) -> tuple[FloatArray, tuple[float, float]]:
     """What of the scales of sensors rises along the sides (2,), in standard deviations.
 
-    And the thickness that does this, relative, at the ends of x and of y.
+    And the thickness that does this, relative, at the ends of x and of y. A fit holds scales back,
+    so that those of sound plates vary by less than they are, in the mean by as much.
     """
     space, plate = match.plate.model.space, match.plate.rig.plate
+    own = space.of("sensor_scale")[_searched(match)]
     scales = match.x[space.groups["sensor_scale"]]
     along = 2 * points / [plate.length, plate.width] - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
-    off = along - along.mean(axis=0)
-    x, y = -np.linalg.lstsq(off, scales * space.std[space.groups["sensor_scale"]])[0]
-    return basis.T @ scales, (float(x), float(y))
+    shown = np.eye(len(points)) - linalg.inv(fitted.information)[np.ix_(own, own)]
+    shown, rises = basis.T @ shown @ basis, basis.T @ scales
+    thinner = basis @ linalg.solve(shown, rises) * space.std[space.groups["sensor_scale"]]
+    x, y = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
+    whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(shown), rises))
+    return whitened, (float(x), float(y))
+
+
+def _searched(match: Match) -> NDArray[np.bool_]:
+    """Mask (p,) of the parameters that are searched beside free gains."""
+    space = match.plate.model.space
+    return space.uncertain & ~space.of("gain")
 
 
 def _loads(
     match: Match, values: ComplexArray, drives: Sequence[int], noise: float
-) -> list[PointLoad | FingertipLoad]:
-    """A mass and a finger where each would explain most, if it is of a size that counts."""
+) -> tuple[list[PointLoad | FingertipLoad], Linearization]:
+    """A mass and a finger where each would explain most, if it is of a size that counts.
+
+    And the match beside which they were sought.
+    """
     plate, of_eras = match.plate, list(drives)
     model, mass = plate.model, plate.rig.plate.mass
     tip = plate.rig.fingertip or Fingertip()
-    searched = model.space.uncertain & ~model.space.of("gain")
+    searched = _searched(match)
     found, by_x = responses_of(model, match.x, searched)
     points = _SCANNED.centres(plate.rig.plate)
     by_mass = by_mass_at(model.at(match.x), points).transpose(3, 0, 2, 1)[:, :, of_eras]
@@ -172,4 +192,4 @@ def _loads(
         if size >= _LIGHT:
             x, y = points[number].tolist()
             heaviest.append(FingertipLoad(x, y, tip.multiplied(min(size, _FIRM))))
-    return heaviest
+    return heaviest, fitted

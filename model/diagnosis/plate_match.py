@@ -25,7 +25,7 @@ from model.rig.rig import Rig
 
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 FALSE_ALARM = 0.01
-"""Share of plates as written that are called another for a value, and as many for their form."""
+"""Share of plates as written that are called another for a value, their form or their thickness."""
 
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled

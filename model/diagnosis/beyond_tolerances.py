@@ -41,6 +41,7 @@ _FIRST_NOISE = 0.02
 _SCANNED = Grid(16, 12)
 _HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
 _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
+_LEAST_SHOWN = 1e-6  # of a variance
 _CLEAR = 40.0  # of half the sum of squares
 
 _THICKNESS, _MASS = "thickness", "distribution of mass"
@@ -143,11 +144,10 @@ def _along_plate(
     along = 2 * points / [plate.length, plate.width] - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
     shown = np.eye(len(points)) - linalg.inv(fitted.information)[np.ix_(own, own)]
-    shown, rises = basis.T @ shown @ basis, basis.T @ scales
+    shown, rises = basis.T @ shown @ basis + _LEAST_SHOWN * np.eye(2), basis.T @ scales
     thinner = basis @ linalg.solve(shown, rises) * space.std[space.groups["sensor_scale"]]
     x, y = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
-    whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(shown), rises))
-    return whitened, (float(x), float(y))
+    return linalg.solve(linalg.cholesky(shown, lower=True), rises), (float(x), float(y))
 
 
 def _searched(match: Match) -> NDArray[np.bool_]:

@@ -174,8 +174,8 @@ def diagnose(
         if with_form.error <= MAX_ERROR:
             match = with_form
     # Values that stand in for a form error that is less likely say nothing of themselves.
-    is_likely = match.chance >= min(false_alarm, beyond.chance if beyond else 1.0)
-    matches = match.error <= MAX_FIT_ERROR and is_likely
+    limit = min(false_alarm, beyond.chance if beyond else 1.0)
+    matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
     explanations: Sequence[Explanation] = ()
     fitted = match
     if not matches:

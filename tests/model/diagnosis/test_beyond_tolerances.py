@@ -24,17 +24,21 @@ def test_diagnose_passes_plates_within_tolerances(rig, name, seed):
 
 
 @pytest.mark.parametrize(
-    ("name", "word"),
+    ("name", "seed", "word"),
     [
-        ("bonded frame", "UNNAMED"),
-        ("thickness ± 3 % from end to end", "THICKNESS"),
-        ("a resting finger", "FINGER"),
-        ("10 g", "MASS"),
+        ("bonded frame", 204, "UNNAMED"),
+        ("thickness ± 3 % from end to end", 1, "THICKNESS"),
+        ("the same with form errors and 3 g", 203, "THICKNESS"),
+        ("a resting finger", 1, "FINGER"),
+        ("10 g", 1, "MASS"),
     ],
 )
-def test_diagnose_names_what_is_beyond_tolerances(rig, name, word):
-    """Each is what it is, and fails the check though the plate matches."""
-    verdict = verdict_on(rig, name, 1)
+def test_diagnose_names_what_is_beyond_tolerances(rig, name, seed, word):
+    """Each is what it is, and fails the check though the plate matches.
+
+    Of the frame a spring is 3.9 standard deviations off, which modes that are farther off explain.
+    """
+    verdict = verdict_on(rig, name, seed)
     assert FAULTS[name].is_named(verdict)
     assert verdict.plate_matches
     assert not verdict.is_well

@@ -69,6 +69,11 @@ class CheckedEffect:
         return max((each.held_back_db for each in self.touches), default=0.0)
 
     @property
+    def exposure_m_s2(self) -> float:
+        """Weighted acceleration of a touch at most [m/s²], root mean square (`exposures`)."""
+        return max((each.exposure_m_s2 for each in self.touches), default=0.0)
+
+    @property
     def frequencies(self) -> list[float]:
         """All frequencies that play [Hz], ascending."""
         return sorted({frequency for each in self.touches for frequency in each.frequencies})
@@ -84,6 +89,7 @@ class CheckedEffect:
             "promised_contrast_db": summary(self.promised_contrasts),
             "felt_contrast_db": summary(self.contrasts),
             "held_back_db": self.held_back_db,
+            "exposure_m_s2": self.exposure_m_s2,
             "frequency_hz": self.frequencies,
             "touches": len(self.touches),
             "problems": [*self.problems],

@@ -8,7 +8,6 @@ from pydantic import Field
 
 from controller.effects.effect import (
     DEFAULT_MAX_DB_SL,
-    MAX_DB_SL,
     Effect,
     Level,
     TunedSection,
@@ -16,6 +15,7 @@ from controller.effects.effect import (
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region
+from model.answer.fingers import MAX_LEVEL_DB_SL
 from model.config.document import Document, KeyPath, read_document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Quantity, Section, Validation
@@ -30,7 +30,7 @@ from registry.suggestions import did_you_mean
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 
 
-_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)]
+_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)]
 
 
 class RegionSection(ShapedSection, TunedSection):

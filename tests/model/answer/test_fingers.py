@@ -48,7 +48,7 @@ def test_fingers_that_contradict_each_other_are_refused(placed):
     "more",
     [
         {"level_db_sl": math.nan},
-        {"level_db_sl": 201.0},
+        {"level_db_sl": 60.5},
         {"level_db_sl": -300.0},
         {"level_db_sl": 10**400},
         {"duration": 0.0},

@@ -203,7 +203,7 @@ def test_two_fingers_that_share_and_no_other_are_served():
 
 def test_what_is_not_felt_is_null_in_json():
     """A higher priority takes the whole stroke: JSON has no infinity."""
-    own = [{"at": NEAR, "level_db_sl": 80.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
+    own = [{"at": NEAR, "level_db_sl": 60.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
     found = query_one(smooth_table(), {"own": own})
     assert found["fingers"][1]["verdict"] == "held back"
     json.dumps(found, allow_nan=False)

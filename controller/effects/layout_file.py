@@ -30,7 +30,9 @@ from registry.suggestions import did_you_mean
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 
 
-_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)]
+_HighestLevel = Annotated[
+    float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
+]
 
 
 class RegionSection(ShapedSection, TunedSection):

@@ -29,7 +29,9 @@ class Ramp(Effect):
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False
 
-    start_level: Annotated[float, Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)] = 6.0
+    start_level: Annotated[float, Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)] = (
+        6.0
+    )
     """First level, in dB SL; the last is `level`."""
 
     duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0

@@ -21,7 +21,8 @@ NEIGHBOURS: Literal["neighbours"] = "neighbours"
 MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
 """Lowest level of an effect, and highest of a layout that does not raise it [dB SL]."""
 
-_DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
+DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
+"""A level of an effect."""
 
 
 MIN_DURATION = 0.020
@@ -34,7 +35,7 @@ def _level(value: object) -> object:
     if value == NEIGHBOURS:
         return NEIGHBOURS
     try:
-        return _DB_SL.read(value)
+        return DB_SL.read(value)
     except ValueError as error:
         raise ValueError(f"{error}; or {NEIGHBOURS}") from error
 

@@ -18,9 +18,9 @@ from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
-"""Below the smallest amplitude of a channel, and the highest that layouts and programs may ask [dB SL].
+"""Below the smallest amplitude of a channel, and the most that layouts and programs may ask for.
 
-Its exposure: docs/concepts/people.md.
+In dB SL; what exposure that is: docs/concepts/people.md.
 """
 
 MIN_DURATION, MAX_DURATION = 0.001, 1e6

@@ -1,12 +1,12 @@
 """Whether promises of two contents are kept on plates with harmonics and with further errors.
 
-    python -m benchmarks.promise.errors [--sets 16] [--plates 80]
+    python -m benchmarks.promise.errors [--sets 16] [--plates 80] [--place 0.001]
 
 Contents of 14 dB SL, fingers anywhere on the plate, 5 cm apart, on plates solved exactly and drawn
 within the uncertainty of the rig (default) or one as after `era rig identify` (identified): with
 none of the harmonics, modulus and places; with 1 % of second harmonic; and with all. Share of the
 promises that are kept where answers do not count these errors and where they do, and the promise at
-the worst finger, median.
+the worst finger, median. With --place ERAs are known to so much [m], and all errors are there.
 """
 
 import argparse
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from model.study.exact_plates import Plates
     from model.table.table import LocalizationTable
 
-RIGS = ("paper_plate", "car_display")
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(
@@ -32,6 +30,7 @@ def main() -> None:
     )
     parser.add_argument("--sets", type=int, default=16)
     parser.add_argument("--plates", type=int, default=80)
+    parser.add_argument("--place", type=float)
     options = parser.parse_args()
     use_one_thread()
     import numpy as np
@@ -46,6 +45,10 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for case in [each for each in CASES if each.with_errors]:
         known = case.rig.uncertainty
+        if options.place is not None:
+            if case.without:
+                continue
+            known = replace(known, place=options.place)
         least = replace(known, modulus=0.0, place=0.0, harmonic=0.0)
         cells = []
         for counted in (least, known):

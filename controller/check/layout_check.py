@@ -11,7 +11,7 @@ from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
-from controller.effects.region import Region
+from controller.effects.region import ON_RELEASE, Region
 from controller.play.intent import Target, band_problem
 from model.progress import Progress, unseen
 from model.structure.plate import Plate
@@ -23,7 +23,6 @@ LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
 MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
-_ON_RELEASE = "on_release"  # felt where the finger goes
 _MIN_STEP = 0.008  # m; nearer touches hardly differ
 _RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
 
@@ -69,6 +68,11 @@ class CheckedEffect:
         return max((each.held_back_db for each in self.touches), default=0.0)
 
     @property
+    def exposure_m_s2(self) -> float:
+        """Weighted acceleration of a touch at most [m/s²], root mean square (`exposures`)."""
+        return max((each.exposure_m_s2 for each in self.touches), default=0.0)
+
+    @property
     def frequencies(self) -> list[float]:
         """All frequencies that play [Hz], ascending."""
         return sorted({frequency for each in self.touches for frequency in each.frequencies})
@@ -84,6 +88,7 @@ class CheckedEffect:
             "promised_contrast_db": summary(self.promised_contrasts),
             "felt_contrast_db": summary(self.contrasts),
             "held_back_db": self.held_back_db,
+            "exposure_m_s2": self.exposure_m_s2,
             "frequency_hz": self.frequencies,
             "touches": len(self.touches),
             "problems": [*self.problems],
@@ -226,10 +231,10 @@ def _unnoticed(
     at: Position,
 ) -> Iterator[str]:
     """Short effects whose given level hides below what lasts in the region."""
-    if on == _ON_RELEASE or not click.is_short or not layout.gives_level(name, region):
+    if on == ON_RELEASE or not click.is_short or not layout.gives_level(name, region):
         return
     for other, beside, lasting in layout.uses():
-        if other is not region or beside in (on, _ON_RELEASE):
+        if other is not region or beside in (on, ON_RELEASE):
             continue
         felt = strongest_target(layout, lasting, region, at=at)
         if felt is None or felt.is_short or felt.level_db_sl is None or click.level_db_sl is None:

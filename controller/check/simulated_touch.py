@@ -12,6 +12,7 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
+from model.answer.exposure import exposures
 from model.arrays import FloatArray
 from model.choice import NEARLY
 from model.drive_modes import DRIVE_MODES
@@ -39,8 +40,8 @@ class SimulatedTouch:
 
     frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
     the resting finger feels over as long, None without one; promised_contrast_db: over that finger
-    on nine of ten plates; held_back_db: by how much it is weaker for that finger; reason: why
-    nothing plays.
+    on nine of ten plates; held_back_db: by how much it is weaker for that finger; exposure_m_s2: of
+    it at full strength (`exposures`); reason: why nothing plays.
     """
 
     at: Position
@@ -51,6 +52,7 @@ class SimulatedTouch:
     promised_contrast_db: float | None = None
     reason: str | None = None
     held_back_db: float = 0.0
+    exposure_m_s2: float = 0.0
 
 
 class TouchSimulator:
@@ -111,6 +113,7 @@ class TouchSimulator:
             resting_level,
             promised,
             held_back_db=0.0 if answer.stroke_factor < 1 - NEARLY else expected.lowered_db,
+            exposure_m_s2=exposures(self.table, answer)[0],
         )
 
     def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:

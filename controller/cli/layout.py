@@ -103,6 +103,8 @@ _SHOWN_FROM = 0.05  # dB
 
 def _lines(each: "CheckedEffect") -> list[str]:
     """Format one effect of a region."""
+    from controller.effects.effect import DEFAULT_MAX_DB_SL
+
     promised = (
         "as neighbours allow" if each.promised_db_sl is None else f"{each.promised_db_sl:g} dB SL"
     )
@@ -120,6 +122,8 @@ def _lines(each: "CheckedEffect") -> list[str]:
     if each.held_back_db > _SHOWN_FROM:
         held = f"  up to {each.held_back_db:.1f} dB weaker"
         lines.append(f"{held} so that it feels half of it at most")
+    if each.promised_db_sl is not None and each.promised_db_sl > DEFAULT_MAX_DB_SL:
+        lines.append(f"  exposure up to {each.exposure_m_s2:.2g} m/s², weighted as by ISO 5349-1")
     return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
 
 

@@ -90,7 +90,9 @@ def _loss(status: StatusResult) -> str | None:
 
 def _contact(contact: ContactStatus) -> str:
     """Format a finger and what it feels."""
-    is_own = contact.verdict == "own"
+    from model.answer.answer import OWN, verdict_shown
+
+    verdict = verdict_shown(contact.verdict, is_foreign_felt=contact.is_foreign_felt)
     details = _given(
         (" {:.1f} dB SL", contact.level_db_sl),
         (", at least {:.1f} dB over the others", contact.promised_contrast_db),
@@ -98,8 +100,7 @@ def _contact(contact: ContactStatus) -> str:
         (", effect {}", contact.effect),
         (", feels {}", None if contact.feels == contact.effect else contact.feels),
         (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),
-        (", {}", None if is_own else contact.verdict),
-        (", {}", "others faintly felt" if is_own and contact.is_foreign_felt else None),
+        (", {}", None if verdict == OWN else verdict),
         (": {}", contact.held_back),
         (", load {:.1f}", None if contact.load == 1 else contact.load),
     )

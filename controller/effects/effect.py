@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Strict, model_validator
 from controller.effects.region import Region
 from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
+from model.answer.fingers import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY, LEVEL
 from model.finger.perception import STRONG_DB_SL
@@ -18,11 +18,11 @@ from model.finger.perception import STRONG_DB_SL
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
 
-MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
-DEFAULT_MAX_DB_SL = 40.0
-"""Highest level of a layout that does not raise it [dB SL]; that of any is MAX_DB_SL."""
+MIN_DB_SL, DEFAULT_MAX_DB_SL = -20.0, 40.0
+"""Lowest level of an effect, and highest of a layout that does not raise it [dB SL]."""
 
-_DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
+DB_SL = Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_LEVEL_DB_SL)
+"""A level of an effect."""
 
 
 MIN_DURATION = 0.020
@@ -35,7 +35,7 @@ def _level(value: object) -> object:
     if value == NEIGHBOURS:
         return NEIGHBOURS
     try:
-        return _DB_SL.read(value)
+        return DB_SL.read(value)
     except ValueError as error:
         raise ValueError(f"{error}; or {NEIGHBOURS}") from error
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from controller.effects.effect import Effect
 from controller.effects.kinds import BUILT_IN
-from controller.effects.region import Region
+from controller.effects.region import USES, Region
 from controller.play.intent import Band, band_problem
 from model.arrays import FloatArray
 from model.finger.perception import STRONG_DB_SL
@@ -46,7 +46,7 @@ class SurfaceLayout:
     def uses(self) -> Iterator[tuple[Region | None, str, str]]:
         """Yield every effect of every region: the region, None outside of all, key and name."""
         for region in self.regions:
-            for on in ("on_press", "on_move", "on_release"):
+            for on in USES:
                 if (name := getattr(region, on)) is not None:
                     yield region, on, name
         if self.elsewhere is not None:

@@ -8,14 +8,14 @@ from pydantic import Field
 
 from controller.effects.effect import (
     DEFAULT_MAX_DB_SL,
-    MAX_DB_SL,
     Effect,
     Level,
     TunedSection,
 )
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
-from controller.effects.region import Region
+from controller.effects.region import ON_MOVE, ON_RELEASE, USES, Region
+from model.answer.fingers import MAX_LEVEL_DB_SL
 from model.config.document import Document, KeyPath, read_document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Quantity, Section, Validation
@@ -30,7 +30,9 @@ from registry.suggestions import did_you_mean
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 
 
-_HighestLevel = Annotated[float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_DB_SL)]
+_HighestLevel = Annotated[
+    float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
+]
 
 
 class RegionSection(ShapedSection, TunedSection):
@@ -139,8 +141,7 @@ def _check_region(
     sides = None if plate is None else (plate.length, plate.width)
     if problem := region.shape_problem(sides):
         validation.add((*path, *problem[0]), problem[1])
-    uses = [region.on_press, region.on_move, region.on_release]
-    if uses == [None, None, None]:
+    if not any(getattr(region, key) for key in USES):
         for key in ("level", "band", "frequency", "own", "may_share"):
             given = getattr(region, key)
             if given is not None and given is not False:  # a level may be 0
@@ -151,9 +152,9 @@ def _check_region(
         validation.add(
             (*path, "may_share"), "must not be true beside own: its content is shared; remove one"
         )
-    for key, is_for_motion in (("on_press", False), ("on_move", True), ("on_release", False)):
+    for key in USES:
         name = getattr(region, key)
-        _check_use(validation, (*path, key), name, effects, is_for_motion=is_for_motion)
+        _check_use(validation, (*path, key), name, effects, is_for_motion=key == ON_MOVE)
 
 
 def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effect | None]) -> None:
@@ -215,7 +216,7 @@ def _check_use(
         validation.add(path, f"{name} is for motion; put it under on_move")
     elif is_for_motion and not effect.is_for_motion:
         validation.add(path, f"{name} is not for motion; put it under on_press or on_release")
-    elif path[-1] == "on_release" and not effect.has_end:
+    elif path[-1] == ON_RELEASE and not effect.has_end:
         can_end = "duration" in type(effect).model_fields
         remedy = "give it a duration" if can_end else "choose an effect that does"
         validation.add(path, f"{name} must end by itself; {remedy}")

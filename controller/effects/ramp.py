@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from controller.effects.effect import (
-    MAX_DB_SL,
+    DB_SL,
     MAX_DURATION,
-    MIN_DB_SL,
     MIN_DURATION,
     Effect,
     EffectRun,
@@ -16,7 +15,7 @@ from controller.effects.effect import (
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
-from model.config.units import LEVEL, TIME
+from model.config.units import TIME
 from model.finger.perception import STRONG_DB_SL
 
 RAMP_STEP_DB = 2.0
@@ -29,7 +28,7 @@ class Ramp(Effect):
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False
 
-    start_level: Annotated[float, Quantity(LEVEL, at_least=MIN_DB_SL, at_most=MAX_DB_SL)] = 6.0
+    start_level: Annotated[float, DB_SL] = 6.0
     """First level, in dB SL; the last is `level`."""
 
     duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0

@@ -6,6 +6,9 @@ from typing import Any
 from controller.play.intent import Band
 from model.config.shapes import Shape
 
+ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")
+"""Keys of a region's effects."""
+
 
 @dataclass(frozen=True)
 class Region:

@@ -17,8 +17,11 @@ from model.finger.perception import STRONG_DB_SL
 from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 
-MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
-"""Below the smallest amplitude of a channel, and above what a plate survives."""
+MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
+"""Below the smallest amplitude of a channel, and the most that layouts and programs may ask for.
+
+In dB SL; what exposure that is: docs/concepts/people.md.
+"""
 
 MIN_DURATION, MAX_DURATION = 0.001, 1e6
 """Durations of a stimulus that has an end [s]: no time step of a plate is nearly as long or short.
@@ -78,7 +81,8 @@ class Stimulus:
         if not MIN_LEVEL_DB_SL <= self.level_db_sl <= MAX_LEVEL_DB_SL:
             raise InputError(
                 f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
-                f"{self.level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold"
+                f"{self.level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold, and at "
+                f"{MAX_LEVEL_DB_SL:g} the exposure is 12 to 60 m/s² (ISO 5349-1)"
             )
         if not (self.name is None or isinstance(self.name, str)):
             raise InputError(f"name of a stimulus must be text, got {shown(self.name)}")

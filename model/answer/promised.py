@@ -60,7 +60,7 @@ def promised(
     owners (m,): the content of each tone; gains: None for those to the contents' levels; ringing:
     of the contents that have a duration.
     """
-    shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
+    shares, streams = fingers.tips.fine_weights, contents.streams
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
     harmonics = fingers.harmonics(PROMISED_DRAWS, rows, weights)
     if any(stream.duration is not None for stream in streams):
@@ -75,11 +75,6 @@ def promised(
         by_tone = of_contents[owners]
     squares = np.square(by_tone, dtype=np.float32)[:, None, None]
     power, harmonics, table = power * squares[..., None], harmonics * squares, fingers.table
-    level = np.full((k, 2), np.nan)
-    for j, stream in enumerate(streams):
-        for finger in stream.targets:
-            felt = felt_amplitudes(power, shares, rows, owners == j, (finger,))
-            level[finger] = felt[0], promise(felt)
     sensitivities = table.sensitivities[:, rows], table.harmonic_sensitivities[:, rows]
     by_set = [
         _compared(
@@ -92,7 +87,7 @@ def promised(
         )
         for at_tones, at_harmonics in zip(*sensitivities, strict=True)
     ]
-    contrast, of_others, worst = (np.array(each) for each in zip(*by_set, strict=True))
+    (level, *_), contrast, of_others, worst = map(np.array, zip(*by_set, strict=True))
     return Tones(
         rows=rows.tolist(),
         weights=weights.tolist(),
@@ -114,24 +109,24 @@ def _compared(
     shares: Float32Array,
     rows: IntArray,
     owners: IntArray,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Contrast (k, 3), what is felt of others (k,), and the promised contrast of all fingers.
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Level (k, 2), contrast (k, 3), what is felt of others (k,), and promised of all fingers.
 
     By one set of thresholds, to which power (m, k, p, d) and that of harmonics (m, k, d) are; NaN
     where there is nothing to compare.
     """
     streams, k = contents.streams, len(contents.places)
-    contrast, of_others = (np.full(size, np.nan) for size in ((k, 3), k))
-    each_own = [
-        felt_amplitudes(power, shares, rows, owners == j, s.targets) for j, s in enumerate(streams)
-    ]
+    level, contrast, of_others = (np.full(size, np.nan) for size in ((k, 2), (k, 3), k))
+    own_of = {finger: owners == j for j, stream in enumerate(streams) for finger in stream.targets}
+    every = {
+        finger: felt_amplitudes(power, shares, rows, own, (finger,))
+        for finger, own in own_of.items()
+    }
+    level[[*every]] = [(felt[0], promise(felt)) for felt in every.values()]
     ratios: list[Float32Array] = []
-    for finger in (*(finger for stream in streams for finger in stream.targets), *contents.quiet):
-        felt, others = np.min(each_own, axis=0), np.ones(len(rows), dtype=bool)
-        for j, stream in enumerate(streams):
-            if finger in stream.targets:
-                others = owners != j
-                felt = felt_amplitudes(power, shares, rows, ~others, (finger,))
+    for finger in (*every, *contents.quiet):
+        felt = every[finger] if finger in every else np.min([*every.values()], axis=0)
+        others = ~own_of.get(finger, np.zeros(len(rows), dtype=bool))
         if not others.any():
             continue
         heard = loudest_power(power[others], harmonics[others], rows[others], finger)
@@ -142,7 +137,7 @@ def _compared(
     worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
     if len(streams) == 1:
         contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
-    return contrast, of_others, worst[2]
+    return level, contrast, of_others, worst[2]
 
 
 def _over_durations(

@@ -325,3 +325,14 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
     if name != "ramp":  # which reports each of its steps
         assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
     assert max(levels) - min(levels) <= 2.0
+
+
+def test_check_states_the_exposure_of_raised_levels() -> None:
+    """A buzz of 100 Hz: 45 dB SL are 0.249 m/s² times 178, 0.160 of its rms by ISO 5349-1 or more.
+
+    The fingertip's mean is at that level, so that its loudest point has no less.
+    """
+    region = Region("button", BUTTON, on_press="it", band=(100.0, 100.0))
+    least = 0.249 * 10 ** (45 / 20) * 0.160 / math.sqrt(2)
+    found = checked(region, Buzz(level=45.0))
+    assert least * 10 ** (-2 / 20) <= found.exposure_m_s2 <= 3 * least

@@ -29,7 +29,7 @@ def test_load_layout_reads_the_example() -> None:
     keypad, slider, _, tuner, patch = layout.regions
     shape = keypad.shape
     assert isinstance(shape, Rectangle)
-    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.23, 0.12, 0.04, 0.03))
+    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.23, 0.14, 0.04, 0.03))
     assert (keypad.on_press, keypad.on_release, keypad.has_level) == ("click", "soft", False)
     assert (patch.has_level, patch.level_db_sl) == (True, None)
     assert (slider.priority, slider.band) == (1, (100.0, 400.0))
@@ -37,7 +37,7 @@ def test_load_layout_reads_the_example() -> None:
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None
-    found = layout.region_at(0.205, 0.045)
+    found = layout.region_at(0.265, 0.025)
     assert found is not None
     assert found.name == "knob"
     assert layout.region_at(0.30, 0.01) is None

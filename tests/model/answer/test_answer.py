@@ -203,7 +203,7 @@ def test_two_fingers_that_share_and_no_other_are_served():
 
 def test_what_is_not_felt_is_null_in_json():
     """A higher priority takes the whole stroke: JSON has no infinity."""
-    own = [{"at": NEAR, "level_db_sl": 80.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
+    own = [{"at": NEAR, "level_db_sl": 60.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
     found = query_one(smooth_table(), {"own": own})
     assert found["fingers"][1]["verdict"] == "held back"
     json.dumps(found, allow_nan=False)
@@ -239,13 +239,13 @@ def test_levels_share_the_stroke_by_one_factor_and_by_priority():
 def test_a_louder_content_does_not_starve_a_softer_one():
     """It is lowered first: the softer keeps its level, at least as long as it is the softer."""
     table, soft = smooth_table(), 12.0
-    requests = [wants(NEAR, level_db_sl=70), wants(FAR, level_db_sl=soft)]
+    requests = [wants(NEAR, level_db_sl=60), wants(FAR, level_db_sl=soft)]
     found = answer(table, requests, min_contrast_db=-99)
     loud = found.fingers[0].promised_level_db_sl
-    assert soft < loud < 70 - 0.5
+    assert soft < loud < 60 - 0.5
     assert [f"{loud:.1f} dB SL" in each for each in found.applied] == [True]
     assert found.fingers[1].promised_level_db_sl == pytest.approx(soft, abs=1e-3)
-    assert found.stroke_factor == pytest.approx(10 ** ((loud - 70) / 20), rel=1e-3)
+    assert found.stroke_factor == pytest.approx(10 ** ((loud - 60) / 20), rel=1e-3)
     full = [
         sum(each.excitation[era.name].amplitude for each in found.layers) / era.stroke
         for era in table.eras
@@ -296,7 +296,7 @@ TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(
         (lambda n: {}, 9),
         (lambda n: {"name": "abcde"[n % 5], "priority": n % 3}, 9),
         (lambda n: {"max_foreign_db_sl": -50.0, "is_protected": n % 2 == 0}, 9),
-        (lambda n: {"level_db_sl": 90.0, "min_contrast_db": 12.0}, 9),
+        (lambda n: {"level_db_sl": 60.0, "min_contrast_db": 12.0}, 9),
         (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 9),
     ],
 )
@@ -320,7 +320,7 @@ def test_twenty_fingers_take_little_memory(without_kernels):
     table = smooth_table()
     prepare_answers(table, with_ringing=False)
     tracemalloc.start()
-    answer(table, [wants(at, name="a", level_db_sl=90.0) for at in TWENTY])
+    answer(table, [wants(at, name="a", level_db_sl=60.0) for at in TWENTY])
     assert tracemalloc.get_traced_memory()[1] < 50e6
     tracemalloc.stop()
 

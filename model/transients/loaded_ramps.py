@@ -26,7 +26,7 @@ from model.transients.time_response import PlateInTime
 _STEP = 0.001  # s; between the times of a response, which is demodulated
 _MAX_TIMES = 48
 _DAMPING = 5.0  # of sigma by the period; what is left after it comes back as exp(-5)
-_PERIODS = 2.0  # period of the transform, in durations
+_PERIODS = 1.2  # period of the transform, in durations
 _LINES = 8.0  # the band of the transform to each side, by the reciprocal of the ramp
 _MIN_BAND = 200.0  # Hz
 

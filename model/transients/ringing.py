@@ -16,7 +16,7 @@ from model.transients.time_response import PlateInTime
 RINGING_TIMES = 6
 """Times at which a short effect is evaluated; those of the ringing after it are as close."""
 
-MIN_RINGING_TIME = 0.02  # s
+MIN_RINGING_TIME = 0.06  # s
 
 BATCH = 32  # frequencies solved together: some ten megabytes
 

@@ -167,22 +167,18 @@ class Chooser:
         requested: ChoiceRequest,
         targets: Targets,
         capabilities: PlaybackCapabilities,
-        beside: Sequence[Selection] | None = None,
+        beside: Sequence[Selection] = (),
     ) -> Selection:
         """Choose for targets within what is left; any failure is their reason for silence.
 
-        beside: what a pulse is felt beside; None for what lasts.
+        beside: what a pulse is felt beside.
         """
         table, intended, before = self.table, requested.intended, requested.before
-        avoided, raised = list[float](), targets
-        if beside is not None:
-            raised = tuple(
-                [(contact, _over(target, contact, beside)) for contact, target in targets]
-            )
-            for content in _contents(beside):
-                avoided += {tone.frequency for tone in content.layer.excitation.values()}
+        raised = tuple([(contact, _over(target, contact, beside)) for contact, target in targets])
+        excitations = [content.layer.excitation.values() for content in _contents(beside)]
+        avoided = [*{tone.frequency for tones in excitations for tone in tones}]
         quiet, protected = intended.quiet_beside(targets), intended.protected
-        is_long = requested.takes_long and beside is None
+        is_long = requested.takes_long and not targets[0][1].is_short
         try:
             answer = answered(
                 table,

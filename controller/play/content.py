@@ -74,10 +74,8 @@ class Prediction:
         if level is None:
             return found
         own = [level + above for above in self.by_set]
-        if contrast is None or self.foreign_level_db_sl is None:  # it is to its own at quiet ones
-            least, background = math.inf if contrast is None else contrast, total
-        else:
-            least = math.inf
+        least, background = math.inf if contrast is None else contrast, total
+        if contrast is not None and self.foreign_level_db_sl is not None:  # else to quiet fingers
             background = sums_db([[each - contrast for each in own], others])
         contrasts = [one - each for one, each in zip(own, background, strict=True)]
         return replace(found, promised_contrast_db=min(least, *contrasts)).judged()

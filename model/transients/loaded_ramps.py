@@ -25,8 +25,7 @@ from model.transients.time_response import PlateInTime
 
 _STEP = 0.001  # s; between the times of a response, which is demodulated
 _MAX_TIMES = 48
-_DAMPING = 5.0  # of sigma by the period; what is left after it comes back as exp(-5)
-_PERIODS = 2.0  # period of the transform, in durations
+_DAMPING = 5.0  # of sigma by the time that is followed; what comes after it returns as exp(-5)
 _LINES = 8.0  # the band of the transform to each side, by the reciprocal of the ramp
 _MIN_BAND = 200.0  # Hz
 
@@ -49,7 +48,8 @@ class _TransformLine:
         The last is the steady one, of both.
         """
         steady = accelerations[:, -1:]
-        transient = (accelerations[:, :-1] - steady) * self.transform[:, None]
+        transient = accelerations[:, :-1] - steady
+        transient = (transient * self.transform[:, None]).astype(self.inverse.dtype)
         d, m, p = transient.shape
         found = (self.inverse @ transient.swapaxes(0, 1).reshape(m, d * p)).reshape(-1, d, p)
         lasting = self.envelope[:, None] * steady
@@ -163,7 +163,7 @@ def _line(
     spacing = duration / within
     count = within + math.ceil((after or 0.0) / spacing)
     times = np.asarray(spacing * (np.arange(count) + 0.5), dtype=float)
-    period = _PERIODS * count * spacing
+    period = count * spacing
     half = math.ceil(period * max(lines / ramp, _MIN_BAND))
     step = 2 * math.pi / period
     p = _DAMPING / period + 1j * step * (np.arange(2 * half) - half + 0.5)
@@ -176,5 +176,5 @@ def _line(
         drive -= rise(np.asarray(times - duration), ramp)
     inverse = np.exp(np.outer(times, p)) * (step / (2 * math.pi))
     return _TransformLine(
-        p.astype(complex), transform.astype(complex), inverse.astype(complex), drive
+        p.astype(complex), transform.astype(complex), inverse.astype(np.complex64), drive
     )

@@ -16,7 +16,7 @@ from model.transients.time_response import PlateInTime
 RINGING_TIMES = 6
 """Times at which a short effect is evaluated; those of the ringing after it are as close."""
 
-MIN_RINGING_TIME = 0.02  # s
+_MIN_RINGING_TIME = 0.02  # s; after a short effect, of what weights are first searched by
 
 BATCH = 32  # frequencies solved together: some ten megabytes
 
@@ -33,17 +33,15 @@ class RampedRinging:
     parts: Float32Array
 
 
-def ringing_time(duration: float) -> float:
-    """Time [s] after a short effect over which what quiet fingers feel is followed."""
-    return max(duration / 2, MIN_RINGING_TIME)
-
-
 def ramped_ringing(
     plate: PlateInTime, frequencies: FloatArray, *, ramp: float, duration: float
 ) -> RampedRinging:
     """Solve ringing at each of the frequencies (f,) [Hz]; ramp, duration [s]."""
     spacing = duration / RINGING_TIMES
-    n, end = RINGING_TIMES + math.ceil(ringing_time(duration) / spacing), RINGING_TIMES
+    n, end = (
+        RINGING_TIMES + math.ceil(max(duration / 2, _MIN_RINGING_TIME) / spacing),
+        RINGING_TIMES,
+    )
     times = spacing * (np.arange(n) + 0.5)
     every = np.append(times, times[end:] - duration)
     risen = rise(every, ramp)

@@ -2,7 +2,7 @@
 
 An answer to a place is best as it is asked, and the finger is elsewhere when it plays. One that
 moves is answered for the next 8 mm of its way, at three places at once, its own content and as
-quiet for all others: from where it is once the weights have changed, to where the next answer is.
+quiet for all others: from where it is once the weights have half changed, to where they do again.
 Weights that change have side bands, which a steady promise does not count: a margin does.
 """
 
@@ -46,7 +46,7 @@ def with_ways(
         vx, vy = contact.motion.velocity(now)
         if not (speed := math.hypot(vx, vy)):
             continue
-        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP
+        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
         way = [
             _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
             for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)

@@ -35,11 +35,11 @@ def fingers(contacts: Sequence[Contact]) -> list[Finger]:
 
 
 def test_a_moving_finger_is_answered_for_the_next_8_mm() -> None:
-    """At 0.2 m/s 20 ms pass until it plays and 40 until weights have changed: 12, 16, 20 mm on."""
+    """At 0.2 m/s 20 ms pass until it plays and 20 until weights have half changed: 8, 12, 16 mm on."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, table().plate)
     assert [each.at[0] - MOVER[0] for each in (first, middle, last)] == pytest.approx(
-        [0.012, 0.016, 0.020]
+        [0.008, 0.012, 0.016]
     )
     assert math.dist(first.at, last.at) == pytest.approx(STRETCH)
     assert other == fingers(contacts)[1]
@@ -94,7 +94,7 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
     found = answered(table(), targets, (), playable(), before={}, now=NOW)
     moving, _ = selection_of(table(), found, targets, (), before={}).predictions
     least = []
-    for way in [*(0.012 + 0.001 * step for step in range(9)), -0.018]:
+    for way in [*(0.008 + 0.001 * step for step in range(9)), -0.022]:
         at = (MOVER[0] + way, MOVER[1])
         own, foreign = (
             max(

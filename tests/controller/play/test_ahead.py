@@ -1,8 +1,10 @@
 """What moving fingers are answered for, and what is promised of it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,6 +110,36 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
         least.append(20 * math.log10(own / foreign))
     assert min(least[:-1]) >= (moving.promised_contrast_db or 0.0)
     assert least[-1] < min(least[:-1])
+
+
+@pytest.mark.parametrize(
+    ("at", "other", "is_retuned"),
+    [
+        ((0.215, 0.047), (0.162, 0.186), True),  # 16.6 in place of 7.1 dB
+        ((0.037, 0.056), (0.077, 0.182), False),  # 0.7 dB more
+        ((0.075, 0.142), (0.204, 0.075), False),  # 8.4 dB, but 10 Hz from what the other feels
+    ],
+)
+def test_frequencies_are_those_for_the_place_50_mm_on(
+    at: tuple[float, float], other: tuple[float, float], is_retuned: bool
+) -> None:
+    """As of fingers that rest there, where they promise 4 dB more and keep 30 Hz; else as felt."""
+
+    def frequencies(mover: Contact, **given: Any) -> tuple[list[float | None], Mapping[Any, Any]]:
+        targets = [
+            (each, Target(each.key, 14.0, content=str(each.key.id)))
+            for each in (mover, contact(2, other))
+        ]
+        found = answered(table(), targets, (), playable(), **given)
+        played = selection_of(table(), found, targets, (), before={}).contents
+        return [each.frequency for each in played], {each.key: each for each in played}
+
+    felt, before = frequencies(contact(1, at), before={})
+    there, _ = frequencies(contact(1, (at[0] + 0.05, at[1])), before={})
+    moving = partial(frequencies, contact(1, at, vx=0.2), before=before, now=NOW)
+    assert moving()[0] == felt
+    assert moving(retunes=True)[0] == (there if is_retuned else felt)
+    assert there != felt
 
 
 def test_a_finger_that_rests_is_answered_where_it_is() -> None:

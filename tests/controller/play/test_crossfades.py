@@ -174,27 +174,6 @@ async def test_a_finger_that_moves_again_within_a_second_is_not_led_again() -> N
 
 
 @in_virtual_time
-async def test_a_finger_on_its_way_changes_frequencies_once_a_second_at_most() -> None:
-    """To and fro, 8 cm each way at 0.2 m/s: it does change, and never sooner than after 1 s."""
-    x, y = 0.2, 0.047
-    async with fingers_on(table(), WHOLE, at={1: (0.162, 0.186), 2: (x, y)}, held=1.5) as fingers:
-        count = len(fingers.applied)
-
-        def way(since: float) -> None:
-            fingers.at[2] = (x - 0.08 + abs(0.08 - 0.2 * since % 0.16), y)
-
-        await fingers.hold(4.0, way)
-        moving = fingers.applied[count - 1 :]
-        changes = [
-            after.time
-            for before, after in pairwise(moving)
-            if frequencies(before) != frequencies(after)
-        ]
-        assert len(changes) >= 2
-        assert all(after - before >= 0.98 for before, after in pairwise(changes))
-
-
-@in_virtual_time
 async def test_after_a_leave_weights_are_led_within_their_layers() -> None:
     """Of three fingers one leaves: the others keep frequency, phase and layer, along 300 ms."""
     places = {1: (0.206, 0.015), 2: (0.151, 0.098), 3: (0.07, 0.077)}

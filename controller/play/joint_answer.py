@@ -37,8 +37,9 @@ from model.vibration.excitation import Excitation, base_amplitudes
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
 
-WORTH_ON_THE_WAY = 4.0
-"""How much more [dB] the worst finger must be promised for other frequencies while any moves."""
+WORTH_ON_THE_WAY, ENOUGH_ON_THE_WAY = 4.0, 20.0
+"""How much more [dB] other frequencies must promise the worst finger while any moves, and the
+promise from which on none are given: a change is felt."""
 
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2
@@ -297,7 +298,9 @@ def _better_on_the_way(
     new = {each: layer.frequency or 0.0 for layer in found.layers for each in layer.fingers}
     gaps = [abs(new[one] - felt[other]) for one in new for other in felt if one != other]
     is_apart = new.keys() == felt.keys() and min(gaps, default=0.0) >= APART_HZ
-    return new if is_apart and worst_of(found) >= worst_of(kept) + WORTH_ON_THE_WAY else felt
+    least = worst_of(kept)
+    is_better = least < ENOUGH_ON_THE_WAY and worst_of(found) >= least + WORTH_ON_THE_WAY
+    return new if is_apart and is_better else felt
 
 
 def _lowered_db(found: Answer) -> float:

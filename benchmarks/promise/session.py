@@ -335,7 +335,7 @@ def _beside_step(
     """Foreign level of the strongest 40 ms of a cross-fade where others feel the same, each above
     what is promised before and after."""
     before, promised = _promises(then), _promises(now)
-    kept = {each.content for each in then.contents.values()}
+    kept = [each.content for each in then.contents.values()]
     led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
     return [
         float(heard[id].foreign_db_sl(span, strongest=True).max())

@@ -30,7 +30,7 @@ TUNED_AHEAD = 0.050
 """Way [m] to the place by which frequencies are chosen for a moving finger."""
 
 MARGIN_DB = 2.0
-"""By how much less is promised of a moving finger than of one that rests on its way."""
+"""By how much less is promised while a finger moves, to it and beside it, than if it rested."""
 
 _ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
 
@@ -85,19 +85,20 @@ def farther_on(
 
 
 def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
-    """Return what the first fingers of an answer get on their ways, the rest being these."""
-    places = [[found.fingers[each] for each in way] for way in _ways(found, count)]
-    return [_on_way(each) if len(each) > 1 else each[0] for each in places]
+    """Return what the first fingers of an answer get on their ways, the rest being these.
+
+    Of weights that change for a way those who rest feel side bands, too.
+    """
+    if len(found.fingers) == count:
+        return [*found.fingers]
+    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
 
 
 def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
     """Return what they feel of others there at most, by set of thresholds [dB SL]."""
     heard = np.nan_to_num(found.tones.foreign_db_sl, nan=-math.inf, neginf=-math.inf)
-    levels = []
-    for way in _ways(found, count):
-        margin = MARGIN_DB if len(way) > 1 else 0.0
-        levels.append((heard[way].max(axis=0) + margin).tolist())
-    return levels
+    margin = MARGIN_DB if len(heard) > count else 0.0
+    return [(heard[way].max(axis=0) + margin).tolist() for way in _ways(found, count)]
 
 
 def _ways(found: Answer, count: int) -> list[list[int]]:

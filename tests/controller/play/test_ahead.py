@@ -78,7 +78,7 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
 
 
 def test_what_is_promised_is_the_least_on_the_way_and_2_db_less() -> None:
-    """Of three places that are answered as fingers of their own; who rests is promised as ever."""
+    """Of three places that are answered as fingers of their own; beside it 2 dB less as well."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     targets = [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
     found = answered(table(), targets, (), playable(), before={}, now=NOW)
@@ -88,9 +88,10 @@ def test_what_is_promised_is_the_least_on_the_way_and_2_db_less() -> None:
     moving, resting = selection_of(table(), found, targets, (), before={}).predictions
     assert moving.promised_contrast_db == pytest.approx(min(promised) - MARGIN_DB)
     assert moving.level_db_sl == pytest.approx(min(levels))
-    assert resting.promised_contrast_db == other.promised_contrast_db
+    assert resting.promised_contrast_db == pytest.approx((other.promised_contrast_db or 0) - 2.0)
+    assert resting.foreign_level_db_sl == pytest.approx((other.foreign_level_db_sl or 0) + 2.0)
     assert len(found.layers) == 2
-    assert felt_on_ways(found, 2)[1] == other
+    assert felt_on_ways(found, 4) == [*found.fingers]
 
 
 def test_a_promise_for_a_way_holds_at_places_between() -> None:

@@ -37,7 +37,7 @@ from model.vibration.excitation import Excitation, base_amplitudes
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
 
-WORTH_ON_THE_WAY, ENOUGH_ON_THE_WAY = 4.0, 20.0
+WORTH_ON_THE_WAY, ENOUGH_ON_THE_WAY = 6.0, 20.0
 """How much more [dB] other frequencies must promise the worst finger while any moves, and the
 promise from which on none are given: a change is felt."""
 
@@ -70,7 +70,7 @@ def answered(
     """Answer the fingers of targets and of quiet contacts, those that move on their ways.
 
     before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
-    fingers, or more strongly, or retunes and they promise 4 dB more where who moves comes to;
+    fingers, or more strongly, or retunes and they promise 6 dB more where who moves comes to;
     now [s]: infinite where all rest; avoided_hz: frequencies that play beside it. Raises
     InputError for fingers that are too close.
     """

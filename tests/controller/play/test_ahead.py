@@ -131,7 +131,7 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
 def test_frequencies_are_those_for_the_place_50_mm_on(
     at: tuple[float, float], other: tuple[float, float], is_retuned: bool
 ) -> None:
-    """As of fingers that rest there, where they promise 4 dB more and keep 30 Hz; else as felt."""
+    """As of fingers that rest there, where they promise 6 dB more and keep 30 Hz; else as felt."""
 
     def frequencies(mover: Contact, **given: Any) -> tuple[list[float | None], Mapping[Any, Any]]:
         targets = [

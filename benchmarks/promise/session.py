@@ -376,6 +376,8 @@ def _note(
             found.events[kind].append(contrast - promised)
         if id != last and id in event.before.served:
             steady = [each[id].foreign_level_db_sl for each in (before, after)]
-            levels = [onset, max((each for each in steady if each is not None), default=-math.inf)]
+            promised = max((each for each in steady if each is not None), default=-math.inf)
+            found.events[f"{event.name}, above promise"].append(foreign - promised)
+            levels = [onset, promised]
             expected = 10 * math.log10(sum(10 ** (each / 10) for each in levels) + 1e-12)
             found.events[event.name].append(foreign - expected)

@@ -339,7 +339,7 @@ def _beside_step(
     led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
     return [
         float(heard[id].foreign_db_sl(span, strongest=True).max())
-        - max(each[id].foreign_level_db_sl or -math.inf for each in (before, promised))
+        - _most(id, before, promised)
         for id in promised
         if id not in led
     ]
@@ -347,6 +347,12 @@ def _beside_step(
 
 def _promises(report: PlayReport) -> dict[int, Prediction]:
     return {each.contact.key.id: each for each in report.targets}
+
+
+def _most(id: int, *promises: Mapping[int, Prediction]) -> float:
+    """The foreign level at a finger by the one of several promises that says most."""
+    levels = [each[id].foreign_level_db_sl for each in promises]
+    return max([each for each in levels if each is not None], default=-math.inf)
 
 
 def _note(
@@ -375,9 +381,7 @@ def _note(
             kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"
             found.events[kind].append(contrast - promised)
         if id != last and id in event.before.served:
-            steady = [each[id].foreign_level_db_sl for each in (before, after)]
-            promised = max((each for each in steady if each is not None), default=-math.inf)
-            found.events[f"{event.name}, above promise"].append(foreign - promised)
-            levels = [onset, promised]
+            levels = [onset, _most(id, before, after)]
+            found.events[f"{event.name}, above promise"].append(foreign - levels[1])
             expected = 10 * math.log10(sum(10 ** (each / 10) for each in levels) + 1e-12)
             found.events[event.name].append(foreign - expected)

@@ -44,7 +44,7 @@ def fingers(contacts: Sequence[Contact]) -> list[Finger]:
 
 
 def test_a_moving_finger_is_answered_for_the_next_8_mm() -> None:
-    """At 0.2 m/s 20 ms pass until it plays and 20 until weights have half changed: 8, 12, 16 mm on."""
+    """At 0.2 m/s 20 ms until it plays and 20 until weights have half changed: 8, 12, 16 mm on."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, table().plate)
     assert [each.at[0] - MOVER[0] for each in (first, middle, last)] == pytest.approx(

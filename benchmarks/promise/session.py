@@ -338,8 +338,7 @@ def _beside_step(
     kept = [each.content for each in then.contents.values()]
     led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
     return [
-        float(heard[id].foreign_db_sl(span, strongest=True).max())
-        - _most(id, before, promised)
+        float(heard[id].foreign_db_sl(span, strongest=True).max()) - _most(id, before, promised)
         for id in promised
         if id not in led
     ]

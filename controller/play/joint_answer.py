@@ -86,7 +86,7 @@ def answered(
         limits=capabilities.limits,
         avoided_hz=avoided_hz,
     )
-    felt = _frequencies(targets, before) if keeps else {}
+    felt: Mapping[int, float] = _frequencies(targets, before) if keeps else {}
     if math.isfinite(now):
         contacts = [*[contact for contact, _ in targets], *quiet]
         far = farther_on(fingers, contacts, now, table.plate)

@@ -8,7 +8,7 @@ import asyncio
 import math
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
@@ -30,10 +30,11 @@ from benchmarks.promise.cases import (
     Point,
 )
 from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
-from benchmarks.promise.heard import Heard, Log
+from benchmarks.promise.heard import Heard, Log, Span
 from benchmarks.setting import random_contacts
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
+from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.observer import PlayReport
 from model.answer.timing import Timing
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -47,12 +48,14 @@ _chain: Any = import_module("chain").Chain
 _run_virtual: Any = import_module("virtual_loop").run_virtual
 
 SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
+EARLY = 0.020  # s; by which amplifiers may start before another: less than between two cross-fades
 SPEED, WAY = 0.2, 0.1  # m/s, m; of the finger that moves
 STEP, REPORTED = 0.0025, 4
 """Steps [s] of the finger that moves, and lifts: longer ones would be taps on the plate. The panel
 reports every fourth."""
 ANSWERS = "answers while moving, above their promise"
 """Of the contrast over the next 80 ms; its share of 0 dB and more is what is kept."""
+STEPS = "cross-fades, foreign above promise"
 LIFTING = np.arange(0.875, 0, -0.125)  # load of the finger, until the panel reports that it is off
 
 
@@ -85,7 +88,7 @@ class _Steady:
 
     @property
     def promised(self) -> Mapping[int, Prediction]:
-        return {each.contact.key.id: each for each in self.applied.targets}
+        return _promises(self.applied)
 
     @property
     def served(self) -> list[int]:
@@ -202,12 +205,12 @@ class _Session:
                 before = event.after
             self._note_owners(log, on)
             on.far.bench.advance(before.until)
-            return _measured(log, first, events, self._timing, self._case)
+            return _measured(log, first, events, self._timing, self._case, on.applied)
 
     def _note_owners(self, log: Log, on: Any) -> None:
         for applied in on.applied:
             owners = {n: owner_of(one) for n, one in applied.contents.items()}
-            log.own(owners, applied.time - FIRST)  # amplifiers start one after another
+            log.own(owners, applied.time - EARLY)
 
     async def _settled(self, on: Any) -> _Steady:
         await on.hold(SETTLING)
@@ -271,7 +274,12 @@ class _Session:
 
 
 def _measured(
-    log: Log, first: _Steady, events: list[_Event], timing: Timing, case: Case
+    log: Log,
+    first: _Steady,
+    events: list[_Event],
+    timing: Timing,
+    case: Case,
+    applied: Sequence[PlayReport],
 ) -> Outcome:
     """What was felt in a session, beside what was promised."""
     until, last = events[-1].after.until if events else first.until, case.contents - 1
@@ -299,6 +307,10 @@ def _measured(
         len(first.served) / (last + 1),
         start,
     )
+    for then, now in pairwise(applied):
+        span = now.time, now.time + FALL_AFTER + CROSSFADE
+        if now.settled_after == CROSSFADE and span[1] <= until:
+            found.events[STEPS] += _beside_step(then, now, heard, span)
     for event in events:
         found.fingers += pairs(event.after)
         if event.name == MOVES:
@@ -306,7 +318,7 @@ def _measured(
             resting = [mover.contrast_db(each.span) for each in (event.before, event.after)]
             found.events[MOVES].append(mover.contrast_db(*event.path) - float(np.mean(resting)))
             for each in event.answers:
-                promised = {one.contact.key.id: one for one in each.targets}[last]
+                promised = _promises(each)[last]
                 if promised.promised_contrast_db is not None:
                     until = each.time + NEXT
                     spans = [one for one in event.path if each.time <= one[0] < one[1] <= until]
@@ -315,6 +327,31 @@ def _measured(
         else:
             _note(event, found, heard, timing, case)
     return found
+
+
+def _beside_step(
+    then: PlayReport, now: PlayReport, heard: Mapping[int, Heard], span: Span
+) -> list[float]:
+    """Foreign level of the strongest 40 ms of a cross-fade where others feel the same, each above
+    what is promised before and after."""
+    before, promised = _promises(then), _promises(now)
+    kept = [each.content for each in then.contents.values()]
+    led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
+    return [
+        float(heard[id].foreign_db_sl(span, strongest=True).max()) - _most(id, before, promised)
+        for id in promised
+        if id not in led
+    ]
+
+
+def _promises(report: PlayReport) -> dict[int, Prediction]:
+    return {each.contact.key.id: each for each in report.targets}
+
+
+def _most(id: int, *promises: Mapping[int, Prediction]) -> float:
+    """The foreign level at a finger by the one of several promises that says most."""
+    levels = [each[id].foreign_level_db_sl for each in promises]
+    return max([each for each in levels if each is not None], default=-math.inf)
 
 
 def _note(
@@ -343,7 +380,7 @@ def _note(
             kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"
             found.events[kind].append(contrast - promised)
         if id != last and id in event.before.served:
-            steady = [each[id].foreign_level_db_sl for each in (before, after)]
-            levels = [onset, max((each for each in steady if each is not None), default=-math.inf)]
+            levels = [onset, _most(id, before, after)]
+            found.events[f"{event.name}, above promise"].append(foreign - levels[1])
             expected = 10 * math.log10(sum(10 ** (each / 10) for each in levels) + 1e-12)
             found.events[event.name].append(foreign - expected)

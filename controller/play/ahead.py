@@ -2,7 +2,7 @@
 
 An answer to a place is best as it is asked, and the finger is elsewhere when it plays. One that
 moves is answered for the next 8 mm of its way, at three places at once, its own content and as
-quiet for all others: from where it is once the weights have changed, to where the next answer is.
+quiet for all others: from where it is once the weights have half changed, to where they do again.
 Weights that change have side bands, which a steady promise does not count: a margin does.
 """
 
@@ -26,8 +26,11 @@ from model.structure.plate import Plate
 STRETCH = 0.008
 """Way [m] that a moving finger is answered for: until it has gone that far it is not asked anew."""
 
+TUNED_AHEAD = 0.050
+"""Way [m] to the place by which frequencies are chosen for a moving finger."""
+
 MARGIN_DB = 2.0
-"""By how much less is promised of a moving finger than of one that rests on its way."""
+"""By how much less is promised while a finger moves, to it and beside it, than if it rested."""
 
 _ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
 
@@ -46,7 +49,7 @@ def with_ways(
         vx, vy = contact.motion.velocity(now)
         if not (speed := math.hypot(vx, vy)):
             continue
-        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP
+        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
         way = [
             _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
             for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)
@@ -65,20 +68,37 @@ def with_ways(
     return [*found, *ends]
 
 
+def farther_on(
+    fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
+) -> list[Finger]:
+    """Return fingers of contacts at a time [s], those that move where they come to 50 mm on."""
+    found = [*fingers]
+    for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
+        vx, vy = contact.motion.velocity(now)
+        if speed := math.hypot(vx, vy):
+            far = TUNED_AHEAD / speed
+            at = _on_plate((contact.x + vx * far, contact.y + vy * far), plate)
+            others = [each.at for each in found if each is not finger]
+            if all(math.dist(at, each) >= FINGERTIP_RADIUS for each in others):
+                found[number] = replace(finger, at=at)
+    return found
+
+
 def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
-    """Return what the first fingers of an answer get on their ways, the rest being these."""
-    places = [[found.fingers[each] for each in way] for way in _ways(found, count)]
-    return [_on_way(each) if len(each) > 1 else each[0] for each in places]
+    """Return what the first fingers of an answer get on their ways, the rest being these.
+
+    Of weights that change for a way those who rest feel side bands, too.
+    """
+    if len(found.fingers) == count:
+        return [*found.fingers]
+    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
 
 
 def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
     """Return what they feel of others there at most, by set of thresholds [dB SL]."""
     heard = np.nan_to_num(found.tones.foreign_db_sl, nan=-math.inf, neginf=-math.inf)
-    levels = []
-    for way in _ways(found, count):
-        margin = MARGIN_DB if len(way) > 1 else 0.0
-        levels.append((heard[way].max(axis=0) + margin).tolist())
-    return levels
+    margin = MARGIN_DB if len(heard) > count else 0.0
+    return [(heard[way].max(axis=0) + margin).tolist() for way in _ways(found, count)]
 
 
 def _ways(found: Answer, count: int) -> list[list[int]]:

@@ -86,19 +86,12 @@ class JointSets:
         """
         lines = {self._members.amplifiers[name].line for name in layers}
         self._members.has_joint_set = len(lines) > 1
-        try:
-            return await self._play(layers, is_preempted)
-        finally:
-            self._members.has_joint_set = False
-
-    async def _play(
-        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
-    ) -> Played | DriverError:
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
         is_silent = all(map(is_silence, layers.values()))
+        priority = Priority.SILENCE if is_silent else Priority.SET
         is_now = is_silent or len(layers) == 1
         began = clock.now()
         amplifiers: list[Amplifier] = []
@@ -106,8 +99,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                requested = layers[each.name]
-                staging.append(each.stage(token, requested, now=is_now, is_preempted=is_preempted))
+                stage = partial(each.stage, token, layers[each.name], now=is_now)
+                staging.append(stage(priority=priority, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -221,7 +214,7 @@ class JointSets:
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines at once, or for a time [s]."""
     while clock.now() < until:
-        busy = [line.awaited for line in lines if line.awaited is not None]
+        busy = [line.current.result for line in lines if line.current is not None]
         if not busy:
             break
         await asyncio.wait(busy)

@@ -64,8 +64,12 @@ class Members:
     @property
     def lost_from(self) -> float:
         """When [s] the next beat stops all, since one that does not reply must be silent."""
-        mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
-        return min([each.feeding.lost_from for each in mute], default=math.inf)
+        ends = [
+            each.feeding.lost_from
+            for each in self.amplifiers.values()
+            if each.silence_cause is not None
+        ]
+        return min(ends, default=math.inf)
 
     @property
     def last_sent_at(self) -> float:

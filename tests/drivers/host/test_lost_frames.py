@@ -99,7 +99,7 @@ LONG = [pytest.param(*each[:2], 6700, marks=pytest.mark.long) for each in CASES]
 
 @pytest.mark.parametrize(("kind", "lines", "count"), [*CASES, *LONG])
 def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, count: int) -> None:
-    """One frame of ten either way, of sets of 1 to 8 parts; the long form has 20 000 on each wire."""
+    """One frame of ten either way, of sets of 1 to 8 parts; the long form: 20 000 on each wire."""
     rng = random.Random(count)
     assert run_virtual(_play(kind, lines, rng, count), rng=rng) == []
 

@@ -238,7 +238,8 @@ class Line:
                     job.takes = member.next_request(job.name, job.values, job.priority)
                 if self.seen is not None:
                     self.seen("out", address, job.name, job.values)
-                data = self.wire.request(address, job.name, job.values)
+                has_reply = member is not None and job.part >= len(job.parts) - 1
+                data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
             now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
             if not rest:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 
 from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
@@ -59,9 +60,8 @@ class JointSets:
     @property
     def is_in_doubt(self) -> bool:
         """Whether it is unknown if the last set plays, on all amplifiers: it is silenced first."""
-        return self.is_incomplete or any(
-            each.is_in_doubt for each in self._members.amplifiers.values()
-        )
+        every = self._members.amplifiers.values()
+        return self.is_incomplete or any(map(attrgetter("is_in_doubt"), every))
 
     def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.

@@ -298,7 +298,7 @@ class Line:
         """Go on with the next part of a set, unless a request that waits comes before it."""
         self.current = None
         job.attempts += 1  # this part has not been awaited in vain
-        job.go_to(job.part + 1)
+        job.part, job.values = job.part + 1, job.parts[job.part + 1]
         if self.wire.confirms_parts:
             job.reach(job.part)
         if self._queue.jobs and self._queue.has_before(job, self.time()):
@@ -431,11 +431,10 @@ class Line:
         if job.attempts > 0 or (is_first and self.time() < self._boots_until):
             self._repeat(job, member)
             return
-        self._give_up(job, member)
+        self._give_up(job, member, boot_time=self._boot_time if is_first else 0.0)
 
-    def _give_up(self, job: Job, member: Member) -> None:
+    def _give_up(self, job: Job, member: Member, *, boot_time: float = 0.0) -> None:
         """End a request that has had no reply, or whose parts do not arrive."""
-        is_first = job.name == "Hello" and self._boots_until > -math.inf
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
         member.silence_cause = no_reply(
             self.name,
@@ -443,7 +442,7 @@ class Line:
             job.timeout,
             remark,
             before=member.counts.last_round_trip or 0.0,
-            boot_time=self._boot_time if is_first else 0.0,
+            boot_time=boot_time,
         )
         self._fail(job, LinkTimeout(member.silence_cause))
 

@@ -7,7 +7,7 @@ import asyncio
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
@@ -46,11 +46,10 @@ class Members:
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        names = []
-        for name, each in self.amplifiers.items():
-            if each.silence_cause is not None and not is_lost(each):
-                names.append(name)
-        return tuple(names)
+        every = self.amplifiers.items()
+        return tuple(
+            [name for name, each in every if each.silence_cause is not None and not is_lost(each)]
+        )
 
     @property
     def lost_by(self) -> Mapping[str, str]:
@@ -92,20 +91,14 @@ class Members:
         """Await all requests to their ends, then raise the most severe error."""
         return self.checked(await outcomes(requests))
 
-    def checked(self, results: Sequence[_T | BaseException]) -> list[_T]:
+    def checked(self, results: list[_T | BaseException]) -> list[_T]:
         """Return results; raises the most severe error.
 
         A lost link is first; last are what others have preempted and, after it, a degraded link.
         """
-        values, errors = list[_T](), list[BaseException]()
-        for each in results:
-            if isinstance(each, BaseException):
-                errors.append(each)
-            else:
-                values.append(each)
-        if errors:
+        if errors := [each for each in results if isinstance(each, BaseException)]:
             raise min(errors, key=self._severity)
-        return values
+        return cast("list[_T]", results)
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
@@ -170,7 +163,7 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
     return task.result()
 
 
-async def outcomes(requests: Sequence[Awaitable[_T]]) -> Sequence[_T | BaseException]:
+async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
     """Await all requests to their ends; returns the result or the error of each."""
     if len(requests) > 1:
         return await asyncio.gather(*requests, return_exceptions=True)

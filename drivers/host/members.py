@@ -20,7 +20,8 @@ from registry import clock
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_need = attrgetter("feeding.since")
+_need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
+_silence_cause = attrgetter("silence_cause")
 
 
 class Members:
@@ -46,10 +47,8 @@ class Members:
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        every = self.amplifiers.items()
-        return tuple(
-            [name for name, each in every if each.silence_cause is not None and not is_lost(each)]
-        )
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return tuple([each.name for each in mute if not is_lost(each)])
 
     @property
     def lost_by(self) -> Mapping[str, str]:
@@ -63,12 +62,8 @@ class Members:
     @property
     def lost_from(self) -> float:
         """When [s] the next beat stops all, since one that does not reply must be silent."""
-        ends = [
-            each.feeding.lost_from
-            for each in self.amplifiers.values()
-            if each.silence_cause is not None
-        ]
-        return min(ends, default=math.inf)
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return min(map(_lost_from, mute), default=math.inf)
 
     @property
     def last_sent_at(self) -> float:

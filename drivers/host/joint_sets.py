@@ -3,7 +3,7 @@
 At one moment on all, or on none: by one broadcast on a line that they share, on several lines for a
 moment that is ahead for the slowest. On one amplifier it plays with its last part. A token is newer
 than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000 sets
-would take the next one for an older one. It commits one that changes nothing before.
+would take the next one for an older one. It commits an empty one before.
 """
 
 import asyncio
@@ -199,16 +199,15 @@ class JointSets:
                 await _check_plays(each, status, token)
 
     async def _close_gaps(self) -> None:
-        """Have amplifiers whose token is far behind commit a set that changes nothing."""
-        unchanged = []
-        for amplifier in self._members.amplifiers.values():
-            committed = amplifier.committed  # 0: any is newer
-            if committed > 0 and (self.token - committed) % _SPAN > _MAX_GAP:
-                unchanged += [(amplifier, layer) for layer in _unchanged(amplifier)]
-        if unchanged:
+        """Have amplifiers whose token is far behind commit an empty set, which changes nothing."""
+        behind = [
+            each
+            for each in self._members.amplifiers.values()
+            if each.committed > 0 and (self.token - each.committed) % _SPAN > _MAX_GAP
+        ]
+        if behind:  # not of those that have committed none: any is newer
             self.token = token_after(self.token)
-            sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
-            await self._members.all(sets)
+            await self._members.all([each.stage(self.token, (), now=True) for each in behind])
 
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
@@ -256,15 +255,3 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
-
-
-def _unchanged(amplifier: Amplifier) -> list[Layer]:
-    """Return a layer that is silent, or renewed without end; none if all end soon by themselves."""
-    playback = amplifier.ledger.playback
-    changing = {due[1] for due in playback.dues}  # end by themselves, or start what waits
-    for number in range(amplifier.capabilities["layers"]):
-        if number not in playback.tokens:
-            return [Layer(number)]
-        if number not in changing:
-            return [Layer(number, renew=True)]
-    return []

@@ -141,8 +141,8 @@ class Rounding:
                 )
             )
             numbers.append(number)
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
+        if len(set(numbers)) < len(numbers):
+            raise CommandRefused(f"a set must have each layer once, got {numbers}")
         return tuple(rounded)
 
     def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:

@@ -104,7 +104,7 @@ class Line:
         future, now = self._loop.create_future(), self.time()
         make, values = (values, Values()) if callable(values) else (None, values)
         job = Job(member, priority, name, values, timeout, now, future, make)
-        if trace.has_requests():
+        if trace.is_active():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
@@ -366,12 +366,9 @@ class Line:
             current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
         # Where replies come late one that is cut short would never end.
         elif is_reading and first <= Priority.SET and self.late <= GRACE:
-            current.due = min(current.due, max(self.time(), self._begins_by(current)))
+            begins_by = max(current.started_at + current.takes, self._free_at) + REACTION
+            current.due = min(current.due, max(self.time(), begins_by))  # none begins from then on
         self._look_by(current.due)
-
-    def _begins_by(self, job: Job) -> float:
-        """Return by when [s] the reply to the request on the line is due: none is from then on."""
-        return max(job.started_at + job.takes, self._free_at) + REACTION
 
     def _look_by(self, due: float) -> None:
         """Look at the request on the line at a time [s], or before."""

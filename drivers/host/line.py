@@ -66,7 +66,6 @@ class Line:
         """Called with each message: out, in, event or none; address, name, content. Must return."""
         self.ahead: Callable[[str, Priority], Make | None] | None = None
         """Called with each request to one amplifier: what to commit on all of the line ahead."""
-        self._commit_takes = wire.transit(MESSAGES["Commit"].request.words)
         self._queue = JobQueue()
         self.current: Job | None = None
         """The request on the line; None if it is free."""
@@ -84,6 +83,7 @@ class Line:
     def open(self, port: OpenPort) -> None:
         """Send by a port that is open."""
         self._port = port
+        self._commit_takes = self.wire.transit(MESSAGES["Commit"].request.words)
         self._boots_until = self.time() + self._boot_time
 
     def submit(

@@ -70,10 +70,12 @@ class JointSets:
         """
         if self.is_in_doubt:
             return None
-        refusals: dict[str, CommandRefused] = {}
-        for name, each in layers.items():
-            if (refusal := self._members.amplifiers[name].refusal_of(each)) is not None:
-                refusals[name] = refusal
+        amplifiers = self._members.amplifiers
+        refusals = {
+            name: refusal
+            for name, each in layers.items()
+            if (refusal := amplifiers[name].refusal_of(each)) is not None
+        }
         return _merged(refusals) if refusals else None
 
     async def play(
@@ -212,10 +214,9 @@ class JointSets:
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines at once, or for a time [s]."""
-    while clock.now() < until:
-        busy = [line.current.result for line in lines if line.current is not None]
-        if not busy:
-            break
+    while clock.now() < until and (
+        busy := [line.current.result for line in lines if line.current is not None]
+    ):
         await asyncio.wait(busy)
 
 

@@ -225,8 +225,7 @@ class Dialogue:
         delay = max(COMMIT_DELAY, ATTEMPTS * takes)
         if (words := _words_of(layers)) > PART_WORDS:  # parts of all of the line, and those again
             delay += 2 * words / PART_WORDS * takes
-        ledger = self._ledger or self.ledger  # often: without a call
-        admitted = ledger.admit(layers, moment, delay=delay + longer)
+        admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")

@@ -43,8 +43,6 @@ class Direction(StrEnum):
 
 is_active = partial(_wire.isEnabledFor, logging.DEBUG)
 """Whether anything is traced; ask it where the bytes of a frame must be made first."""
-has_requests = partial(_request.isEnabledFor, logging.DEBUG)
-"""Whether requests are traced."""
 
 
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
@@ -59,8 +57,7 @@ def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], st
 
 def request(requested: object, outcome: object, duration: float) -> None:
     """Trace a request with its reply or error, and its duration [s]."""
-    if has_requests():
-        _request.debug("%s -> %r in %.1f ms", requested, outcome, duration * 1e3)
+    _request.debug("%s -> %r in %.1f ms", requested, outcome, duration * 1e3)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ class CountedClocks:
     def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
         self._rig, self._now = rig, now
         self._names = sorted(rig.channel_counts)
+        self._known: Mapping[str, float] = {}  # by the plan that is being made
         self.errors: dict[str, float] = {}
         """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
 
@@ -32,7 +33,7 @@ class CountedClocks:
         """The table with the clocks as they are counted now; takes no time."""
         if len(self._names) < 2:
             return table
-        known = self._now()
+        known = self._known or self._now()
         if self._is_other(known):
             before = self.errors
             self.errors = {name: MARGIN * known[name] for name in self._names}
@@ -43,7 +44,7 @@ class CountedClocks:
     @property
     def is_one_lost(self) -> bool:
         """Whether a clock is held no longer to those with which its amplifier shares contents."""
-        known = self._now() if self.errors else {}
+        self._known = known = self._now() if self.errors else {}
         for name, counted in self.errors.items():  # with each plan: no further calls
             if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
                 return True

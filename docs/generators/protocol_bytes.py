@@ -11,7 +11,7 @@ from functools import partial
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.clock import clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
-from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
+from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.protocol.table import MESSAGES, QUANTITIES
 from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
@@ -128,7 +128,8 @@ class _Exchange:
     def request(self, name: str, values: Values, address: int = 1) -> list[str]:
         """Send a request; return what went over the line, a line for each frame."""
         self._lines = []
-        self._send(self._wire.request(address, name, values))
+        has_reply = address > 0 and (name != "Set" or is_last(values))
+        self._send(self._wire.request(address, name, values, has_reply=has_reply))
         return self._lines
 
     def _send(self, data: bytes) -> None:

@@ -136,7 +136,7 @@ class Amplifier(Dialogue):
         elif can != self.capabilities:
             self._ledger.adopt(can)
         self.identity, self.capabilities = identity, can
-        self._times.clear()
+        self.exchange_time.cache_clear()
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
         self.clock.identified(can["clock_error"], bits=self.line.wire.transit(status_words))
         self._serial_number = identity["serial_number"]
@@ -241,7 +241,7 @@ class Amplifier(Dialogue):
         """
 
         def make() -> list[Values]:
-            is_playing = any(self.ledger.playback.all_voices)
+            is_playing = self._ledger is not None and any(self._ledger.playback.all_voices)
             rate = self.clock.rate(self._time(), is_playing=is_playing)
             return [{"session": self.session, "rate": rate}]
 

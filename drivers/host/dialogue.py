@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeAlias
 
 from drivers.counters import LinkStatistics
@@ -21,7 +22,7 @@ from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
 from drivers.host.jobs import Priority
-from drivers.host.ledger import Ledger, is_silence
+from drivers.host.ledger import Ledger
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
 from drivers.host.reports import (
@@ -123,12 +124,12 @@ class Dialogue:
         self.clock = HeldClock()
         """Its clock, which is held to that of the line."""
         self.counts = LinkStatistics()
+        self.exchange_time = cache(self._exchange_time)  # of the wire, and what was identified
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
         self.listeners: list[Callable[[Values], None]] = []
         self.silences = 0
         """Stops and disarms that were sent to it."""
-        self._times: dict[str, float] = {}  # of exchanges, by the name of the request
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
@@ -152,15 +153,12 @@ class Dialogue:
         """Whether a set was sent to it that it has not confirmed, so that it may play."""
         return self._ledger is not None and self._ledger.doubt is not None
 
-    def exchange_time(self, name: str) -> float:
+    def _exchange_time(self, name: str) -> float:
         """Return how long the longest request of a name and its reply take on the wire [s]."""
-        if name not in self._times:
-            can = self.capabilities
-            size = (can["channels"], can["layers"]) if can else WIDEST
-            event = _EVENT_WORDS if name in _CHANGING else 0
-            words = request_words(name), reply_words(name, *size) + event
-            self._times[name] = self.line.wire.exchange_time(*words)
-        return self._times[name]
+        can = self.capabilities
+        size = (can["channels"], can["layers"]) if can else WIDEST
+        event = _EVENT_WORDS if name in _CHANGING else 0
+        return self.line.wire.exchange_time(request_words(name), reply_words(name, *size) + event)
 
     async def stage(
         self,
@@ -168,25 +166,27 @@ class Dialogue:
         layers: Sequence[Layer],
         *,
         now: bool = False,
-        priority: Priority | None = None,
+        priority: Priority = Priority.SET,
         is_preempted: IsPreempted | None = None,
     ) -> Staged:
         """Stage a set under a token, or play it at once.
 
-        priority: None for that of a set, or of what silences. It is admitted by the ledger when
-        its turn on the line has come, unless it is preempted then. Raises CommandRefused with the
-        reason; Preempted where a stop came first; FrameError for two replies in a row with another
-        token.
+        It is admitted by the ledger when its turn on the line has come, unless it is preempted
+        then. Raises CommandRefused with the reason; Preempted where a stop came first; FrameError
+        for two replies in a row with another token.
         """
-        if priority is None:
-            priority = Priority.SILENCE if is_silence(layers) else Priority.SET
         staged: Staged
 
         def make() -> list[Values]:
             nonlocal staged
             if is_preempted is not None and is_preempted():
                 raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
-            staged, messages = self._admit(token, layers, now=now)
+            moment, (known, until, delay, checked) = self._time(), self._checked
+            if known is not layers or moment > until:
+                delay, checked = self._check(layers, moment)
+            (admitted, stream), self._checked = checked, _UNCHECKED
+            messages = parts(stream, session=self.session, token=token, now=now)
+            self._admitted = staged = Staged(token, admitted, True, until=moment + delay)
             return messages
 
         for _ in range(MAX_CONTRADICTIONS):
@@ -200,18 +200,6 @@ class Dialogue:
         if not (taken["played"] or (taken["staged"] and not now and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
-
-    def _admit(
-        self, token: int, layers: Sequence[Layer], *, now: bool
-    ) -> tuple[Staged, list[Values]]:
-        """Have the ledger admit a set; returns its messages, too. Raises CommandRefused."""
-        moment, (known, until, delay, checked) = self._time(), self._checked
-        if known is not layers or moment > until:
-            delay, checked = self._check(layers, moment)
-        (admitted, stream), self._checked = checked, _UNCHECKED
-        messages = parts(stream, session=self.session, token=token, now=now)
-        self._admitted = Staged(token, admitted, True, until=moment + delay)
-        return self._admitted, messages
 
     def refusal_of(self, layers: Sequence[Layer]) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would.
@@ -259,8 +247,7 @@ class Dialogue:
         another host, CommandRefused once a status has shown that it is not armed any more; of a set
         Preempted once it is not admitted any more, CommandRefused where it is too late.
         """
-        takes = self._times.get(name)
-        takes = self.exchange_time(name) if takes is None else takes
+        takes = self.exchange_time(name)
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, reply_words("Set"))

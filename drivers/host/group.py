@@ -227,7 +227,7 @@ class Group:
                 async with limit as self._limit:
                     done = await exchange()
             finally:
-                self._limit = None
+                self._limit, members.has_joint_set = None, False
         except Exception as error:
             self._note(error)
             has_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST

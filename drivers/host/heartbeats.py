@@ -20,7 +20,6 @@ from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
 from drivers.host.moments import word_passed_by_all
-from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
 from drivers.protocol.timing import HEARTBEAT
@@ -54,8 +53,11 @@ class Heartbeats:
     def beat(self) -> Awaitable[Sequence[object]]:
         """Feed every amplifier that replies, and read the status of any other meanwhile.
 
-        One that has committed nothing since it was armed is fed by a silent set on a line that it
+        One that has committed nothing since it was armed is fed by an empty set on a line that it
         shares, so that all have committed the same: the line feeds them together by that.
+        A status shows how a watchdog runs down only if it is read before any of its line are fed.
+        On a line that is slow or late of one alone, so that none waits for long; of none where one
+        may reply again, which is to be heard before.
         """
         by_line: dict[Line, list[Amplifier]] = {}
         mute: set[Line] = set()
@@ -69,44 +71,31 @@ class Heartbeats:
         self._clocks.look({line: by_line[line] for line in by_line if line not in mute})
         feeds: list[tuple[float, Feed]] = []
         for line, of_line in by_line.items():
-            feeds += self._feeds(line, of_line, may_read=line not in mute)
+            may_read, token = line not in mute, 0
+            is_late, is_shared, now = line.late > GRACE, len(line.members) > 1, line.time()
+            for each in of_line:
+                if each.silence_cause is not None:
+                    self._listen(each)
+                    continue
+                feed: Feed = each.ping
+                due = self._running_due.get(each, 0.0)
+                if is_shared and not each.committed:
+                    token = token or self._first_token(of_line)
+                    feed = partial(each.stage, token, (), now=True, priority=Priority.HEARTBEAT)
+                elif may_read and now >= due and each.feeding.tells(now):
+                    due = now + max(each.exchange_time("Set") / _MAX_STATUS_LOAD, _STATUS_INTERVAL)
+                    self._running_due[each] = due
+                    all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
+                    may_read = not is_late and all_of_line <= HEARTBEAT
+                    reading = each.read_status(Priority.HEARTBEAT)
+                    feed = partial(self._feed_after, each, self._members.epoch, reading)
+                elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
+                    pause = asyncio.sleep(self._clocks.later())
+                    feed = partial(self._feed_after, each, self._members.epoch, pause)
+                # A late line feeds all again ahead of each: after that the last one's status tells.
+                feeds.append((-due if is_late else 0.0, feed))
         feeds.sort(key=itemgetter(0))
         return self._members.all([feed() for _, feed in feeds])
-
-    def _feeds(
-        self, line: Line, of_line: Sequence[Amplifier], *, may_read: bool
-    ) -> list[tuple[float, Feed]]:
-        """Request the statuses of a line that are due; returns what feeds each, and in what order.
-
-        A status shows how a watchdog runs down only if it is read before any of its line are fed.
-        On a line that is slow or late of one alone, so that none waits for long; of none where one
-        may reply again, which is to be heard before.
-        """
-        is_late, is_shared, now = line.late > GRACE, len(line.members) > 1, line.time()
-        feeds: list[tuple[float, Feed]] = []
-        token = 0
-        for each in of_line:
-            if each.silence_cause is not None:
-                self._listen(each)
-                continue
-            feed: Feed = each.ping
-            due = self._running_due.get(each, 0.0)
-            if is_shared and not each.committed:
-                token = token or self._first_token(of_line)
-                feed = partial(each.stage, token, [Layer(0)], now=True, priority=Priority.HEARTBEAT)
-            elif may_read and now >= due and each.feeding.tells(now):
-                due = now + max(each.exchange_time("Set") / _MAX_STATUS_LOAD, _STATUS_INTERVAL)
-                self._running_due[each] = due
-                all_of_line = 2 * each.exchange_time("GetStatus") * len(line.members)
-                may_read = not is_late and all_of_line <= HEARTBEAT
-                reading = each.read_status(Priority.HEARTBEAT)
-                feed = partial(self._feed_after, each, self._members.epoch, reading)
-            elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
-                pause = asyncio.sleep(self._clocks.later())
-                feed = partial(self._feed_after, each, self._members.epoch, pause)
-            # A late line feeds all again ahead of each: after that the last one's status tells.
-            feeds.append((-due if is_late else 0.0, feed))
-        return feeds
 
     def _first_token(self, of_line: Sequence[Amplifier]) -> int:
         """Return the token that one of a line has committed, or else a new one."""

@@ -105,10 +105,6 @@ class Job:
         """Whether the message on the line is no last part, and so has no reply."""
         return self.part < len(self.parts) - 1
 
-    def go_to(self, part: int) -> None:
-        """Go on with a part of its set."""
-        self.part, self.values = part, self.parts[part]
-
     def reach(self, part: int) -> None:
         """Note that all before a part have arrived: one that is farther than ever begins anew."""
         if part > self.reached:
@@ -119,7 +115,7 @@ class Job:
         missing = taken["missing"]
         if taken["staged"] or taken["played"] or missing >= self.part:
             return False
-        self.go_to(missing)
+        self.part, self.values = missing, self.parts[missing]
         self.reach(missing)
         return True
 

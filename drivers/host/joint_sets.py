@@ -3,7 +3,7 @@
 At one moment on all, or on none: by one broadcast on a line that they share, on several lines for a
 moment that is ahead for the slowest. On one amplifier it plays with its last part. A token is newer
 than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000 sets
-would take the next one for an older one. It commits one that changes nothing before.
+would take the next one for an older one. It commits an empty one before.
 """
 
 import asyncio
@@ -11,6 +11,7 @@ import math
 from collections.abc import Awaitable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 
 from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
@@ -59,9 +60,8 @@ class JointSets:
     @property
     def is_in_doubt(self) -> bool:
         """Whether it is unknown if the last set plays, on all amplifiers: it is silenced first."""
-        return self.is_incomplete or any(
-            each.is_in_doubt for each in self._members.amplifiers.values()
-        )
+        every = self._members.amplifiers.values()
+        return self.is_incomplete or any(map(attrgetter("is_in_doubt"), every))
 
     def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
@@ -70,10 +70,12 @@ class JointSets:
         """
         if self.is_in_doubt:
             return None
-        refusals: dict[str, CommandRefused] = {}
-        for name, each in layers.items():
-            if (refusal := self._members.amplifiers[name].refusal_of(each)) is not None:
-                refusals[name] = refusal
+        amplifiers = self._members.amplifiers
+        refusals = {
+            name: refusal
+            for name, each in layers.items()
+            if (refusal := amplifiers[name].refusal_of(each)) is not None
+        }
         return _merged(refusals) if refusals else None
 
     async def play(
@@ -86,19 +88,12 @@ class JointSets:
         """
         lines = {self._members.amplifiers[name].line for name in layers}
         self._members.has_joint_set = len(lines) > 1
-        try:
-            return await self._play(layers, is_preempted)
-        finally:
-            self._members.has_joint_set = False
-
-    async def _play(
-        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None
-    ) -> Played | DriverError:
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
         is_silent = all(map(is_silence, layers.values()))
+        priority = Priority.SILENCE if is_silent else Priority.SET
         is_now = is_silent or len(layers) == 1
         began = clock.now()
         amplifiers: list[Amplifier] = []
@@ -106,8 +101,8 @@ class JointSets:
         for each in self._members.by_need:
             if each.name in layers:
                 amplifiers.append(each)
-                requested = layers[each.name]
-                staging.append(each.stage(token, requested, now=is_now, is_preempted=is_preempted))
+                stage = partial(each.stage, token, layers[each.name], now=is_now)
+                staging.append(stage(priority=priority, is_preempted=is_preempted))
         results = await outcomes(staging)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
@@ -206,24 +201,22 @@ class JointSets:
                 await _check_plays(each, status, token)
 
     async def _close_gaps(self) -> None:
-        """Have amplifiers whose token is far behind commit a set that changes nothing."""
-        unchanged = []
-        for amplifier in self._members.amplifiers.values():
-            committed = amplifier.committed  # 0: any is newer
-            if committed > 0 and (self.token - committed) % _SPAN > _MAX_GAP:
-                unchanged += [(amplifier, layer) for layer in _unchanged(amplifier)]
-        if unchanged:
+        """Have amplifiers whose token is far behind commit an empty set, which changes nothing."""
+        behind = [
+            each
+            for each in self._members.amplifiers.values()
+            if each.committed > 0 and (self.token - each.committed) % _SPAN > _MAX_GAP
+        ]
+        if behind:  # not of those that have committed none: any is newer
             self.token = token_after(self.token)
-            sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
-            await self._members.all(sets)
+            await self._members.all([each.stage(self.token, (), now=True) for each in behind])
 
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines at once, or for a time [s]."""
-    while clock.now() < until:
-        busy = [line.awaited for line in lines if line.awaited is not None]
-        if not busy:
-            break
+    while clock.now() < until and (
+        busy := [line.current.result for line in lines if line.current is not None]
+    ):
         await asyncio.wait(busy)
 
 
@@ -263,15 +256,3 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
-
-
-def _unchanged(amplifier: Amplifier) -> list[Layer]:
-    """Return a layer that is silent, or renewed without end; none if all end soon by themselves."""
-    playback = amplifier.ledger.playback
-    changing = {due[1] for due in playback.dues}  # end by themselves, or start what waits
-    for number in range(amplifier.capabilities["layers"]):
-        if number not in playback.tokens:
-            return [Layer(number)]
-        if number not in changing:
-            return [Layer(number, renew=True)]
-    return []

@@ -96,8 +96,19 @@ class Ledger:
             if self.doubt is not None:
                 token = self.doubt.token
                 raise CommandRefused(f"set {token} must be confirmed first; read the status")
-            requested = self._within_budget(requested, now, delay)  # an ending may come amid a ramp
-            self._check_sums(requested, now, delay)
+            fade = 0.0 if self._budget.is_unlimited else max(map(_fade, requested))
+            remaining = self._budget.remaining(now, fade=fade, delay=delay)
+            if remaining < math.inf:
+                left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
+                if left <= 0:
+                    raise CommandRefused("on-time or duty limit reached; pause the vibration")
+                requested = tuple(
+                    replace(one, valid_for=min(one.valid_for or left, left))
+                    if is_vibrating(one)
+                    else one
+                    for one in requested
+                )
+            self._check_sums(requested, now, delay)  # an ending may come amid a ramp
             return requested
         except CommandRefused:
             raise
@@ -320,22 +331,6 @@ class Ledger:
                 levels[channel] += largest
         is_within = max(levels) <= self.limits.level / full * TOLERANCE
         return is_within and math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE
-
-    def _within_budget(
-        self, layers: tuple[LayerSet, ...], now: float, delay: float
-    ) -> tuple[LayerSet, ...]:
-        """Shorten `valid_for` to the on-time and duty that are left."""
-        fade = 0.0 if self._budget.is_unlimited else max(map(_fade, layers))
-        remaining = self._budget.remaining(now, fade=fade, delay=delay)
-        if remaining == math.inf:
-            return layers
-        left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
-        if left <= 0:
-            raise CommandRefused("on-time or duty limit reached; pause the vibration")
-        return tuple(
-            replace(one, valid_for=min(one.valid_for or left, left)) if is_vibrating(one) else one
-            for one in layers
-        )
 
 
 def _fade(one: LayerSet) -> float:

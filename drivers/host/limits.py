@@ -115,36 +115,35 @@ class Rounding:
         rounded: list[LayerSet] = []
         numbers: list[int] = []
         for layer in layers:
-            rounded.append(self._layer(layer))
-            numbers.append(rounded[-1].layer)
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
-        return tuple(rounded)
-
-    def _layer(self, layer: Layer) -> LayerSet:
-        number, ramp, valid_for = index(layer.number), layer.ramp, layer.valid_for
-        if not 0 <= number < self._layers:
-            raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
-        if not 0 <= ramp <= self._ramp_max:  # nor NaN
-            raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
-        if not 0 <= valid_for <= _VALID_FOR_MAX:
-            raise CommandRefused(
-                f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
+            number, ramp, valid_for = index(layer.number), layer.ramp, layer.valid_for
+            if not 0 <= number < self._layers:
+                raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
+            if not 0 <= ramp <= self._ramp_max:  # nor NaN
+                raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
+            if not 0 <= valid_for <= _VALID_FOR_MAX:
+                raise CommandRefused(
+                    f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
+                )
+            if layer.renew and (layer.tones or layer.after):
+                raise CommandRefused("renew must be without tones and after")
+            if layer.after and not layer.tones:
+                raise CommandRefused("after must be with tones")
+            commands = self._commands(layer.tones)
+            self._check_envelopes(layer.tones)
+            rounded.append(
+                LayerSet(
+                    number,
+                    min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
+                    max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
+                    tuple(commands.values()),
+                    bool(layer.after),
+                    bool(layer.renew),
+                )
             )
-        if layer.renew and (layer.tones or layer.after):
-            raise CommandRefused("renew must be without tones and after")
-        if layer.after and not layer.tones:
-            raise CommandRefused("after must be with tones")
-        commands = self._commands(layer.tones)
-        self._check_envelopes(layer.tones)
-        return LayerSet(
-            number,
-            min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
-            max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
-            tuple(commands.values()),
-            bool(layer.after),
-            bool(layer.renew),
-        )
+            numbers.append(number)
+        if len(set(numbers)) < len(numbers):
+            raise CommandRefused(f"a set must have each layer once, got {numbers}")
+        return tuple(rounded)
 
     def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
         """Return the commands of tones by channel; few calls, since every set has some."""

@@ -45,7 +45,6 @@ An adapter may keep what passes for 16 ms, each way.
 """
 _LATE_DECAY = 0.9  # with each reply
 _MAX_COMMIT_LATE = 0.003  # s; frames of USB at full speed, 1 ms, of port, hub and adapter
-_COMMIT_WORDS = MESSAGES["Commit"].request.words
 _SENDING = 0.0005  # s; until this process has written to all lines
 _DELAYS = 4  # of this process that prolong the wait for one reply
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
@@ -68,7 +67,8 @@ class Line:
         self.ahead: Callable[[str, Priority], Make | None] | None = None
         """Called with each request to one amplifier: what to commit on all of the line ahead."""
         self._queue = JobQueue()
-        self._current: Job | None = None
+        self.current: Job | None = None
+        """The request on the line; None if it is free."""
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
         self.time = self._loop.time
@@ -83,6 +83,7 @@ class Line:
     def open(self, port: OpenPort) -> None:
         """Send by a port that is open."""
         self._port = port
+        self._commit_takes = self.wire.transit(MESSAGES["Commit"].request.words)
         self._boots_until = self.time() + self._boot_time
 
     def submit(
@@ -103,27 +104,22 @@ class Line:
         future, now = self._loop.create_future(), self.time()
         make, values = (values, Values()) if callable(values) else (None, values)
         job = Job(member, priority, name, values, timeout, now, future, make)
-        if trace.has_requests():
+        if trace.is_active():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
-        if self._current is None and not (self._queue.jobs or self._is_pumping):
+        if self.current is None and not (self._queue.jobs or self._is_pumping):
             self._start(job)
             return future
         for queued in [*self._queue.jobs]:
             if queued.is_superseded_by(priority, member):
                 self._fail(queued, Preempted(SUPERSEDED))
         self._queue.add(job)
-        if self._current is not None:
-            self._preempt(self._current)
+        if self.current is not None:
+            self._preempt(self.current)
         self.pump()
         return future
-
-    @property
-    def awaited(self) -> "asyncio.Future[Values] | None":
-        """The result of the request on the line, which a set waits for; None if it is free."""
-        return None if self._current is None else self._current.result
 
     def commit_arrives(self) -> float:
         """Return by when [s] a commit arrives that is sent next.
@@ -133,7 +129,7 @@ class Line:
         """
         begins = max(self.time(), self._free_at, self._sent_until)
         late = min(self.late, _MAX_COMMIT_LATE) + _SENDING
-        return begins + self.wire.transit(_COMMIT_WORDS) + late
+        return begins + self._commit_takes + late
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
@@ -147,7 +143,7 @@ class Line:
                 if (unasked := self.members.get(arrival.address)) is not None:
                     unasked.note_unasked(arrival)
                 continue
-            job = self._current
+            job = self.current
             if job is None or (member := job.member) is None:  # no broadcast is on the line
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
@@ -158,7 +154,7 @@ class Line:
                 else:
                     self._start(job, arrival.data, is_present=arrival.is_present)
                 continue
-            self._current = member.silence_cause = None
+            self.current = member.silence_cause = None
             if isinstance(arrival, Written):
                 self._go_on(job)
                 continue
@@ -187,14 +183,14 @@ class Line:
             job.result.set_result(arrival.values)
         if self._queue.jobs:
             self.pump()
-        elif self._current is None and self._timer is not None:
+        elif self.current is None and self._timer is not None:
             self._timer.cancel()  # nothing is awaited: it would wake the process for nothing
             self._timer = None
 
     def lose(self, cause: str) -> None:
         """Fail every request: the port is lost, or closed."""
         self.loss = cause
-        current, self._current = self._current, None
+        current, self.current = self.current, None
         for job in (*([] if current is None else [current]), *self._queue.jobs):
             self._fail(job, LinkError(cause))
         if self._timer is not None:
@@ -206,7 +202,7 @@ class Line:
             return
         self._is_pumping = True
         try:
-            while self.loss is None and self._current is None and self._queue.jobs:
+            while self.loss is None and self.current is None and self._queue.jobs:
                 job = self._queue.next(self.time())
                 if job is None:
                     break
@@ -242,7 +238,8 @@ class Line:
                     job.takes = member.next_request(job.name, job.values, job.priority)
                 if self.seen is not None:
                     self.seen("out", address, job.name, job.values)
-                data = self.wire.request(address, job.name, job.values)
+                has_reply = member is not None and job.part >= len(job.parts) - 1
+                data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
             now = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
             if not rest:
@@ -265,7 +262,7 @@ class Line:
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
         except Exception as error:  # no caller may wait for ever
-            self._current = None
+            self.current = None
             self.wire.withdraw()
             self._fail(job, error)
             return
@@ -282,7 +279,7 @@ class Line:
         longer = job.takes - FAST if job.takes > FAST else 0.0
         job.due = max(job.due, begins + longer + job.timeout + late)
         job.delays, job.is_last_look = 0, False
-        self._current = job
+        self.current = job
         if job.part < len(job.parts) - 1 and not self.wire.confirms_parts:  # often: without a call
             self._send_further(job)
         elif self._timer is None:
@@ -299,9 +296,9 @@ class Line:
 
     def _go_on(self, job: Job) -> None:
         """Go on with the next part of a set, unless a request that waits comes before it."""
-        self._current = None
+        self.current = None
         job.attempts += 1  # this part has not been awaited in vain
-        job.go_to(job.part + 1)
+        job.part, job.values = job.part + 1, job.parts[job.part + 1]
         if self.wire.confirms_parts:
             job.reach(job.part)
         if self._queue.jobs and self._queue.has_before(job, self.time()):
@@ -369,12 +366,9 @@ class Line:
             current.due = min(current.due, free_at + (0.0 if is_reading else GRACE))
         # Where replies come late one that is cut short would never end.
         elif is_reading and first <= Priority.SET and self.late <= GRACE:
-            current.due = min(current.due, max(self.time(), self._begins_by(current)))
+            begins_by = max(current.started_at + current.takes, self._free_at) + REACTION
+            current.due = min(current.due, max(self.time(), begins_by))  # none begins from then on
         self._look_by(current.due)
-
-    def _begins_by(self, job: Job) -> float:
-        """Return by when [s] the reply to the request on the line is due: none is from then on."""
-        return max(job.started_at + job.takes, self._free_at) + REACTION
 
     def _look_by(self, due: float) -> None:
         """Look at the request on the line at a time [s], or before."""
@@ -390,7 +384,7 @@ class Line:
         it had then.
         """
         timer, self._timer = self._timer, None
-        job, now = self._current, self.time()
+        job, now = self.current, self.time()
         if job is None or timer is None:
             return
         since = max(timer.when(), job.sent_at)
@@ -404,19 +398,19 @@ class Line:
             return
         if now >= job.due:
             self._port.poll()
-            if self._current is job and self.time() >= job.due:
+            if self.current is job and self.time() >= job.due:
                 if job.is_last_look:
                     self._not_answered(job)
                     self.pump()
                     return
                 job.due, job.is_last_look = now, True
-        if self._current is not None and self._timer is None:
-            due = min(self._current.due, self.time() + _LOOK_INTERVAL)
+        if self.current is not None and self._timer is None:
+            due = min(self.current.due, self.time() + _LOOK_INTERVAL)
             self._timer = self._loop.call_at(due, self._look)
 
     def _not_answered(self, job: Job) -> None:
         """Take the request off the line, and repeat it or give it up."""
-        self._current = None
+        self.current = None
         self.wire.withdraw()
         member = job.member
         if member is None:
@@ -434,11 +428,10 @@ class Line:
         if job.attempts > 0 or (is_first and self.time() < self._boots_until):
             self._repeat(job, member)
             return
-        self._give_up(job, member)
+        self._give_up(job, member, boot_time=self._boot_time if is_first else 0.0)
 
-    def _give_up(self, job: Job, member: Member) -> None:
+    def _give_up(self, job: Job, member: Member, *, boot_time: float = 0.0) -> None:
         """End a request that has had no reply, or whose parts do not arrive."""
-        is_first = job.name == "Hello" and self._boots_until > -math.inf
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
         member.silence_cause = no_reply(
             self.name,
@@ -446,7 +439,7 @@ class Line:
             job.timeout,
             remark,
             before=member.counts.last_round_trip or 0.0,
-            boot_time=self._boot_time if is_first else 0.0,
+            boot_time=boot_time,
         )
         self._fail(job, LinkTimeout(member.silence_cause))
 

@@ -7,7 +7,7 @@ import asyncio
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
@@ -20,7 +20,8 @@ from registry import clock
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_need = attrgetter("feeding.since")
+_need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
+_silence_cause = attrgetter("silence_cause")
 
 
 class Members:
@@ -46,11 +47,8 @@ class Members:
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        names = []
-        for name, each in self.amplifiers.items():
-            if each.silence_cause is not None and not is_lost(each):
-                names.append(name)
-        return tuple(names)
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return tuple([each.name for each in mute if not is_lost(each)])
 
     @property
     def lost_by(self) -> Mapping[str, str]:
@@ -64,8 +62,8 @@ class Members:
     @property
     def lost_from(self) -> float:
         """When [s] the next beat stops all, since one that does not reply must be silent."""
-        mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
-        return min([each.feeding.lost_from for each in mute], default=math.inf)
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return min(map(_lost_from, mute), default=math.inf)
 
     @property
     def last_sent_at(self) -> float:
@@ -88,20 +86,14 @@ class Members:
         """Await all requests to their ends, then raise the most severe error."""
         return self.checked(await outcomes(requests))
 
-    def checked(self, results: Sequence[_T | BaseException]) -> list[_T]:
+    def checked(self, results: list[_T | BaseException]) -> list[_T]:
         """Return results; raises the most severe error.
 
         A lost link is first; last are what others have preempted and, after it, a degraded link.
         """
-        values, errors = list[_T](), list[BaseException]()
-        for each in results:
-            if isinstance(each, BaseException):
-                errors.append(each)
-            else:
-                values.append(each)
-        if errors:
+        if errors := [each for each in results if isinstance(each, BaseException)]:
             raise min(errors, key=self._severity)
-        return values
+        return cast("list[_T]", results)
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
@@ -166,7 +158,7 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
     return task.result()
 
 
-async def outcomes(requests: Sequence[Awaitable[_T]]) -> Sequence[_T | BaseException]:
+async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
     """Await all requests to their ends; returns the result or the error of each."""
     if len(requests) > 1:
         return await asyncio.gather(*requests, return_exceptions=True)

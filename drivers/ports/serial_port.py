@@ -125,15 +125,16 @@ class SerialPort(DevicePort):
 
     def write(self, data: bytes) -> None:
         """Send bytes, as soon as the port takes them; raises LinkError."""
-        was_blocked, self._unsent = bool(self._unsent), data
+        self._unsent = data
         self._send()
-        if was_blocked is not bool(self._unsent):
-            self._watch_room(not was_blocked)
+        if self._unsent and self.descriptor is not None:
+            self.loop.add_writer(self.descriptor, self._send_rest)
 
     def close(self) -> None:
         """Stop reading and writing; `wait_closed` closes the port."""
         self._unsent = b""
-        self._watch_room(False)
+        if self.descriptor is not None:
+            self.loop.remove_writer(self.descriptor)
         super().close()
 
     def read_watched(self) -> bytes:
@@ -162,17 +163,9 @@ class SerialPort(DevicePort):
         except OSError as error:
             raise self.lose(error) from error
 
-    def _watch_room(self, is_watched: bool) -> None:
-        """Have the event loop send the rest when there is room, or no more."""
-        if self.descriptor is None:
-            return
-        if is_watched:
-            self.loop.add_writer(self.descriptor, self._send_rest)
-        else:
-            self.loop.remove_writer(self.descriptor)
-
     def _send_rest(self) -> None:
+        """Send the rest, for which there is room; nothing, where a newer frame has gone whole."""
         with contextlib.suppress(LinkError):  # reported as a loss
             self._send()
-        if not self._unsent:
-            self._watch_room(False)
+        if not self._unsent and self.descriptor is not None:
+            self.loop.remove_writer(self.descriptor)

@@ -177,10 +177,10 @@ class Wire(Protocol):
     busy: float = 0.0
     """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 
-    def request(self, address: int, name: str, values: Values) -> bytes:
+    def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the bytes of a request, which is on the wire from now on; address 0: of all.
 
-        Of the parts of a set the last alone has a reply: what comes to another is none.
+        has_reply: not to one of all, nor a part of a set but the last: what comes to it is none.
         """
 
     def received(self, data: bytes) -> list[Arrival]:

@@ -106,12 +106,12 @@ class MemoryLine:
     """Simulated amplifiers at addresses 1, 2, ... of a line, and the host's amplifiers on it.
 
     inward, outward: what becomes of bytes for the amplifiers, and for the host; sent: the requests
-    of the host as address:number, with their times.
+    of the host as address:number, with their times; wire: None for the usual one of the kind.
     """
 
     is_blocked = False
 
-    def __init__(self, kind: str, *names: str, channels: int = 2) -> None:
+    def __init__(self, kind: str, *names: str, channels: int = 2, wire: Wire | None = None) -> None:
         self.loop = asyncio.get_running_loop()
         self.far = {each: Amplifier(each, channels=channels) for each in names}
         self.inward: Alter = unaltered
@@ -121,7 +121,7 @@ class MemoryLine:
         self._sending = self._handling = ""
         self._due: dict[str, float] = {}  # s; of what was handed over last, by who takes it
         self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
-        self.line = Line(self.kind.wire(), "line")
+        self.line = Line(wire or self.kind.wire(), "line")
         self.line.open(self)
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)

@@ -7,7 +7,6 @@ from collections import deque
 
 from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
     BROADCAST,
     BY_NUMBER,
@@ -79,7 +78,7 @@ class CanWire(Wire):
         self._replies = Assembler(self.counters)
         self._events: dict[int, Assembler] = {}
 
-    def request(self, address: int, name: str, values: Values) -> bytes:
+    def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the frames of a request, which is on the wire from now on; address 0: of all.
 
         Hello sets the node operational first, and reads its versions from an object, which one of
@@ -96,7 +95,6 @@ class CanWire(Wire):
         if name == "Hello":
             start = CanFrame(cob_id("nmt"), bytes((_START, address)))
             frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
-        has_reply = address != BROADCAST and (name != "Set" or is_last(values))
         self._pending = (address, number, kind) if has_reply else None
         self._requested = address
         self._replies = Assembler(self.counters)

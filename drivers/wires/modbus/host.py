@@ -14,7 +14,6 @@ from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_last
 from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.protocol.timing import BOOT_TIME
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
@@ -102,7 +101,7 @@ class ModbusWire(Wire):
         self._unawaited: set[int] = set()  # transactions whose responses are passed over
         self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
 
-    def request(self, address: int, name: str, values: Values) -> bytes:
+    def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the frame of a request, which is on the wire from now on; address 0: of all.
 
         Over TCP a request of all is a frame to each unit that was sent something before.
@@ -123,7 +122,7 @@ class ModbusWire(Wire):
             self._request = self._sent(name, 0, message)
         else:
             self._request = self._written(address, name, values)
-            self._request.has_reply = name != "Set" or is_last(values)
+            self._request.has_reply = has_reply
             if name == "Set" and not self.confirms_parts:
                 return self._without_pause(self._request)
         return self._request.frame

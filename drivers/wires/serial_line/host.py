@@ -11,9 +11,7 @@ from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_last
 from drivers.protocol.table import (
-    BROADCAST,
     BY_NUMBER,
     EVENT,
     HELLO,
@@ -62,7 +60,7 @@ class SerialWire(Wire):
         self._replied: Frame | None = None  # the last reply
         self._reader = FrameReader(on_invalid=self._count_invalid)
 
-    def request(self, address: int, name: str, values: Values) -> bytes:
+    def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the frame of a request, which is on the wire from now on; address 0: of all."""
         self._sequence = (self._sequence + 1) & 0xFFFF
         kind, version, words = HELLO, NEUTRAL, list[int]()
@@ -71,7 +69,6 @@ class SerialWire(Wire):
             kind, version, words = message.number, VERSION, message.request.append([], values)
         frame = Frame(kind, address, self._sequence, b"", version)
         data = encode_frame(frame, words)
-        has_reply = address != BROADCAST and (name != "Set" or is_last(values))
         self._pending = frame if has_reply else None
         self.counters.frames_out += 1
         self.takes = self._byte_time * len(data)

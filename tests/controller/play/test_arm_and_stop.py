@@ -57,10 +57,10 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
         wire = chain.controller.amplifiers["b"].line.wire
         request = wire.request
 
-        def fail(address: int, name: str, values: Values) -> bytes:
+        def fail(address: int, name: str, values: Values, **more: bool) -> bytes:
             if name == kind:
                 raise ZeroDivisionError("a bug")
-            return request(address, name, values)
+            return request(address, name, values, **more)
 
         wire.request = fail  # type: ignore[method-assign]
         await chain.hold(0.1, down=[FINGER])

@@ -45,8 +45,7 @@ SLACK = 0.0002  # s; what is under way for longer than its bits
 def timed_line(name: str, amplifier: str) -> MemoryLine:
     """A line on which bytes take as long as their bits, and 0.2 ms."""
     kind, wire, takes = LINES[name]
-    end = MemoryLine(kind, amplifier)
-    end.line.wire = wire()
+    end = MemoryLine(kind, amplifier, wire=wire())
     end.inward = end.outward = lambda _, data: [(takes(data) + SLACK, data)]
     return end
 

@@ -64,8 +64,7 @@ async def test_heartbeat_waits_for_one_request_that_has_waited(
 @in_virtual_time
 async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, attempts: int) -> None:
     """A status of 41 bytes takes 43 ms at 9600 baud, more than the 30 ms of others."""
-    end = MemoryLine("serial", "a")
-    end.line.wire = SerialWire(baud, sequence=0)
+    end = MemoryLine("serial", "a", wire=SerialWire(baud, sequence=0))
     (host,) = end.hosts.values()
     await host.open()
     end.outward = lambda name, data: []

@@ -69,8 +69,7 @@ LINES = {
 async def armed(name: str, *amplifiers: str) -> tuple[Group, MemoryLine, Paced]:
     """An armed group on one line with the times of its characters."""
     kind, make, bits, gap = LINES[name]
-    end = MemoryLine(kind, *amplifiers)
-    end.line.wire = make()
+    end = MemoryLine(kind, *amplifiers, wire=make())
     paced = Paced(end, int(name.split()[-1]), bits, gap)
     return await group_of(end, watchdog=2.0), end, paced
 

@@ -140,7 +140,6 @@ class HeldClock:
     def read_marks(self, since: float) -> None:
         """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
         self.marked_from = since
-        self._lowest.clear()
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
@@ -196,20 +195,27 @@ class HeldClock:
         lead = line.lead + line.rate * (time - line.time)
         off = math.remainder(shown - lead, CLOCK_TURN)
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
-        # All that was read before may have come late, each by no more than its exchange took.
-        sure = max([low - late - line.rate * (at - time) for at, low, late in self._lowest] or [lead])
+        # What was read before came late where it is above, each by no more than its exchange took.
+        sure = max([low - late - line.rate * (at - time) for at, low, late in self._lowest] or [-math.inf])
         if not sure - lead - far - earlier <= off <= later + far:
             if is_reported:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
+        elif time < self.marked_from and off < -_FAR - _SURELY * self.scatter(time):
+            for number, (at, low, late) in enumerate(self._lowest):
+                above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
+                self._lowest[number] = at, low + min(off + above, 0.0), late
+            self._part_ends = time
         if self._lowest and time < self._part_ends:
             before, low, _ = self._lowest[-1]
             if lead + off >= low + line.rate * (time - before) - _STEP / 2:  # as it is rounded
                 return
             self._lowest.pop()
         else:
-            self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+            marked = [each for each in self._lowest if each[0] > self.marked_from]
+            kept = marked if len(marked) >= _RECENT else self._lowest
+            self._lowest = [each for each in kept if time - each[0] <= WINDOW]
             span = time - self._lowest[0][0] if self._lowest else 0.0
             self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
         self._lowest.append((time, lead + off, later))
@@ -223,8 +229,9 @@ class HeldClock:
         rate, bend = self._line.rate, self._line.bend
         aged = [(time - at, lead) for at, lead, _ in self._lowest]
         count = max(len(aged) // 2, 1)
-        # Few may be as late as a whole exchange, however well they lie on a line.
-        least = (self.shortest / len(aged) ** 2) ** 2 + _LEAST**2
+        # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
+        delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
+        least = (delay / len(aged) ** 2) ** 2 + _LEAST**2
         # Marks share what scatters; what is likely would bend each line as its crystal is not.
         is_common = self._is_by_marks(time)
         for _ in range(_ROUNDS):  # what leads are at that time
@@ -264,5 +271,5 @@ class HeldClock:
 
     def _is_by_marks(self, time: float) -> bool:
         """Whether all that is kept was read by Marks, for as long as readings count."""
-        known = time - self._lowest[0][0] if self._lowest else 0.0
-        return self.marked_from < math.inf and known > WINDOW - 2 * _MAX_PART
+        since = self._lowest[0][0] if self._lowest else math.inf
+        return self.marked_from < since < time - WINDOW + 2 * _MAX_PART

@@ -67,7 +67,6 @@ _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
 _SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
-_KEEPS = 0.01  # s; largest error of a clock by which a set starts when its commit says
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether what waits preempts a set, as long as no amplifier is to play it."""
@@ -114,7 +113,8 @@ class Dialogue:
         """When [s] a set that was sent last starts at the soonest, or silence was sent."""
         self.starts = -math.inf
         """When [s] the set that it has staged starts by its next commit; before now: at once."""
-        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held
+        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held so well
+        self._is_start_known = True  # within what statuses are compared with
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -327,8 +327,9 @@ class Dialogue:
                 self._may_wait_until = -math.inf if is_now else now + MAX_AHEAD
                 error, starts = 0.0, None if is_now or self.starts <= now else self.starts
                 if starts is not None:
-                    error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))
-                    error = min(error, _MAX_START_ERROR)
+                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+                    self._is_start_known = error <= _MAX_START_ERROR
+                    error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
                 self.played_at = arrives if starts is None else starts
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
 
@@ -380,7 +381,8 @@ class Dialogue:
             problem = self.feeding.problem(left, sent_at, now)
         plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
         # By a clock that is not held a set may wait, whatever its commit says.
-        if plays_wrong and (sent_at >= self._may_wait_until or self.clock.error(now) <= _KEEPS):
+        is_held = self._is_start_known and self.clock.error(now) < math.inf
+        if plays_wrong and (sent_at >= self._may_wait_until or is_held):
             problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:

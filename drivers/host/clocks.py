@@ -81,33 +81,28 @@ class Clocks:
         if len(self._amplifiers) == 1:
             return
         loop, worst = asyncio.get_running_loop(), 0.0
-        now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier], float]]()
+        now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
-            takes = sum(
-                [
-                    max(each.exchange_time("GetStatus"), each.counts.last_round_trip or 0.0)
-                    for each in of_line
-                ]
-            )
             if of_line[0].clock.marked_from < now:
-                # Behind the heartbeats: what waits for a reply is sent in step with frames.
-                later = self.later(_INTERVAL + takes)
+                later = self.later(_INTERVAL)
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
-            unmarked.append((line, of_line, takes))
+            unmarked.append((line, of_line))
             for each in of_line:
                 if each.clock.can_be_steered:
                     worst = max(worst, each.clock.scatter(now))
         if worst <= _GOOD:
             return
         least = _INTERVAL if worst <= _POOR else _INTERVAL / 2
-        for line, of_line, takes in unmarked:
+        for line, of_line in unmarked:
             if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
                 # Each by itself: one behind the reply to another is sent in step with frames.
-                interval = max(least, takes / _MAX_LOAD) / len(of_line)
+                takes = [each.exchange_time("GetStatus") for each in of_line]
+                shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+                interval = max(least, sum(map(max, takes, shown)) / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(self.later(number * interval), self._read, next(self._turns[line]))
 

@@ -67,6 +67,8 @@ _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
 _SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
+COMMITTING = 0.1
+"""Time [s] within which a commit arrives and is carried out."""
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether what waits preempts a set, as long as no amplifier is to play it."""
@@ -266,7 +268,7 @@ class Dialogue:
             takes = self.line.wire.exchange_time(words, reply_words("Set"))
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return takes
-        if name in ("Set", "Commit"):
+        if name == "Set" or (name == "Commit" and values["token"] != self.committed):
             admitted, token, now = self._admitted, values["token"], self._time()
             if admitted is None or admitted.token != token:
                 raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
@@ -365,9 +367,9 @@ class Dialogue:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = reply["token"]
             return
-        if ledger is not None and (
-            ledger.doubt or self._admitted or reply["token"] != self.committed
-        ):
+        # A set plays some time after its commit: a status of before says that it does, or nothing.
+        is_sure = reply["token"] != self.committed or sent_at >= self.played_at + COMMITTING
+        if ledger is not None and is_sure:
             self._confirm(reply["token"], now)
         if name == "Ping" and not is_enabled:
             raise disarmed(self.name, reply)

@@ -37,7 +37,7 @@ _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock tha
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
 _NEAR = 20e-6  # s; or its error: what is led to zero
-_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
+_COMMON = 0.05  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -228,12 +228,12 @@ class HeldClock:
         """
         rate, bend = self._line.rate, self._line.bend
         aged = [(time - at, lead) for at, lead, _ in self._lowest]
-        count = max(len(aged) // 2, 1)
-        # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
-        delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
-        least = (delay / len(aged) ** 2) ** 2 + _LEAST**2
         # Marks share what scatters; what is likely would bend each line as its crystal is not.
         is_common = self._is_by_marks(time)
+        count = len(aged) if is_common else max(len(aged) // 2, 1)
+        # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
+        delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
+        least = (delay / len(aged) ** 2) ** 2 / 12 + _LEAST**2
         for _ in range(_ROUNDS):  # what leads are at that time
             above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])
             lowest = above[:count]

@@ -80,11 +80,15 @@ class Clocks:
         """
         if len(self._amplifiers) == 1:
             return
-        loop, worst = asyncio.get_running_loop(), 0.0
+        loop, worst, busy = asyncio.get_running_loop(), 0.0, dict[Line, float]()
         now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
+            takes = [each.exchange_time("GetStatus") for each in of_line]
+            shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+            busy[line] = sum(map(max, takes, shown))
             if of_line[0].clock.marked_from < now:
-                later = self.later(_INTERVAL)
+                # Behind the heartbeats: what waits for a reply is sent in step with frames.
+                later = self.later(_INTERVAL + busy[line])
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
             unmarked.append((line, of_line))
@@ -100,9 +104,7 @@ class Clocks:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
                 # Each by itself: one behind the reply to another is sent in step with frames.
-                takes = [each.exchange_time("GetStatus") for each in of_line]
-                shown = [each.counts.last_round_trip or 0.0 for each in of_line]
-                interval = max(least, sum(map(max, takes, shown)) / _MAX_LOAD) / len(of_line)
+                interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
                     loop.call_later(self.later(number * interval), self._read, next(self._turns[line]))
 

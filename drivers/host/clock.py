@@ -37,7 +37,7 @@ _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock tha
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
 _NEAR = 20e-6  # s; or its error: what is led to zero
-_COMMON = 0.05  # of an error, between clocks that were read by the same Marks
+_COMMON = 0.04  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -257,8 +257,9 @@ class HeldClock:
             lead = mean + tilt * middle + warp * square
         # Where readings lie on a line by chance those above it show how late they may be.
         scatter = (above[min(count, len(aged) - 1)][0] - mean) ** 2 + least
-        rate_error = _ERRORS * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
-        error = _ERRORS * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
+        errors = _ERRORS + min(_RECENT / len(aged), 1.0)
+        rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
+        error = errors * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
         recent = [
             (lead_then + (rate - bend * (time - at)) * (time - at) - lead, late - self.shortest - self._bits)
             for at, lead_then, late in self._lowest[-_RECENT:]

@@ -132,7 +132,7 @@ class HeldClock:
         lead, error = self.lead(time), self._line.error
         if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
             self._near_at = time
-        is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
+        is_gentle = is_playing or abs(lead) <= max(_NEAR, error)
         within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
         return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
@@ -196,7 +196,9 @@ class HeldClock:
         off = math.remainder(shown - lead, CLOCK_TURN)
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
         # What was read before came late where it is above, each by no more than its exchange took.
-        sure = max([low - late - line.rate * (at - time) for at, low, late in self._lowest] or [-math.inf])
+        sure = max(
+            [low - late - line.rate * (at - time) for at, low, late in self._lowest] or [-math.inf]
+        )
         if not sure - lead - far - earlier <= off <= later + far:
             if is_reported:
                 self._jumped_at = time
@@ -261,7 +263,10 @@ class HeldClock:
         rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
         error = errors * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
         recent = [
-            (lead_then + (rate - bend * (time - at)) * (time - at) - lead, late - self.shortest - self._bits)
+            (
+                lead_then + (rate - bend * (time - at)) * (time - at) - lead,
+                late - self.shortest - self._bits,
+            )
             for at, lead_then, late in self._lowest[-_RECENT:]
         ]
         # None is later than its exchange took longer than the promptest one.

@@ -106,7 +106,9 @@ class Clocks:
                 # Each by itself: one behind the reply to another is sent in step with frames.
                 interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
-                    loop.call_later(self.later(number * interval), self._read, next(self._turns[line]))
+                    loop.call_later(
+                        self.later(number * interval), self._read, next(self._turns[line])
+                    )
 
     def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] and some of a frame."""

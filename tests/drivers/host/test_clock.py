@@ -162,7 +162,7 @@ def test_lost_pings_make_it_swing_no_further(is_playing: bool) -> None:
 
 
 def busy(seed: int) -> Callable[[], float]:
-    """Delays of a machine with far more to do than it can [s]: most of 1 to 60 ms, a fifth prompt."""
+    """Delays of a machine that does more than it can [s]: most of 1 to 60 ms, a fifth none."""
     rng = random.Random(seed)
     late = partial(rng.lognormvariate, math.log(5e-3), 1.2)
     return lambda: 0.0 if rng.random() < 0.2 else min(late(), 0.06)

@@ -26,6 +26,7 @@ from controller.process.log import LogThread, start_log
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
 from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
+from controller.sources.tuio import RESTART_PAUSE
 from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -314,7 +315,7 @@ async def _play(
         async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
             await era.layout(_layout_name(number))
         await replay_capture(scene.touches, _HOST, port)
-        await asyncio.sleep(DECAY)  # the last datagrams arrive
+        await asyncio.sleep(RESTART_PAUSE)  # or the next scene's sender would be a second one
         while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
             await asyncio.sleep(DECAY)
     await asyncio.sleep(DECAY)

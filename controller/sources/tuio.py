@@ -36,7 +36,8 @@ _SOURCE = b"source\0\0"  # OSC string, NUL-padded
 # Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
 # restart within the first 100 frames shows by the pause: reordered frames are never this late.
 _LATE_FRAMES = 100
-_LATE_SECONDS = 0.5
+RESTART_PAUSE = 0.5
+"""Time [s] without a datagram after which a sender at another port is the one of before."""
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
 # message once a second.
 DEFAULT_TIMEOUT = 3.0  # s
@@ -170,7 +171,7 @@ class TuioReader:
             return shared
         sequence = -1 if bundle.sequence is None else bundle.sequence
         follows = sequence < 0 or 0 < sequence - known.sequence <= _LATE_FRAMES
-        if known.former != peer and (follows or now - known.last_heard >= _LATE_SECONDS):
+        if known.former != peer and (follows or now - known.last_heard >= RESTART_PAUSE):
             return shared
         ports = f"ports {known.peer[1]} and {peer[1]}"
         self.rejects.count("same_name", f"{shared} comes from {ports}; rename one of the programs")
@@ -198,7 +199,7 @@ class TuioReader:
             return min(names, key=lambda name: self._senders[name].last_heard)
 
         idle = oldest(self._senders)
-        if now - self._senders[idle].last_heard >= _LATE_SECONDS:
+        if now - self._senders[idle].last_heard >= RESTART_PAUSE:
             return idle
         counts = Counter(sender.peer for sender in self._senders.values())
         ((busiest, count),) = counts.most_common(1)
@@ -218,7 +219,7 @@ class TuioReader:
             return True
         behind = sender.sequence - sequence
         if behind > 0:
-            if behind <= _LATE_FRAMES and now - sender.sequence_time < _LATE_SECONDS:
+            if behind <= _LATE_FRAMES and now - sender.sequence_time < RESTART_PAUSE:
                 self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
                 return False
             sender.alive, sender.positions = None, {}  # a restarted sender

@@ -29,17 +29,15 @@ COMMON_AFTER = WINDOW + 2.0
 _PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
-_FEW = 2  # below which the time of an exchange bounds the error
-_ERRORS = 2.0  # the lowest of some readings depend on each other: by simulation
+_ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
 _EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
 _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
-_FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors
+_FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
-_UNKNOWN = 150e-6  # s; an error above which nothing is led to zero
 _NEAR = 20e-6  # s; or its error: what is led to zero
-_COMMON = 0.1  # of an error, between clocks that were read by the same Marks
+_COMMON = 0.04  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -79,9 +77,8 @@ class HeldClock:
 
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
-        self._lowest: list[tuple[float, float]] = []  # time, lead
+        self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
         self._part_ends = -math.inf
-        self._least_delay = math.inf  # s; by which a request may have come late, of the promptest
         self._line = _Line(time)
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
 
@@ -133,9 +130,9 @@ class HeldClock:
         if not self.can_be_steered or time - self._jumped_at < CLOCK_SETTLING:
             return round(self._pace * _PER_RATE)
         lead, error = self.lead(time), self._line.error
-        if abs(lead) <= max(_NEAR, error) and error <= _UNKNOWN:
+        if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
             self._near_at = time
-        is_gentle = is_playing or abs(lead) <= max(_NEAR, 2 * error)
+        is_gentle = is_playing or abs(lead) <= max(_NEAR, error)
         within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
         return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
@@ -143,7 +140,6 @@ class HeldClock:
     def read_marks(self, since: float) -> None:
         """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
         self.marked_from = since
-        self._lowest.clear()
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
@@ -199,22 +195,32 @@ class HeldClock:
         lead = line.lead + line.rate * (time - line.time)
         off = math.remainder(shown - lead, CLOCK_TURN)
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
-        if not -far <= off <= later + far:  # else what delayed all that was read has ended
-            if is_reported and not -far - earlier <= off <= later + far:
+        # What was read before came late where it is above, each by no more than its exchange took.
+        sure = max(
+            [low - late - line.rate * (at - time) for at, low, late in self._lowest] or [-math.inf]
+        )
+        if not sure - lead - far - earlier <= off <= later + far:
+            if is_reported:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
-        self._least_delay = min(self._least_delay, later)
+        elif time < self.marked_from and off < -_FAR - _SURELY * self.scatter(time):
+            for number, (at, low, late) in enumerate(self._lowest):
+                above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
+                self._lowest[number] = at, low + min(off + above, 0.0), late
+            self._part_ends = time
         if self._lowest and time < self._part_ends:
-            before, low = self._lowest[-1]
+            before, low, _ = self._lowest[-1]
             if lead + off >= low + line.rate * (time - before) - _STEP / 2:  # as it is rounded
                 return
             self._lowest.pop()
         else:
-            self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+            marked = [each for each in self._lowest if each[0] > self.marked_from]
+            kept = marked if len(marked) >= _RECENT else self._lowest
+            self._lowest = [each for each in kept if time - each[0] <= WINDOW]
             span = time - self._lowest[0][0] if self._lowest else 0.0
             self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
-        self._lowest.append((time, lead + off))
+        self._lowest.append((time, lead + off, later))
         self._fit(time)
 
     def _fit(self, time: float) -> None:
@@ -223,42 +229,53 @@ class HeldClock:
         What is likely of crystals counts as if it were measured, too.
         """
         rate, bend = self._line.rate, self._line.bend
-        aged = [(time - at, lead) for at, lead in self._lowest]
-        count = max(len(aged) // 2, min(len(aged), 2))
+        aged = [(time - at, lead) for at, lead, _ in self._lowest]
         # Marks share what scatters; what is likely would bend each line as its crystal is not.
         is_common = self._is_by_marks(time)
+        count = len(aged) if is_common else max(len(aged) // 2, 1)
+        # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
+        delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
+        least = (delay / len(aged) ** 2) ** 2 / 12 + _LEAST**2
         for _ in range(_ROUNDS):  # what leads are at that time
-            above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])[:count]
+            above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])
+            lowest = above[:count]
             mean = middle = breadth = scatter = slope = curve = wide = 0.0
-            for high, age in above:
+            for high, age in lowest:
                 mean, middle = mean + high / count, middle + age / count
-            for high, age in above:
+            for high, age in lowest:
                 breadth += (middle - age) ** 2
                 slope += (middle - age) * (high - mean)
                 scatter += (high - mean) ** 2
-            for high, age in above:
+            for high, age in lowest:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            own = 0.0 if is_common else off_line / count
-            square, error = middle**2 - breadth / count, own + _LEAST**2
+            error = _LEAST**2 if is_common else off_line / count + least
+            square = middle**2 - breadth / count
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
             tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
             warp = (curve - bend * error / _EXPECTED_BEND**2) / wide
             rate, bend = rate + tilt + 2 * warp * middle, bend + warp
             lead = mean + tilt * middle + warp * square
-        scatter = max(scatter - tilt * slope - warp * curve, 0.0) / max(count - 3, 1) + _LEAST**2
-        rate_error = _ERRORS * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
-        known = 1 / count + middle**2 / breadth + square**2 / wide
-        error = _ERRORS * math.sqrt(scatter * known)
-        if count <= _FEW:
-            error = max(error, self._least_delay / math.sqrt(12))
-        off = min([high + (rate - bend * age) * age for age, high in aged[-_RECENT:]]) - lead
-        if off > _FAR + _FAR_ERRORS * error:
+        # Where readings lie on a line by chance those above it show how late they may be.
+        scatter = (above[min(count, len(aged) - 1)][0] - mean) ** 2 + least
+        errors = _ERRORS + min(_RECENT / len(aged), 1.0)
+        rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
+        error = errors * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
+        recent = [
+            (
+                lead_then + (rate - bend * (time - at)) * (time - at) - lead,
+                late - self.shortest - self._bits,
+            )
+            for at, lead_then, late in self._lowest[-_RECENT:]
+        ]
+        # None is later than its exchange took longer than the promptest one.
+        if min([off - late for off, late in recent]) > _FAR / 2:
             del self._lowest[:-_RECENT]
+        off = min(recent)[0]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
 
     def _is_by_marks(self, time: float) -> bool:
         """Whether all that is kept was read by Marks, for as long as readings count."""
-        known = time - self._lowest[0][0] if self._lowest else 0.0
-        return self.marked_from < math.inf and known > WINDOW - 2 * _MAX_PART
+        since = self._lowest[0][0] if self._lowest else math.inf
+        return self.marked_from < since < time - WINDOW + 2 * _MAX_PART

@@ -9,7 +9,8 @@ delays it is common to all of them.
 import asyncio
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import cycle
 from statistics import median
 from typing import Any
 
@@ -36,11 +37,14 @@ class Clocks:
         self._are_alike = True  # and so are their lines
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+        self._turns: dict[Line, Iterator[Amplifier]] = {}
 
     def follow(self) -> None:
         """Know all from now on: one alone, or by which lines and amplifiers they differ."""
         every = self._amplifiers.values()
         self._are_alike = len({_kind(each) for each in every}) == 1
+        for line in {each.line for each in every}:
+            self._turns[line] = cycle([each for each in every if each.line is line])
         for each in every:
             each.clock.is_alone = len(every) == 1
 
@@ -76,11 +80,15 @@ class Clocks:
         """
         if len(self._amplifiers) == 1:
             return
-        loop, worst = asyncio.get_running_loop(), 0.0
+        loop, worst, busy = asyncio.get_running_loop(), 0.0, dict[Line, float]()
         now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
         for line, of_line in by_line.items():
+            takes = [each.exchange_time("GetStatus") for each in of_line]
+            shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+            busy[line] = sum(map(max, takes, shown))
             if of_line[0].clock.marked_from < now:
-                later = self.later(_INTERVAL)
+                # Behind the heartbeats: what waits for a reply is sent in step with frames.
+                later = self.later(_INTERVAL + busy[line])
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
                 continue
             unmarked.append((line, of_line))
@@ -95,26 +103,25 @@ class Clocks:
                 for each in of_line:
                     each.clock.read_marks(now)
             elif line.late <= GRACE:
-                takes = [each.exchange_time("GetStatus") for each in of_line]
-                shown = [each.counts.last_round_trip or 0.0 for each in of_line]
-                interval = max(least, sum(map(max, takes, shown)) / _MAX_LOAD)
+                # Each by itself: one behind the reply to another is sent in step with frames.
+                interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):
-                    loop.call_later(self.later(number * interval), self._read, of_line)
+                    loop.call_later(
+                        self.later(number * interval), self._read, next(self._turns[line])
+                    )
 
     def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] and some of a frame."""
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME
 
-    def _read(self, amplifiers: Sequence[Amplifier]) -> None:
-        """Read the statuses of amplifiers that reply, can be steered and are not being read."""
-        if self._members.has_joint_set:
-            return
-        for each in amplifiers:
-            reading = self._readings.get(each)
-            is_free = each.clock.can_be_steered and (reading is None or reading.done())
-            if is_free and each.silence_cause is None and each.line.loss is None:
-                self._readings[each] = each.read_status(Priority.READING)
+    def _read(self, amplifier: Amplifier) -> None:
+        """Read the status of an amplifier that replies, can be steered and is not being read."""
+        reading = self._readings.get(amplifier)
+        is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
+        is_heard = amplifier.silence_cause is None and amplifier.line.loss is None
+        if is_free and is_heard and not self._members.has_joint_set:
+            self._readings[amplifier] = amplifier.read_status(Priority.READING)
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

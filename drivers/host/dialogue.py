@@ -68,7 +68,8 @@ _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
 _SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
-_KEEPS = 0.01  # s; largest error of a clock by which a set starts when its commit says
+COMMITTING = 0.1
+"""Time [s] within which a commit arrives and is carried out."""
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether what waits preempts a set, as long as no amplifier is to play it."""
@@ -115,7 +116,8 @@ class Dialogue:
         """When [s] a set that was sent last starts at the soonest, or silence was sent."""
         self.starts = -math.inf
         """When [s] the set that it has staged starts by its next commit; before now: at once."""
-        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held
+        self._may_wait_until = -math.inf  # s; the last set, by a clock that is not held so well
+        self._is_start_known = True  # within what statuses are compared with
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
@@ -253,7 +255,7 @@ class Dialogue:
             takes = self.line.wire.exchange_time(words, reply_words("Set"))
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return takes
-        if name in ("Set", "Commit"):
+        if name == "Set" or (name == "Commit" and values["token"] != self.committed):
             admitted, token, now = self._admitted, values["token"], self._time()
             if admitted is None or admitted.token != token:
                 raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
@@ -314,8 +316,9 @@ class Dialogue:
                 self._may_wait_until = -math.inf if is_now else now + MAX_AHEAD
                 error, starts = 0.0, None if is_now or self.starts <= now else self.starts
                 if starts is not None:
-                    error = max(HIGH_TIME, _SURELY * self.clock.scatter(now))
-                    error = min(error, _MAX_START_ERROR)
+                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+                    self._is_start_known = error <= _MAX_START_ERROR
+                    error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
                 self.played_at = arrives if starts is None else starts
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
 
@@ -351,9 +354,9 @@ class Dialogue:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = reply["token"]
             return
-        if ledger is not None and (
-            ledger.doubt or self._admitted or reply["token"] != self.committed
-        ):
+        # A set plays some time after its commit: a status of before says that it does, or nothing.
+        is_sure = reply["token"] != self.committed or sent_at >= self.played_at + COMMITTING
+        if ledger is not None and is_sure:
             self._confirm(reply["token"], now)
         if name == "Ping" and not is_enabled:
             raise disarmed(self.name, reply)
@@ -367,7 +370,8 @@ class Dialogue:
             problem = self.feeding.problem(left, sent_at, now)
         plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
         # By a clock that is not held a set may wait, whatever its commit says.
-        if plays_wrong and (sent_at >= self._may_wait_until or self.clock.error(now) <= _KEEPS):
+        is_held = self._is_start_known and self.clock.error(now) < math.inf
+        if plays_wrong and (sent_at >= self._may_wait_until or is_held):
             problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:

@@ -155,8 +155,7 @@ class Heartbeats:
                 "at": word_passed_by_all(line.time(), of_line),
             }
             for each in of_line:
-                request = "Ping" if each.committed == token else "Commit"
-                each.next_request(request, values, Priority.SET)
+                each.next_request("Commit", values, Priority.SET)
             return [values]
 
         return make

@@ -239,14 +239,15 @@ def _commit_of(several: Sequence[Amplifier], token: int, at: int) -> list[Values
 
 
 async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
-    """Raise CommandRefused unless a status shows the token of a set, or does once it is repeated.
+    """Raise CommandRefused unless a status has shown the token of a set, or does once repeated.
 
+    status: of a heartbeat, which may have gone before the commit: another may have shown it since.
     What its layers play is compared with every status.
     """
-    if status["token"] != token and status["state"] not in LATCHED:
+    if amplifier.committed != token and status["state"] not in LATCHED:
         amplifier.starts = -math.inf
         status = await amplifier.commit(token, word_passed_by_all(clock.now(), [amplifier]))
-    if status["token"] != token or status["state"] in LATCHED:
+    if amplifier.committed != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "
             f"{status['token']} in state {name_of(STATES, status['state'])}"

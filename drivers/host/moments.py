@@ -7,7 +7,7 @@ word that names a moment to it is another, and what has passed for others may be
 from collections.abc import Sequence
 from typing import TypeVar
 
-from drivers.host.dialogue import Dialogue
+from drivers.host.dialogue import COMMITTING, Dialogue
 from drivers.protocol.clock import (
     HIGH_TIME,
     HIGH_WORDS,
@@ -18,7 +18,6 @@ from drivers.protocol.clock import (
 )
 from drivers.protocol.table import AHEAD_MAX
 
-_COMMITTING = 0.1  # s; within which a commit arrives
 _Amplifier = TypeVar("_Amplifier", bound=Dialogue)
 _STEP = AHEAD_MAX // 2  # from a high word that is tried to the next
 
@@ -36,7 +35,7 @@ def word_passed_by_all(now: float, amplifiers: Sequence[Dialogue]) -> int:
     """Return a high word that is no moment ahead for amplifiers, now [s] and a little later."""
     at = word_passed(now)
     others = [each for each in amplifiers if not each.clock.can_be_steered]
-    times = [_shown(each, now + later) for each in others for later in (0.0, _COMMITTING)]
+    times = [_shown(each, now + later) for each in others for later in (0.0, COMMITTING)]
     for _ in range(HIGH_WORDS // _STEP):
         if all(moment_of(at, time) is None for time in times):
             break

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.host.group import Group
+from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.transport.line_kinds import LINE_KINDS, LineDelays
@@ -106,6 +107,35 @@ def test_frames_of_full_speed_are_read_at_all_phases() -> None:
         assert await skew(group, clocks, 4.0) < 17e-6
 
     run_virtual(run())
+
+
+@pytest.mark.parametrize("lines", [("abc",), ("a", "b")], ids="-".join)
+def test_sets_beside_readings_of_clocks_are_played(lines: tuple[str, ...]) -> None:
+    """40 sets at any time between the readings of USB of full speed, of which each takes 2 ms.
+
+    On one line a reading may show a set before its own status does; on several no reading goes
+    between a set and its commit, which would wait for the reply.
+    """
+
+    async def run() -> list[tuple[str, ...]]:
+        group, _ = await held("usb-full-speed", 1, *lines, features=0)
+        between, rng = list[tuple[str, ...]](), random.Random(1)
+        for number in range(40):
+            await asyncio.sleep(0.03)
+            await group.beat()
+            await asyncio.sleep(rng.uniform(0.005, 0.02))
+            sent = list[str]()
+            for line in {each.line for each in group.amplifiers.values()}:
+                line.seen = lambda way, _, name, __, sent=sent: sent.append(f"{way} {name}")
+            tones = (Tone(0, 100.0, 0.1 + number / 100),)
+            await group.apply({each: [Layer(0, tones, 0.001)] for each in group.amplifiers})
+            after = sent.index("out Set")
+            between.append((*sent[after : sent.index("out Commit", after)],))
+        assert {each.committed for each in group.amplifiers.values()} == {group.sets.token}
+        return between
+
+    between = run_virtual(run())
+    assert len(lines) == 1 or not any("out GetStatus" in each for each in between)
 
 
 def test_one_mark_tells_the_clocks_of_a_shared_line() -> None:

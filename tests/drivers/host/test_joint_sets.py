@@ -18,7 +18,7 @@ from drivers.wires.serial_line.host import SerialWire
 from drivers.wires.wire import Wire
 from sim.amplifier.clock import AmplifierClock, Crystal
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, group_of
+from words_line import KINDS, MemoryLine, group_of, unaltered
 
 LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 # By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
@@ -142,6 +142,31 @@ async def test_amplifier_that_does_not_start_at_its_moment_is_found() -> None:
     await asyncio.sleep(0.011)
     with pytest.raises(CommandRefused):
         await read_status()
+
+
+@in_virtual_time
+async def test_set_that_starts_as_late_as_its_clock_is_behind_is_no_fault() -> None:
+    """Requests took 6 ms until it was armed: it is behind by as much, and known to be.
+
+    Of each of two sets a status 3 ms after its moment shows the set before.
+    """
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    group = await group_of(*ends, is_armed=False)
+    ends[1].inward = lambda name, data: [(0.0062, data)]
+    for _ in range(10):
+        await asyncio.sleep(0.05)
+        await group.statuses()
+    ends[1].inward = lambda name, data: [(0.0002 if name == "Arm" else 0.0062, data)]
+    await group.arm()
+    ends[1].inward = unaltered
+    host, levels = group.amplifiers["b"], []
+    for level in (0.3, 0.6):
+        applied = await group.apply({name: [loud(0, level)] for name in group.amplifiers})
+        await asyncio.sleep(applied.starts_at + 0.003 - ends[0].loop.time())
+        levels.append((await host.read_status())["levels"][0])
+        await asyncio.sleep(0.01)
+    assert levels == [0, 3000]
+    assert group.is_armed
 
 
 @pytest.mark.parametrize(("meanwhile", "checks"), [("nothing", 1), ("6 ms", 2), ("a reply", 2)])

@@ -247,7 +247,7 @@ async def broadcasts(subject: Subject) -> None:
         data = subject.client.request(message.number, words, to=0)
         await subject.client.expect_silence(data, f"a {name} for all")
         if is_obeyed:
-            subject.shown.granted(name, values, {}, When(sent, clock.now()))
+            subject.shown.granted(name, values, {}, subject.since(sent))
         await subject.request("GetStatus")
 
     await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
@@ -281,7 +281,8 @@ async def mark(subject: Subject) -> None:
         sent = clock.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))
         await asyncio.sleep(_MARKED)
-        subject.shown.carry_out("Mark", {}, {}, When(sent, sent + REACTION + client.transit))
+        when = subject.dating.interval(When(sent, sent + REACTION + client.transit))
+        subject.shown.carry_out("Mark", {}, {}, when)
         await subject.run([_MARKED, 0.1])
         expect_equal(len(client.heard), 0, "replies to a Mark for all")
 

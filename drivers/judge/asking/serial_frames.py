@@ -178,7 +178,7 @@ async def doubled_frames(subject: Subject) -> None:
     for (part, _), data in zip(made, frames, strict=True):
         began = clock.now()
         await subject.client.send(data)
-        subject.played(part, When(began, clock.now()))
+        subject.played(part, began)
     for at, pause in ((0, 0.0), (1, 0.25), (1, 0.0)):
         await subject.client.send(frames[at])
         await subject.run([subject.ping, pause])

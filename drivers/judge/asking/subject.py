@@ -193,7 +193,7 @@ class Subject(Material):
         if made:
             expect_equal(len(self.client.heard), 0, "number of replies to parts but the last")
         for sent, part, _ in made if self.expected is not None else ():
-            self.shown.part_came(part, When(sent, latest))
+            self.shown.part_came(part, self.dating.interval(When(sent, latest)))
         if self.client.transactions > 1:  # each had its response
             return 0.0
         return sum(self.client.wire_time(words, 0) for _, _, words in made)
@@ -211,8 +211,7 @@ class Subject(Material):
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
-        if "clock" in shown:
-            answer = replace(answer, when=self._dated(name, values, shown, answer.when))
+        answer = replace(answer, when=self._dated(name, values, shown, answer.when))
         if self.expected is not None:
             if name == "Set":
                 self.token = values["token"]
@@ -231,8 +230,9 @@ class Subject(Material):
         That may have been read later than the request was carried out, but for a GetStatus.
         """
         dating, judge = self.dating, self.expected
-        if name == "Mark" or (judge is not None and judge.clock.is_marked):
-            return when
+        between = dating.interval(when)
+        if "clock" not in shown or name == "Mark" or (judge and judge.clock.is_marked):
+            return between
         if name == "Arm" and not (
             judge and judge.is_enabled and judge.session == values["session"]
         ):
@@ -242,7 +242,7 @@ class Subject(Material):
             dating.pace = 1.0
         elif name == "Ping":
             dating.pace = 1 + values["rate"] * RATE
-        return dated if name == "GetStatus" else When(when.earliest, dated.latest)
+        return dated if name == "GetStatus" else When(between.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
         """Read what is played of a set that is not played to the word."""
@@ -351,10 +351,14 @@ class Subject(Material):
         self.sent_set = [words]
         return part, words
 
-    def played(self, part: Values, when: When) -> None:
-        """Note that a set of one part was carried out."""
+    def since(self, sent: float) -> When:
+        """Return what is between a time of this machine and now, by the amplifier's clock."""
+        return self.dating.interval(When(sent, clock.now()))
+
+    def played(self, part: Values, sent: float) -> None:
+        """Note that a set of one part was carried out that was sent at a time."""
         self.shown.sets.sent(part)
-        self.shown.carry_out("Set", part, {}, when)
+        self.shown.carry_out("Set", part, {}, self.since(sent))
 
     async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""

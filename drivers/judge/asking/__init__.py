@@ -66,7 +66,7 @@ CHECKS: tuple[Check, ...] = (
     *(playing.after_the_last_onset, playing.what_waits_for_an_onset),
     *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),
     *(playing.endings_amid, playing.extreme_envelopes, playing.phases, playing.voices),
-    *(playing.voices_of_layers, playing.voices_of_channels, playing.limited),
+    playing.limited,
     *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
     serial_frames.discarded_frames,
     *(modbus_frames.present_areas, modbus_frames.exceptions),

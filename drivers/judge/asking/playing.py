@@ -7,17 +7,18 @@ from functools import partial
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require, require_in_time
-from drivers.judge.asking.material import Rows, layer, play, send
+from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
-from drivers.protocol.table import SHORTENED_FADE
+from drivers.protocol.sets import Command, Envelope
 from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.2  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
-_PAUSE = 0.004  # s; between the sets of voices, at least
+_SHARES = 0.25, 0.2, 0.12  # of the test level, of the voices that are cut
+_LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
 
 
@@ -302,82 +303,45 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 
 
 @driving(_PLACE)
-async def voices(subject: Subject) -> None:
-    """It refuses no set for its fades: the oldest fade ends within 2 ms, and what lasts stays."""
-    ramp, sets = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES) + 4
-    # Each tone is at its level at once, and falls along the ramp of the next set.
-    onset = subject.envelope(0.0001)
-    tones = [
-        subject.tone(0, 1 / sets, frequency=subject.near(at), onset=onset) for at in range(sets)
-    ]
-    await subject.arm()
-    subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
-    # Apart, so that the oldest has faded further than the newest, but none ends before the last.
-    pause = max(0.4 * ramp / 1000 / sets - subject.exchange_time, _PAUSE + onset.step / 10_000)
-    began = clock.now()
-    for tone in tones:
-        last = await subject.play(layer(0, tone, ramp=ramp))
-        await subject.status()  # amid the 2 ms of what is cut, on a quick line
-        await asyncio.sleep(pause)
-    require_in_time(
-        last.when.latest - began <= 0.8 * ramp / 1000,
-        "sets were too far apart for so many voices",
-    )
-    cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)
+def voices(subject: Subject) -> Rows:
+    """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
+    channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
+    count, ramp = min(subject.can["voices"], _MAX_VOICES), subject.can["ramp_max"]
+    fades, apart = count - others, math.ceil(5 * subject.exchange_time * 1000) + 5
+    subject.require_ramp((count + 3) * subject.exchange_time + 3 * apart / 1000)
+    shape = subject.envelope(0.1, *[_SHARES[1]] * 8)
+    ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
+    quiet = (1 - sum(_SHARES)) / (count + 2)
+
+    def tones(at: int, ending: Envelope | None = None) -> list[Command]:
+        share = _SHARES[at] if at < len(_SHARES) else quiet
+        made = partial(subject.tone, fraction=share, frequency=subject.near(at), ending=ending)
+        return [made(each) for each in channels]
+
+    async def fade(number: int) -> None:
+        """Have tones fade before one that lasts: the first the longest, the next by its ending."""
+        for at in range(number + 1):
+            await subject.play(layer(0, *tones(at, ending if at == 1 else None), ramp=ramp - at))
+            if at == 1 and ending:
+                await subject.play(layer(0))
+
+    def from_a_moment(at: int, ramp: int = ramp, apart: float = 0.0) -> Row:
+        return partial(subject.at, layer(0, *tones(at), ramp=ramp), apart=apart)
+
+    look = partial(subject.follow, 0.008)
+    cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
+    lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
-    others = [play(layer(each, tones[each], ramp=ramp)) for each in subject.layers[1:3]]
-    fade = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
-    await asyncio.sleep(cut)  # in which the oldest fade may end as it likes
-    await subject.follow(0.05)
-    for row in (*others, fade, play(subject.one())):
-        await subject.send(row)
-    await asyncio.sleep(cut)
-    await subject.follow()
-
-
-def _fading(subject: Subject) -> int:
-    """Return a ramp [ms] that is longer than the sets of as many voices as are tried."""
-    return min(subject.lasting(450), int(subject.can["ramp_max"]))
-
-
-@driving(_PLACE)
-def voices_of_layers(subject: Subject) -> Rows:
-    """It cuts fades only: what lasts on all layers plays on while others fade."""
-    ramp, share = _fading(subject), 1 / (2 * len(subject.layers))
-    others = subject.layers[1:]
-    count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
-    near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
-    least = max(near[0].level // 4, subject.can["level_step"])
-    quiet = [replace(each, level=least) for each in near[len(others) + 1 :]]
-    lasting = play(*(layer(number, near[number]) for number in others))
-
-    async def fade() -> None:
-        for tone in quiet:
-            await subject.play(layer(0, tone, ramp=ramp))
-
-    return [(lasting, fade, layer(0))]
-
-
-@driving(_PLACE)
-def voices_of_channels(subject: Subject) -> Rows:
-    """It counts the voices of each channel by itself: fades of others cut none of it."""
-    require(len(subject.channels) > 1, "it has one channel")
-    ramp, count = _fading(subject), min(subject.can["voices"], _MAX_VOICES)
-    onset = subject.envelope(0.0001)  # at its level at once
-    tones = [
-        [
-            subject.tone(channel, 1 / count, frequency=subject.near(at), onset=onset)
-            for channel in (0, 1)
-        ]
-        for at in range(count)
+    fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
+    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one())
+    counted = [
+        (from_a_moment(fades - 1, apart), from_a_moment(fades, ramp, apart / 1000 - left), look)
+        for left in _LEFT
     ]
-
-    async def fade() -> None:
-        for each in tones:
-            await subject.play(layer(0, *each, ramp=ramp))
-            await asyncio.sleep(_PAUSE + onset.step / 10_000)
-
-    return [(fade, layer(0, ramp=ramp))]
+    return [
+        (lasting, partial(fade, fades - 1), *cuts, *full),
+        *((lasting, partial(fade, fades - 2), *each) for each in counted),
+    ]
 
 
 @driving(_PLACE)

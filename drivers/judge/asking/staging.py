@@ -108,7 +108,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.arm(shift=shift)
     one = subject.one()
     await subject.run([stage(one)])
-    at, began = await _commit(subject, duration), clock.now()
+    at, began = await subject.commit_in(duration), clock.now()
     await subject.run([play(one, token=1), send("Commit", token=1)])
     is_ahead = 0 < duration <= MAX_AHEAD
     await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
@@ -122,20 +122,12 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.run([subject.follow])
 
 
-async def _commit(subject: Subject, duration: float) -> int:
-    """Commit the staged set for a moment that is a time [s] ahead of its last status."""
-    await subject.status()
-    at = subject.moment(duration)
-    await subject.request("Commit", token=subject.token, at=at)
-    return at
-
-
 @driving(_PLACE)
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
     left = min(0.1 * subject.slowness, 0.4)
-    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
+    waits: Rows = [stage(subject.one(level=0.25)), partial(subject.commit_in, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     first, *_ = subject.parts(half, token=2, now=0, count=3)
     ends: list[Rows] = [
@@ -146,11 +138,11 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         # It starts before what comes for its own layer.
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],
-        [stage(half), partial(_commit, subject, left / 2)],
+        [stage(half), partial(subject.commit_in, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
-    later = [waits[0], partial(_commit, subject, min(3 * left, 0.45)), *trips, 2 * left]
+    later = [waits[0], partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
     # No status is read as it starts.
-    unseen = stage(subject.one(ramp=subject.ramp)), partial(_commit, subject, left)
+    unseen = stage(subject.one(ramp=subject.ramp)), partial(subject.commit_in, left)
     return [*([*waits, *each, 1.25 * left] for each in ends), later, [*unseen, 1.25 * left]]

@@ -33,9 +33,10 @@ from drivers.judge.asking.material import (
     layer,
     play,
     send,
+    stage,
 )
 from drivers.judge.states import OFF
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
@@ -51,6 +52,7 @@ _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 RATE = 1 / QUANTITIES["rate"].per_unit
@@ -73,6 +75,7 @@ class Subject(Material):
         self.is_starving, self._is_at_rest = True, False
         self.sent_set: list[Sequence[int]] = []
         self.dating = Dating()
+        self._moment = 0  # at which a set started last, a high word of its clock
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
@@ -363,6 +366,21 @@ class Subject(Material):
     async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""
         return await self.send(play(*layers))
+
+    async def commit_in(self, duration: float) -> int:
+        """Commit the staged set for a moment a time [s] ahead of the last status; return that."""
+        at = self.moment(duration)
+        await self.request("Commit", token=self.token, at=at)
+        return at
+
+    async def at(self, *layers: LayerSet, apart: float = 0.0) -> None:
+        """Play a set from a moment of its clock on, a time [s] apart from the last such moment."""
+        await self.send(stage(*layers))
+        since = ahead(self._moment * HIGH_STEPS, self.shown.clock.present * HIGH_STEPS)
+        ahead_by = apart + since if apart else 2.5 * self.exchange_time + _LEAD
+        self._moment = await self.commit_in(ahead_by)
+        while ahead((await self.status())["clock"], self._moment * HIGH_STEPS) <= 0:
+            pass
 
     # In time
 

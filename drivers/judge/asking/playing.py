@@ -17,7 +17,7 @@ _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.2  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
-_SHARES = 0.25, 0.2, 0.12  # of the test level, of the voices that are cut
+_SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
 
@@ -308,20 +308,22 @@ def voices(subject: Subject) -> Rows:
     channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
     count, ramp = min(subject.can["voices"], _MAX_VOICES), subject.can["ramp_max"]
     fades, apart = count - others, math.ceil(5 * subject.exchange_time * 1000) + 5
-    subject.require_ramp((count + 3) * subject.exchange_time + 3 * apart / 1000)
-    shape = subject.envelope(0.1, *[_SHARES[1]] * 8)
+    at_once, shape = subject.envelope(0.0001), subject.envelope(0.1, *[_SHARES[1]] * 8)
+    pause = 0.004 + at_once.step / 10_000  # s; until a tone is at its level
+    subject.require_ramp((count + 3) * (subject.exchange_time + pause) + 3 * apart / 1000)
     ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
     quiet = (1 - sum(_SHARES)) / (count + 2)
 
     def tones(at: int, ending: Envelope | None = None) -> list[Command]:
         share = _SHARES[at] if at < len(_SHARES) else quiet
-        made = partial(subject.tone, fraction=share, frequency=subject.near(at), ending=ending)
-        return [made(each) for each in channels]
+        made = partial(subject.tone, fraction=share, frequency=subject.near(at), onset=at_once)
+        return [made(each, ending=ending) for each in channels]
 
     async def fade(number: int) -> None:
         """Have tones fade before one that lasts: the first the longest, the next by its ending."""
         for at in range(number + 1):
             await subject.play(layer(0, *tones(at, ending if at == 1 else None), ramp=ramp - at))
+            await asyncio.sleep(pause)
             if at == 1 and ending:
                 await subject.play(layer(0))
 

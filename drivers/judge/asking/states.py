@@ -112,7 +112,8 @@ async def _arm_as(subject: Subject, session: int) -> None:
 def arming_ends_fades(subject: Subject) -> Rows:
     """It is silent 5 ms after an Arm amid the fade of a Disarm."""
     disarm = send("Disarm", ramp=subject.can["ramp_max"])
-    return [subject.arm, subject.one(), disarm, subject.arm, 0.02, subject.one()]
+    fades = partial(subject.follow, 0.02)
+    return [subject.arm, subject.one(), disarm, subject.arm, fades, subject.one()]
 
 
 @driving(_STATES)

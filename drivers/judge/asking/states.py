@@ -52,7 +52,8 @@ async def watchdog_ranges(subject: Subject) -> None:
     outer = QUANTITIES["watchdog"]
     times = low - 1, high + 1, outer.minimum - 1, outer.maximum + 1, 0, 0xFFFF
     beyond = [time for time in times if not low <= time <= high]
-    await subject.run([send("Arm", watchdog=time, code="BAD_VALUE") for time in beyond])
+    arm = partial(send, "Arm", session=subject.next_session, code="BAD_VALUE")
+    await subject.run([arm(watchdog=time) for time in beyond])
     await subject.send(send("Arm", session=0, watchdog=low, code="BAD_VALUE"))
     # No feeding is needed, and none may be possible on a slow line.
     await subject.arm(low / 1000, is_fed=False)
@@ -151,6 +152,8 @@ def silence_never_later(subject: Subject) -> Rows:
         (subject.whole(), slow, quick),
         (subject.whole(), quick, slow),
         (subject.one(), fading, slow),
+        # It is what is left of a fade that counts, not how long it was.
+        (subject.whole(), send("Stop", ramp=400), 0.3, send("Stop", ramp=200)),
     ]
 
 

@@ -46,12 +46,12 @@ from registry import clock
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
-_PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest that count
+_PROMPT, _SLOWEST = 0.02, 0.1  # s; exchanges of a quick line, and the longest that count
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
-_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.012  # s
 _LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
@@ -65,6 +65,7 @@ class Subject(Material):
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
     sent_set: the parts of the last set that was sent. dating: of its statuses, by its clock.
+    is_at_rest: nothing was sent since it was brought to rest.
     """
 
     def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
@@ -72,7 +73,7 @@ class Subject(Material):
         self.client, self.identity = client, identity
         self.session, self.token = 1, 0
         self.expected: Judge | None = None
-        self.is_starving, self._is_at_rest = True, False
+        self.is_starving, self.is_at_rest = True, False
         self.sent_set: list[Sequence[int]] = []
         self.dating = Dating()
         self._moment = 0  # at which a set started last, a high word of its clock
@@ -149,7 +150,7 @@ class Subject(Material):
         self._check_fed()
         message, values = MESSAGES[name], self.filled(values)
         has_reply = _has_reply(name, raw, values)
-        self._is_at_rest = False
+        self.is_at_rest = False
         if raw is None:
             try:
                 raw = message.request.pack(values)
@@ -318,11 +319,11 @@ class Subject(Material):
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
-        self.expected = None
+        self.expected, self.dating, self._parts = None, Dating(), []
         stopped = await self.settle(await self.request("Stop", ramp=0))
         cleared = await self.request("Clear", latch=stopped["latch"])
         expect_equal(cleared["state"], OFF, "state after Clear")
-        self.expected, self._is_at_rest = Judge(self.can, cleared.values, cleared.when), True
+        self.expected, self.is_at_rest = Judge(self.can, cleared.values, cleared.when), True
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
@@ -398,7 +399,7 @@ class Subject(Material):
 
     @property
     def slowness(self) -> float:
-        """By what times must be longer than those for a line with exchanges of 10 ms or less."""
+        """By what times must be longer than those for a line with exchanges of 20 ms or less."""
         return max(min(self.exchange_time, _SLOWEST) / _PROMPT, 1.0)
 
     def lasting(self, milliseconds: int) -> int:
@@ -414,7 +415,7 @@ class Subject(Material):
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        required = max(150, math.ceil(16_000 * min(self.exchange_time, 0.05)))
+        required = max(100, math.ceil(8_000 * min(self.exchange_time, 0.1)))
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
@@ -427,7 +428,7 @@ class Subject(Material):
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
-        duration = max(0.2, 16 * min(max(self.exchange_time, self.client.transit / 2), 1.0))
+        duration = max(0.2, 8 * min(max(self.exchange_time, self.client.transit / 2), 2.0))
         step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
         self.require_knots()
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
@@ -484,7 +485,7 @@ class Subject(Material):
         """Try a case, each time from rest, until this machine was in time."""
         while True:
             began = clock.now()
-            if not self._is_at_rest:
+            if not self.is_at_rest:
                 await self.rest()
             try:
                 await case()

@@ -93,7 +93,8 @@ def after(subject: Subject) -> Rows:
 @driving(_SETS)
 def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
-    long, short = subject.long_onset, subject.envelope(0.02, 0.5)
+    long = subject.long_onset
+    short = subject.envelope(max(0.02, 2 * min(subject.exchange_time, 0.1)), 0.5)
     last = len(subject.channels) - 1
     both, exchanged = (
         [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
@@ -198,7 +199,7 @@ def onsets(subject: Subject) -> Rows:
         subject.envelope(0.05, *fractions)
         for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
     ]
-    alone = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
+    alone = [[subject.one(subject.tone(0, 0.5, 90.0, onset=shape))] for shape in shapes]
     kept = subject.one(subject.tone(0, 0.5, onset=shapes[0], keep=True))
     again = subject.one(subject.tone(0, 0.5, onset=shapes[0]), ramp=subject.ramp)
     rising = subject.one(ramp=subject.ramp), 0.4 * subject.ramp / 1000
@@ -223,6 +224,7 @@ def endings(subject: Subject) -> Rows:
         (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
         (first, layer(0, replaced, ramp=ramp)),
         (first, layer(0, subject.tone(last, keep=True), ramp=ramp), layer(0, ramp=ramp)),
+        (layer(0, unshaped), layer(0, replace(tone, keep_phase=True)), layer(0)),
     ]
 
 
@@ -240,7 +242,7 @@ def endings_amid(subject: Subject) -> Rows:
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
         (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
-        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 20)),
+        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 75)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
         (layer(0, towards_0), half, send("Silence", ramp=long)),
     ]
@@ -306,11 +308,13 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 def voices(subject: Subject) -> Rows:
     """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
     channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
-    count, ramp = min(subject.can["voices"], _MAX_VOICES), subject.can["ramp_max"]
+    count = min(subject.can["voices"], _MAX_VOICES)
     fades, apart = count - others, math.ceil(5 * subject.exchange_time * 1000) + 5
     at_once, shape = subject.envelope(0.0001), subject.envelope(0.1, *[_SHARES[1]] * 8)
     pause = 0.004 + at_once.step / 10_000  # s; until a tone is at its level
-    subject.require_ramp((count + 3) * (subject.exchange_time + pause) + 3 * apart / 1000)
+    time = (count + 3) * (subject.exchange_time + pause) + 3 * apart / 1000
+    subject.require_ramp(time)
+    ramp = min(max(math.ceil(2500 * time), 200), subject.can["ramp_max"])
     ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
     quiet = (1 - sum(_SHARES)) / (count + 2)
 
@@ -335,14 +339,15 @@ def voices(subject: Subject) -> Rows:
     lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
     fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
-    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one())
+    silence = send("Silence", ramp=0)
+    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one()), silence
     counted = [
         (from_a_moment(fades - 1, apart), from_a_moment(fades, ramp, apart / 1000 - left), look)
         for left in _LEFT
     ]
     return [
         (lasting, partial(fade, fades - 1), *cuts, *full),
-        *((lasting, partial(fade, fades - 2), *each) for each in counted),
+        *((lasting, partial(fade, fades - 2), *each, silence) for each in counted),
     ]
 
 

@@ -24,6 +24,7 @@ def stage_and_commit(subject: Subject) -> Rows:
     others = (send("Commit", token=other, code=_OLD) for other in (3, 302, 2 ^ 0x100, 0))
     return [
         subject.arm,
+        send("Commit", token=0, code=_OLD),
         subject.one(),
         stage(*both),
         *others,

@@ -172,13 +172,13 @@ class Subject(Material):
         before = self._parts_came(answer.when.latest)
         if "index" in values and answer.code and self.expected is not None:
             self.expected.part_refused(values, answer.code)
+        bits = client.wire_time(len(raw), len(answer.words))
         if not answer.code:  # a refusal may come sooner
-            bits = client.wire_time(len(raw), len(answer.words))
             client.pace = min(client.pace, took / bits if bits else 0.0)
-            beyond = max(took - client.pace * (before + bits), 0.0)
-            count = 1 if name in _READ_ALONE else client.transactions
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
-            client.reactions[name].append(beyond / count)
+        beyond = max(took - client.pace * (before + bits), 0.0)
+        count = 1 if name in _READ_ALONE else client.transactions
+        client.reactions["refusals" if answer.code else name].append(beyond / count)
         self.heard_at = answer.when.latest
         return answer
 

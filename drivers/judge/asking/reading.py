@@ -265,14 +265,16 @@ async def broadcasts(subject: Subject) -> None:
         ("Set", subject.parts(half, token=2)[0]),
         *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
         ("Clear", {"latch": subject.latch}),
-        ("Commit", {"session": 77, "token": 2, "at": 0}),
     ):
         await subject.run([subject.one(), subject.ping, _UNFED])
         await send_to_all(name, **values)
     await subject.run([stage(half), 0.1])
-    await send_to_all("Commit", is_obeyed=True, token=subject.token)
+    await send_to_all("Commit", session=77, token=subject.token)
+    at = subject.moment(0.1 * subject.slowness)
+    commit = partial(send_to_all, "Commit", is_obeyed=True, token=subject.token, at=at)
+    await subject.run([commit, subject.follow, commit])
     await subject.starve()
-    await send_to_all("Stop", is_obeyed=True, ramp=0)
+    await send_to_all("Stop", is_obeyed=True, ramp=subject.ramp)
     await subject.settle()
     await send_to_all("Clear", latch=subject.latch)
 

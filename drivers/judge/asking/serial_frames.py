@@ -15,6 +15,7 @@ from drivers.judge.asking.client import (
     Heard,
     When,
     altered,
+    expect,
     expect_equal,
     message_name,
     read_as,
@@ -130,7 +131,13 @@ class SerialClient(Client):
             (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
         )
         yield from ((what, _framed(each)) for what, each in bits)
+        stuffed, at = bytearray(good[1:-1]), 0
+        while at + stuffed[at] < len(stuffed):
+            at += stuffed[at]
+        stuffed[at] += 1
         yield from {
+            "a byte of its last block missing": b"\0" + stuffed + b"\0",
+            "eight bytes": _framed(_checked(content[:4])),
             "its last byte missing": good[:-2] + b"\0",
             "its first byte missing": b"\0" + good[2:],
             "a broken stuffing": b"\0\xff" + good[2:],
@@ -157,7 +164,13 @@ _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 @driving(_PLACE)
 async def damaged_frames(subject: Subject) -> None:
     """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
-    await subject.client.look_around()
+    client = subject.client
+    await client.look_around()
+    own = client.address
+    for client.address in client.neighbours if client.kind == "serial" else ():
+        named = await client.hello()
+        expect(named != subject.identity, "addresses that reply", expected=own, seen=client.address)
+    client.address = own
     await subject.arm()
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
@@ -196,6 +209,8 @@ async def discarded_frames(subject: Subject) -> None:
     await subject.run([subject.arm, subject.one()])
     answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
     expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")
+    head = pack_words([subject.session, subject.token + 1, 2 << 1])
+    await client.expect_silence(client.frame(_SET, head + b"\0"), "a part with half a word")
     await subject.run([stage(subject.one(level=0.5))])
     for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
         message = MESSAGES[name]

@@ -173,7 +173,8 @@ def stops_are_numbered(subject: Subject) -> Rows:
     return [
         *(send("Stop", ramp=0), send("Stop", ramp=0), send("Stop", ramp=0)),
         *(send("Clear", latch=other, code="WRONG_LATCH") for other in others),
-        *(subject.clear, subject.clear, subject.arm, subject.one(), subject.clear),
+        *(subject.clear, subject.clear, subject.arm, subject.clear),
+        *(subject.one(), subject.clear),
     ]
 
 
@@ -223,7 +224,7 @@ async def _trips_for_good(subject: Subject, time: int) -> None:
     await subject.run(
         [
             play(subject.one(), code=_WRONG),
-            0.05,
+            *(0.05, send("Stop", ramp=0)),
             arm(session=77, code=_WRONG),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
             *(send("Disarm", ramp=0), subject.clear, arm(code="WRONG_SESSION")),

@@ -158,6 +158,7 @@ def _framed(content: bytes) -> bytes:
 
 
 _PLACE = "protocol.md#checks-in-this-order"
+_UNFED = 0.01  # s; before what must not feed
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 
 
@@ -175,8 +176,9 @@ async def damaged_frames(subject: Subject) -> None:
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
     for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
-        for what, data in subject.client.damaged(number, sent):
-            await subject.client.expect_silence(data, f"message {number} with {what}")
+        for what, data in client.damaged(number, sent):
+            await asyncio.sleep(_UNFED)
+            await client.expect_silence(data, f"message {number} with {what}")
             await subject.request("GetStatus")
             await subject.ping()
 

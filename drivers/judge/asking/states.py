@@ -94,13 +94,13 @@ def sessions(subject: Subject) -> Rows:
         stage(subject.one()),
         *others,
         send("Ping", session=0, code="BAD_VALUE"),
-        *(send("Disarm", ramp=0), subject.settle),
+        *(send("Disarm", ramp=0), subject.settle, play(quarter, session=0x1235, code=_WRONG)),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
         partial(_arm_as, subject, own ^ 0x100),
         play(quarter, session=own, code="WRONG_SESSION"),
         *(send("Stop", ramp=0), subject.settle, subject.clear),
         send("Arm", watchdog=maximum, code="WRONG_SESSION"),
-        partial(_arm_as, subject, (own ^ 0x100) + 1),
+        partial(_arm_as, subject, own - 7),
     ]
 
 
@@ -294,7 +294,8 @@ def what_feeds(subject: Subject) -> Rows:
     long, *_ = subject.parts(*long_set(subject), token=3, now=0)
     feeds = (
         *(subject.ping, subject.one(), stage(subject.one(level=0.5))),
-        *(send("Commit", token=2), send("Commit", token=2), send("Set", **long)),
+        *(send("Commit", token=2), send("Commit", token=2), stage(subject.one(), token=2)),
+        send("Set", **long),
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
     return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.05, feed))]

@@ -62,11 +62,16 @@ def renew(subject: Subject) -> Rows:
         subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
         layer(1, subject.beside(1, 0.25)),
     )
+    sooner = layer(0, renew=True, valid_for=subject.lasting(100))
     third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(60))
     return [
         (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
-        (third, layer(3, renew=True), 0.12 * subject.slowness),
+        (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.12 * subject.slowness),
+        *(
+            (subject.one(valid_for=subject.lasting(before)), sooner)
+            for before in (0, 400)
+        ),
     ]
 
 

@@ -8,12 +8,13 @@ from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
-from drivers.protocol.table import COMMAND, LAYER
+from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
 from registry import clock
 
 _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
-_AROUND, _NEAR = 0.015, 0.001  # s; of a moment, in which statuses are dense; that may be either
+_AROUND, _NEAR = 0.015, 0.0005  # s; of a moment, in which statuses are dense; that may be either
+_FASTEST, _LONG = QUANTITIES["rate"].maximum, 0.2  # of the clock; s in which it shows
 
 
 @driving(_PLACE)
@@ -107,6 +108,7 @@ async def starts_at_its_moment(subject: Subject) -> None:
 async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     """Commit a set for a moment a time [s] ahead, which repeats do not move."""
     await subject.arm(shift=shift)
+    await subject.request("Ping", rate=_FASTEST if duration > _LONG else 0)
     one = subject.one()
     await subject.run([stage(one)])
     at, began = await subject.commit_in(duration), clock.now()

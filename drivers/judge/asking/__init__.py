@@ -51,7 +51,7 @@ CHECKS: tuple[Check, ...] = (
     *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
     *(states.silence, states.plays_nothing_disarmed, states.arming, states.watchdog_ranges),
     *(states.arms_again, states.sessions, states.arming_ends_fades, reading.obeys_in_time),
-    *(states.watchdog, states.watchdog_fade, states.watchdog_unread, states.what_feeds),
+    *(states.watchdog, states.watchdog_unread, states.what_feeds),
     *(states.what_does_not_feed, states.trips_amid_other_requests),
     *(states.trips_amid_fades, states.fault_list),
     *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),

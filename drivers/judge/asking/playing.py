@@ -11,7 +11,6 @@ from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.sets import Command, Envelope
-from registry import clock
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
@@ -68,10 +67,7 @@ def renew(subject: Subject) -> Rows:
         (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
         (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.12 * subject.slowness),
-        *(
-            (subject.one(valid_for=subject.lasting(before)), sooner)
-            for before in (0, 400)
-        ),
+        *((subject.one(valid_for=subject.lasting(before)), sooner) for before in (0, 400)),
     ]
 
 
@@ -140,7 +136,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
     sooner = replace(other, commands=(replace(other.commands[0], onset=subject.short_onset),))
     return [
-        (half, timed),
+        (half, replace(timed, valid_for=2 * lasts)),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
         (play(half, sooner), play(timed, beside)),

@@ -168,9 +168,10 @@ async def damaged_frames(subject: Subject) -> None:
     client = subject.client
     await client.look_around()
     own = client.address
-    for client.address in client.neighbours if client.kind == "serial" else ():
+    for other in client.neighbours if client.kind == "serial" else ():
+        client.address = other
         named = await client.hello()
-        expect(named != subject.identity, "addresses that reply", expected=own, seen=client.address)
+        expect(named != subject.identity, "addresses that reply", expected=own, seen=other)
     client.address = own
     await subject.arm()
     await subject.play(subject.one())

@@ -137,7 +137,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
-        [play(half)],
+        *([play(one)] for one in (half, subject.one(level=0.5))),
         # It starts before what comes for its own layer.
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],

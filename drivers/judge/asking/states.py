@@ -1,19 +1,15 @@
 """Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
 
 import asyncio
-import math
 from functools import partial
 from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_within, require, require_in_time
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
-from drivers.judge.states import FADE
-from drivers.protocol.clock import ahead
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import ENABLED, QUANTITIES
+from drivers.protocol.table import QUANTITIES
 from registry import clock
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
@@ -237,39 +233,6 @@ async def watchdog(subject: Subject) -> None:
     """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
     for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
         await subject.in_time(partial(_trips_for_good, subject, time))
-
-
-@driving(_SESSIONS)
-async def watchdog_fade(subject: Subject) -> None:
-    """It fades as its watchdog expires along 5 ms of its clock, neither at once nor slower."""
-    require(subject.exchange_time < _DENSE, "its exchanges are too long to see a fade of 5 ms")
-    await subject.in_time(partial(_fades, subject))
-
-
-async def _fades(subject: Subject) -> None:
-    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    due = subject.shown.fed[0] + 0.95 * subject.shown.watchdog
-    await asyncio.sleep(due - clock.now())
-    armed = seen = await subject.status()
-    while seen["state"] == ENABLED:
-        armed, seen = seen, await subject.status()
-    began, full = seen["clock"], armed["levels"][0]
-    require_in_time(ahead(began, armed["clock"]) <= _DENSE, "statuses were too far apart")
-    while True:
-        since = (ahead(seen["clock"], each) for each in (armed["clock"], began))
-        low, high = (
-            _faded(time + by) * full for time, by in zip(since, (_NEAR, -_NEAR), strict=True)
-        )
-        what = "level amid the fade of the watchdog"
-        expect_within(seen["levels"][0], low - _ROUGH, high + _ROUGH, what)
-        if not seen["levels"][0]:
-            break
-        seen = await subject.status()
-
-
-def _faded(time: float) -> float:
-    """The share of a level that is left a time [s] after a fade of 5 ms has begun."""
-    return (1 + math.cos(math.pi * min(max(time / FADE, 0.0), 1.0))) / 2
 
 
 @driving(_SESSIONS)

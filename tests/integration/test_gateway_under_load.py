@@ -203,5 +203,5 @@ def test_daemon_continues_when_gateways_are_killed_under_load(
                 gateway.process.kill()
                 gateway.process.wait()
     with Client.connect(daemon, name="test") as era:
-        sources = {contact.source for contact in era.status().contacts}
-    assert len(sources) == 1  # the watch's own
+        # the watch's own; a busy machine may have it expire between two repetitions
+        wait_for(lambda: len({contact.source for contact in era.status().contacts}) == 1)

@@ -123,9 +123,9 @@ def _flawed_shapes(subject: Subject) -> Iterator[list[int]]:
     count, knot = subject.can["knots"], (100, 0)
     wrong = (_LEVEL + 1, 0), (100, _PHASE.maximum + 1), (100, 0x10000 + _PHASE.minimum - 1)
     bare = Envelope(low, ())
-    tones = (subject.tone(0, at, onset=(at and bare) or None) for at in (0.5, 0.0))
-    ended = [replace(each, ending=bare) for each in tones]
-    for tone in (subject.tone(0, 0.5, onset=bare), *ended):
+    onset = subject.tone(0, 0.5, onset=bare)
+    ended = [replace(each, ending=bare) for each in (onset, subject.tone(0, 0.0))]
+    for tone in (onset, *ended):
         start = pack_layers([layer(0, tone)])[: -ENVELOPE.words]
         yield from ([*start, 0, step] for step in (low - 1, high + 1))
         yield [*start, count + 1, low, *knot * (count + 1)]

@@ -207,7 +207,7 @@ class ExpectedOutputs:
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             must_be = is_beyond and self.is_exact and not self.may_derate
-            if must_be > is_limited or (is_limited and self._highest < 1):
+            if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):
             if until == math.inf and (layer >= len(tokens) or not tokens[layer]):

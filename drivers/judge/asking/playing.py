@@ -62,11 +62,11 @@ def renew(subject: Subject) -> Rows:
         layer(1, subject.beside(1, 0.25)),
     )
     sooner = layer(0, renew=True, valid_for=subject.lasting(100))
-    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(60))
+    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(120))
     return [
         (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
-        (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.12 * subject.slowness),
+        (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.15 * subject.slowness),
         *((subject.one(valid_for=subject.lasting(before)), sooner) for before in (0, 400)),
     ]
 
@@ -361,6 +361,6 @@ async def limited(subject: Subject) -> None:
         "it has one frequency, whose tones interfere",
     )
     over = layer(1, subject.tone(frequency=subject.other))
-    near = layer(1, subject.tone(0, 0.995 / subject.level - 1.0, frequency=subject.other))
+    near = layer(1, subject.tone(0, 1.0 / subject.level - 1.0, frequency=subject.other))
     rows = near, over, layer(1), near, layer(1), over, layer(1)
     await subject.run([subject.arm, subject.one(), *rows])

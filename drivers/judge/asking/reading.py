@@ -84,14 +84,14 @@ async def replies_in_time(subject: Subject) -> None:
     """It begins each reply within 10 ms."""
     for name in ("GetStatus", "GetCaps", "GetFaults"):
         await _expect_prompt(subject, name, partial(subject.request, name))
-    refused = send("GetAchieved", raw=[16], code="BAD_VALUE")
-    await _expect_prompt(subject, "refusals", partial(subject.send, refused))
 
 
 @driving("protocol.md#times")
 async def obeys_in_time(subject: Subject) -> None:
     """It begins each reply to what feeds, plays and silences within 10 ms."""
+    refused = send("Ping", session=77, code="WRONG_SESSION")
     requests: dict[str, Callable[[], Awaitable[object]]] = {
+        "refusals": partial(subject.send, refused),
         "Arm": partial(subject.request, "Arm", watchdog=subject.can["watchdog_max"]),
         "Ping": subject.ping,
         "Set": partial(subject.send, stage(subject.one())),
@@ -275,7 +275,7 @@ async def broadcasts(subject: Subject) -> None:
     await subject.run([commit, subject.follow, commit])
     await subject.starve()
     await send_to_all("Stop", is_obeyed=True, ramp=subject.ramp)
-    await subject.settle()
+    await subject.run([subject.settle, 0.02])
     await send_to_all("Clear", latch=subject.latch)
 
 

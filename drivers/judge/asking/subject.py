@@ -428,7 +428,7 @@ class Subject(Material):
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
-        duration = max(0.2, 8 * min(max(self.exchange_time, self.client.transit / 2), 2.0))
+        duration = max(0.2, 12 * min(max(self.exchange_time, self.client.transit / 2), 1.3))
         step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
         self.require_knots()
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])

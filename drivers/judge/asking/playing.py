@@ -233,7 +233,7 @@ def endings(subject: Subject) -> Rows:
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     subject.require_knots()
-    knots = math.ceil(subject.slowness)
+    knots = math.ceil(min(subject.exchange_time, 0.1) / 0.01)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
     over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]
@@ -335,7 +335,7 @@ def voices(subject: Subject) -> Rows:
     def from_a_moment(at: int, ramp: int = ramp, apart: float = 0.0) -> Row:
         return partial(subject.at, layer(0, *tones(at), ramp=ramp), apart=apart)
 
-    look = partial(subject.follow, 0.008)
+    look = partial(subject.follow, 0.015)
     cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
     lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.

@@ -14,7 +14,7 @@ from drivers.protocol.sets import Command, Envelope
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 1.2  # s; in which errors of a phase add up
+_LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
@@ -242,7 +242,10 @@ def endings_amid(subject: Subject) -> Rows:
     return [
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
-        (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
+        *(
+            (subject.one(subject.tone(ending=ending)), layer(0), at, layer(0))
+            for at in (part, over[1])
+        ),
         (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 75)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
         (layer(0, towards_0), half, send("Silence", ramp=long)),

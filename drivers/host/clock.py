@@ -127,9 +127,10 @@ class HeldClock:
 
     def rate(self, time: float, *, is_playing: bool) -> int:
         """Return the rate of a Ping that is sent at a time [s]."""
-        if not self.can_be_steered or time - self._jumped_at < CLOCK_SETTLING:
-            return round(self._pace * _PER_RATE)
-        lead, error = self.lead(time), self._line.error
+        if not self.can_be_steered:
+            return 0
+        is_trusted = time - self._jumped_at >= CLOCK_SETTLING
+        lead, error = self.lead(time) if is_trusted else 0.0, self._line.error
         if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
             self._near_at = time
         is_gentle = is_playing or abs(lead) <= max(_NEAR, error)
@@ -175,7 +176,9 @@ class HeldClock:
         )
         if marks <= 1 and (is_kept or not self._lowest):
             is_reported = was_armed and self._is_armed
-            self._read(status["clock"], time, time - sent, received - time, is_reported=is_reported)
+            # A reply that is here before its request can be: the bits take less than they should.
+            late = abs(received - arrives)
+            self._read(status["clock"], time, time - sent, late, is_reported=is_reported)
             if not is_kept:  # until the first that counts
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:

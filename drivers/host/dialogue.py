@@ -67,7 +67,7 @@ _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = (
     EVENT_RECORD.words + 7
 )  # with a frame of its own, which precedes the reply to what changes the state
-_SURELY, _MAX_START_ERROR = 4.0, 0.003  # standard errors of a clock; s, of a moment by it
+_SURELY, _MAX_START_ERROR = 3.0, 0.003  # errors of a clock; s, of a moment by it
 COMMITTING = 0.1
 """Time [s] within which a commit arrives and is carried out."""
 _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is sent or received
@@ -314,11 +314,10 @@ class Dialogue:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
                 self._may_wait_until = -math.inf if is_now else now + MAX_AHEAD
-                error, starts = 0.0, None if is_now or self.starts <= now else self.starts
-                if starts is not None:
-                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
-                    self._is_start_known = error <= _MAX_START_ERROR
-                    error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
+                starts = None if is_now or self.starts <= now else self.starts
+                error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+                self._is_start_known = error <= _MAX_START_ERROR
+                error = 0.0 if starts is None else min(max(error, HIGH_TIME), _MAX_START_ERROR)
                 self.played_at = arrives if starts is None else starts
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
 

@@ -26,9 +26,6 @@ from model.structure.plate import Plate
 STRETCH = 0.008
 """Way [m] that a moving finger is answered for: until it has gone that far it is not asked anew."""
 
-TUNED_AHEAD = 0.050
-"""Way [m] to the place by which frequencies are chosen for a moving finger."""
-
 MARGIN_DB = 2.0
 """By how much less is promised while a finger moves, to it and beside it, than if it rested."""
 
@@ -66,22 +63,6 @@ def with_ways(
             ends += [replace(one, at=at) for at in (way[0], way[2])]
             found[number] = replace(one, at=way[1], load=finger.load - 2 * MIN_LOAD)
     return [*found, *ends]
-
-
-def farther_on(
-    fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
-) -> list[Finger]:
-    """Return fingers of contacts at a time [s], those that move where they come to 50 mm on."""
-    found = [*fingers]
-    for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
-        vx, vy = contact.motion.velocity(now)
-        if speed := math.hypot(vx, vy):
-            far = TUNED_AHEAD / speed
-            at = _on_plate((contact.x + vx * far, contact.y + vy * far), plate)
-            others = [each.at for each in found if each is not finger]
-            if all(math.dist(at, each) >= FINGERTIP_RADIUS for each in others):
-                found[number] = replace(finger, at=at)
-    return found
 
 
 def felt_on_ways(found: Answer, count: int) -> list[Sensation]:

@@ -63,7 +63,7 @@ class ChoiceRequest:
     before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
     whether what lasts takes longer than the control loop may wait; is_rested: whether what plays
     would do, too, but may be led to what promises more; now [s]; fading: what played before a
-    cross-fade that goes on; retunes: whether who moves may be given other frequencies.
+    cross-fade that goes on.
     """
 
     intended: Intention
@@ -73,7 +73,6 @@ class ChoiceRequest:
     is_rested: bool = False
     now: float = math.inf
     fading: Selection = _NOTHING
-    retunes: bool = False
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,6 @@ class Chooser:
                 keeps=is_long or _is_step(targets, before),
                 now=requested.now if is_long else math.inf,
                 avoided_hz=avoided,
-                retunes=requested.retunes,
             )
             if not is_long:
                 answer = _alike(answer, raised[0][1])

@@ -12,7 +12,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from controller.play.ahead import farther_on, felt_on_ways, foreign_on_ways, with_ways
+from controller.play.ahead import felt_on_ways, foreign_on_ways, with_ways
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Prediction, Selection, not_served
 from controller.play.intent import Target, band_of_table
@@ -28,18 +28,13 @@ from model.answer.answer import (
     Sensation,
 )
 from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
-from model.answer.plan import answer, worst_of
-from model.answer.search import APART_HZ
+from model.answer.plan import answer
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
-
-WORTH_ON_THE_WAY, ENOUGH_ON_THE_WAY = 6.0, 20.0
-"""How much more [dB] other frequencies must promise the worst finger while any moves, and the
-promise from which on none are given: a change is felt."""
 
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2
@@ -65,19 +60,20 @@ def answered(
     keeps: bool = True,
     now: float = math.inf,
     avoided_hz: Sequence[float] = (),
-    retunes: bool = False,
 ) -> Answer:
     """Answer the fingers of targets and of quiet contacts, those that move on their ways.
 
     before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
-    fingers, or more strongly, or retunes and they promise 6 dB more where who moves comes to;
-    now [s]: infinite where all rest; avoided_hz: frequencies that play beside it. Raises
-    InputError for fingers that are too close.
+    fingers, or more strongly; now [s]: infinite where all rest; avoided_hz: frequencies that
+    play beside it. Raises InputError for fingers that are too close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
     if len(targets) > 1 or targets[0][1].modulation_hz is not None:
         fingers = _as_layers_allow(fingers, len(targets), capabilities)
+    if math.isfinite(now):
+        contacts = [*[contact for contact, _ in targets], *quiet]
+        fingers = with_ways(fingers, contacts, now, table.plate)
     request = partial(
         answer,
         table,
@@ -86,14 +82,7 @@ def answered(
         limits=capabilities.limits,
         avoided_hz=avoided_hz,
     )
-    felt: Mapping[int, float] = _frequencies(targets, before) if keeps else {}
-    if math.isfinite(now):
-        contacts = [*[contact for contact, _ in targets], *quiet]
-        far = farther_on(fingers, contacts, now, table.plate)
-        if retunes and far != fingers and len(felt) == len(targets):
-            felt = _better_on_the_way(request, far, felt)
-        fingers = with_ways(fingers, contacts, now, table.plate)
-    kept = _tuned(fingers, felt)
+    kept = _kept(fingers, targets, before) if keeps else fingers
     if kept == fingers:
         return request(fingers)
     found = request(kept)
@@ -262,45 +251,23 @@ def _as_layers_allow(
     return found
 
 
-def _frequencies(
-    targets: Sequence[tuple[Contact, Target]], before: Mapping[tuple[ContactKey, int], Content]
-) -> dict[int, float]:
-    """The frequencies that fingers feel now, by number."""
-    felt = dict[int, float]()
-    for number, (contact, target) in enumerate(targets):
-        then = before.get((contact.key, target.voice))
-        if then is not None and then.frequency is not None:
-            felt[number] = then.frequency
-    return felt
-
-
-def _tuned(fingers: Sequence[Finger], frequencies: Mapping[int, float]) -> list[Finger]:
-    """The fingers with frequencies, by number, where their bands allow it."""
-    tuned = [*fingers]
-    for number, frequency in frequencies.items():
-        stimulus = fingers[number].stimulus
-        if stimulus is not None and stimulus.band_hz[0] <= frequency <= stimulus.band_hz[1]:
-            one = replace(stimulus, band_hz=(frequency, frequency))
-            tuned[number] = replace(fingers[number], stimulus=one)
-    return tuned
-
-
-def _better_on_the_way(
-    request: Callable[[Sequence[Finger]], Answer],
+def _kept(
     fingers: Sequence[Finger],
-    felt: Mapping[int, float],
-) -> Mapping[int, float]:
-    """The frequencies that promise much more to fingers where they come to, else those felt.
-
-    None is near one that another finger feels, which fades meanwhile.
-    """
-    found, kept = request(fingers), request(_tuned(fingers, felt))
-    new = {each: layer.frequency or 0.0 for layer in found.layers for each in layer.fingers}
-    gaps = [abs(new[one] - felt[other]) for one in new for other in felt if one != other]
-    is_apart = new.keys() == felt.keys() and min(gaps, default=0.0) >= APART_HZ
-    least = worst_of(kept)
-    is_better = least < ENOUGH_ON_THE_WAY and worst_of(found) >= least + WORTH_ON_THE_WAY
-    return new if is_apart and is_better else felt
+    targets: Sequence[tuple[Contact, Target]],
+    before: Mapping[tuple[ContactKey, int], Content],
+) -> list[Finger]:
+    """The fingers with the frequencies that they feel now, where their bands allow it."""
+    kept = [*fingers]
+    for number, (contact, target) in enumerate(targets):
+        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
+        frequency = None if then is None else then.frequency
+        if stimulus is None or frequency is None:
+            continue
+        low, high = stimulus.band_hz
+        if low <= frequency <= high:
+            tuned = replace(stimulus, band_hz=(frequency, frequency))
+            kept[number] = replace(fingers[number], stimulus=tuned)
+    return kept
 
 
 def _lowered_db(found: Answer) -> float:

@@ -232,15 +232,12 @@ class Selector:
         if not self._may_lead(step.contents, now):
             self._steps = ()
             return
-        self._note_led(step, now)
-        self._lasting = step
-        self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
-
-    def _note_led(self, chosen: Selection, now: float) -> None:
-        """Note that what lasts is led to other contents, and what fades meanwhile."""
-        new = {(each.key, each.frequency) for each in chosen.contents}
+        new = {(each.key, each.frequency) for each in step.contents}
         old = [each for each in self._lasting.contents if (each.key, each.frequency) not in new]
-        self._fading, self._led_at = replace(self._lasting, contents=tuple(old)), now
+        self._fading = replace(self._lasting, contents=tuple(old))
+        self._lasting = step
+        self._led_at = now
+        self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
     def _request_again(self) -> None:
         """Ask anew for fingers that were left without an answer, since one has ended."""
@@ -299,7 +296,6 @@ class Selector:
             takes_long,
             is_rested,
             now,
-            retunes=now >= self._led_at + MIN_INTERVAL,
         )
 
     def _playing(self, now: float) -> tuple[Selection, ...]:
@@ -331,19 +327,12 @@ class Selector:
         if chosen.steps and _situation_of(chosen.requested.intended) == self._situation:
             self._steps, self.due = chosen.steps, now
         if chosen.lasting is not None and not is_late:
-            then, new = _frequencies_of(self._lasting), _frequencies_of(chosen.lasting)
-            if then != new and then.keys() == new.keys():
-                self._note_led(chosen.lasting, now)
             self._lasting, self._is_limited = chosen.lasting, chosen.is_limited
             if self._lasting.reason in _UNANSWERED:
                 self.due = math.inf
             if chosen.is_limited:
                 ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER
-
-
-def _frequencies_of(chosen: Selection) -> dict[tuple[ContactKey, int], float | None]:
-    return {each.key: each.frequency for each in chosen.contents}
 
 
 def _situation_of(intended: Intention) -> object:

@@ -200,9 +200,9 @@ class ExpectedAmplifier(ExpectedStates):
         """Start the set that waits at its moment, or sooner before another one."""
         if self._waiting is not None:
             (early, late), token, layers, is_exact = self._waiting
-            when = min(early, sooner[0]), min(late, sooner[1])
+            when, is_at_once = (min(early, sooner[0]), min(late, sooner[1])), sooner[0] < late
             self._waiting, self._started = None, when[1]
-            self.outputs.play(layers, token, when, is_exact=is_exact)
+            self.outputs.play(layers, token, when, is_exact=is_exact, is_at_once=is_at_once)
 
     def _play(self, token: int, when: Interval, moment: Interval | None = None) -> None:
         """Play a set between two times or from a moment on, unless it is the one that plays."""

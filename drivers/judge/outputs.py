@@ -14,7 +14,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, has_flag
 
-LATE = 0.002  # s; by which a set may begin later
+LATE, SAMPLE = 0.002, 0.0001  # s; by which a set may begin later: at once; at its moment
 DRIFT = 1e-3
 """Of a time; of the amplifier's clock."""
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
@@ -102,10 +102,20 @@ class ExpectedOutputs:
         return max([time + ramp, *ends])
 
     def play(
-        self, layers: Sequence[LayerSet], token: int, when: Interval, *, is_exact: bool
+        self,
+        layers: Sequence[LayerSet],
+        token: int,
+        when: Interval,
+        *,
+        is_exact: bool,
+        is_at_once: bool = True,
     ) -> None:
-        """Play a set from some time between two on; is_exact: every command to the word."""
-        start, end = when[0], when[1] + LATE
+        """Play a set from some time between two on; is_exact: every command to the word.
+
+        is_at_once: it may begin a little later, unlike one for whose moment it has waited.
+        """
+        is_prompt = not (is_at_once or any(map(_is_timed, layers)))
+        start, end = when[0], when[1] + (SAMPLE if is_prompt else LATE)
         if self._unclear is not None and self._plays.is_ambiguous((start, end), layers):
             self._unclear(_AMBIGUOUS)
         channels = range(self.playback.channels)
@@ -197,7 +207,7 @@ class ExpectedOutputs:
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             must_be = is_beyond and self.is_exact and not self.may_derate
-            if must_be > is_limited or (is_limited and self._highest < 1):
+            if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):
             if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
@@ -248,6 +258,12 @@ class ExpectedOutputs:
             return "silent"
         before = self._before[channel] if channel < len(self._before) else 0.0
         return "commit" if abs(level - before) < _TOLERANCE else "plays"
+
+
+def _is_timed(one: LayerSet) -> bool:
+    """Whether something of a layer ends or starts later by itself, which may be late."""
+    is_shaped = any(each.onset is not None and each.onset.knots for each in one.commands)
+    return bool(one.valid_for or one.after or is_shaped)
 
 
 def one_of(known: Iterable[object]) -> str:

@@ -104,7 +104,8 @@ class ExpectedStates:
         self.fault = fault
         self._latch_again()
         self._faults.appendleft((fault, since))
-        self._fall_silent(REACTING, since, FADE, cause, has_floor=False)
+        is_whole = fault == FAULTS["WATCHDOG"] and not self._may_fail
+        self._fall_silent(REACTING, since, FADE, cause, has_floor=is_whole)
 
     def _latch_again(self) -> None:
         self.latch = None if self.latch is None else token_after(self.latch)

@@ -107,10 +107,13 @@ static struct verdict handle(struct serial *serial, const uint8_t *request, uint
     if (request[VERSION] != PROTOCOL_VERSION)
         return verdict;
     verdict.nak = message_is_known(request[TYPE]) ? NAK_BAD_LENGTH : NAK_UNKNOWN_TYPE;
-    if ((length - HEADER) % 2 != 0)
-        return verdict;
     for (uint16_t i = 0; i < count; i++)
         words[i] = (uint16_t)(request[HEADER + 2 * i] | request[HEADER + 2 * i + 1] << 8);
+    if ((length - HEADER) % 2 != 0) {
+        if (request[TYPE] == MESSAGE_SET && count > SET_BITS && is_earlier_part(words[SET_BITS]))
+            verdict.nak = NAK_NONE; // dropped without a word
+        return verdict;
+    }
     verdict = message_handle(serial->amplifier, request[TYPE], words, count, reply);
     if (request[TYPE] == MESSAGE_SET_ADDRESS && verdict.nak == NAK_NONE)
         serial->address = (uint8_t)words[SET_ADDRESS_ADDRESS];

@@ -120,7 +120,7 @@ def check_samples(pair: Pair, draw: random.Random, wait: int) -> None:
 
 
 SKIPPED = {"sensors", "steps_as_stated", "readings", "measured", "limited"}
-OF_WIRE = {"rtu": {"events", "watchdog_fade", "clock_rate"}, "tcp": {"events"}}
+OF_WIRE = {"rtu": {"events", "clock_rate"}, "tcp": {"events"}}
 """Skipped too: on RTU two silent intervals of 1.75 ms make exchanges too long for two."""
 
 

@@ -240,7 +240,7 @@ async def numbers(subject: Subject) -> None:
         sent = clock.now()
         frames = segments(number, _SET, words)[::order]
         await expect_replies(1, "frames in another order", *frames)
-        subject.played(part, When(sent, clock.now()))
+        subject.played(part, sent)
         client.number = number
         await subject.ping()
     await asyncio.sleep(_FORGOTTEN)
@@ -268,7 +268,7 @@ async def network_management(subject: Subject) -> None:
     async def stopped_by(command: str) -> None:
         sent = clock.now()
         await client.command(command)
-        subject.shown.carry_out("Stop", {"ramp": 0}, {}, When(sent, clock.now()))
+        subject.shown.carry_out("Stop", {"ramp": 0}, {}, subject.since(sent))
         data = client.packed(segments(client.next_number(), _STATUS, []))
         await client.expect_silence(data, f"GetStatus after {command}")
         await client.command("start")
@@ -305,7 +305,7 @@ async def heartbeats(subject: Subject) -> None:
         await asyncio.sleep(0.06)
         client.frames.clear()
         began = clock.now()
-        await asyncio.sleep(0.5)
+        await asyncio.sleep(0.4)
         took, beats = clock.now() - began, b"".join(client.data_of("heartbeat"))
         count = 1000 * took / interval if interval else 0
         slack, what = 0.15 * count + (interval > 0), f"heartbeats of {interval} ms in {took:.3g} s"

@@ -187,9 +187,8 @@ async def identified(client: Client, level: float) -> Subject:
         answer = await client.exchange(MESSAGES["GetCaps"].number, ())
         expect(not answer.code, "GetCaps", expected="carried out", seen=answer.code)
         can = read_as("reply to GetCaps", STATED.unpack, answer.words, is_strict=False)
-        client.known = identity, can
-    identity, can = client.known
-    return Subject(client, identity, Capabilities(can), level)
+        client.known = Subject(client, identity, Capabilities(can), level)
+    return cast(Subject, client.known)
 
 
 async def run_checks(
@@ -269,6 +268,8 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
         )
     except Finding as found:
         finding = found
+    if subject:
+        subject.is_at_rest = False  # whatever it was sent
     if isinstance(finding, Violation):
         finding.came = client.came.hex(" ")
         finding.sent = in_words(subject.sent_set) if subject else ""
@@ -280,11 +281,13 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
 
 async def _carry_out(check: Check, subject: Subject, level: float) -> None:
     """Carry out the steps of a check, from rest if it drives."""
+    subject.sent_set = []
     if check.drives:
         step = subject.can["level_step"] / FULL
         if level < step:
             raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
-        await subject.rest()
+        if not subject.is_at_rest:
+            await subject.rest()
     else:
         await subject.watch()
     rows = check.run(subject)

@@ -110,7 +110,7 @@ _STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
-QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
+QUIET = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 
 
@@ -157,7 +157,7 @@ class Client(ABC):
     """One amplifier at an address of a line.
 
     heard: messages that no request was waiting for, but Events; order: all, as they came.
-    known: its identity and capabilities, once they were read.
+    known: the amplifier as it is judged, once it was identified.
     reply_words: the longest reply to each message by its number, where it is known. quiet: time [s]
     in which a reply comes; timeout: for which one is awaited. wire_time: on the wire [s], of a
     request and a reply by their words; transit: of the longest reply; pace: how much of that it
@@ -190,7 +190,7 @@ class Client(ABC):
         self.address = address
         self.heard: list[Heard] = []
         self.order: list[Heard] = []
-        self.known: tuple[Values, Values] | None = None
+        self.known: object = None
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
         self.transit, self.pace = 0.0, 1.0

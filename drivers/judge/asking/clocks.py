@@ -4,10 +4,11 @@ import asyncio
 from functools import partial
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_equal, require
+from drivers.judge.asking.client import expect, expect_equal, require
 from drivers.judge.asking.material import Rows, send
 from drivers.judge.asking.subject import RATE, Subject
 from drivers.judge.outputs import DRIFT
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME
 from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
 from registry import clock
 
@@ -35,9 +36,12 @@ async def clock_readings(subject: Subject) -> None:
     _require_known(subject)
 
     async def read() -> None:
+        low = set()
         for at in range(_READINGS):
-            await subject.status()
+            low.add((await subject.status())["clock"] % HIGH_STEPS)
             await asyncio.sleep(_APART * (at % 7) / 7)
+        is_coarse = subject.can["clock_error"] > QUANTITIES["clock_error"].to_wire(HIGH_TIME)
+        expect(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
         await _expect_steady(subject)
 
     await subject.run([read, subject.arm, subject.one(), read])

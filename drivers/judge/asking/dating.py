@@ -1,8 +1,7 @@
-"""When an amplifier's clock was read: all its readings together date each of them.
+"""Times by an amplifier's own clock, however late this machine was.
 
-    A reading that shows u seconds came between s and r, so it showed 0 between s - u and r - u
-
-What is common to all these intervals is short, however late this machine was for some.
+A reading that shows u seconds came between s and r, so its clock is ahead of that of this machine
+by u - r to u - s. What is common to all these intervals is short.
 """
 
 from drivers.judge.asking.client import When
@@ -11,12 +10,12 @@ from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead
 from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
 
 _LONG = 5.0  # s; without a reading, after which it may have gone round
-_BESIDE = 0.001  # s; by which levels may be older than the clock beside them
+_BESIDE = 0.0002  # s; by which levels may be older than the clock beside them
 _ERROR = QUANTITIES["clock_error"]
 
 
 class Dating:
-    """The clock of one amplifier by this machine's; times [s].
+    """Times [s] by the clock of one amplifier, which began near those of this machine.
 
     pace: seconds of the clock in one of its crystal. error: by how much readings contradict each
     other beyond what the clock may drift, since that was set to 0.
@@ -29,12 +28,20 @@ class Dating:
     def forget(self) -> None:
         """Begin anew with the next reading."""
         self._last: tuple[int, float] | None = None  # the clock, and until when it was read
-        self._counted = self._low = self._high = 0.0
+        self._time, self._ahead = 0.0, (0.0, 0.0)  # of the last reading; of this machine's
 
     def shift(self, steps: int) -> None:
         """Move the clock on by steps of its high word."""
         if self._last is not None:
             self._last = (self._last[0] + steps * HIGH_STEPS) % SPAN, self._last[1]
+
+    def interval(self, when: When) -> When:
+        """Return what is between two times of this machine, behind the last reading."""
+        if self._last is None:
+            return when
+        drift = DRIFT * max(when.latest - self._last[1], 0.0)
+        low, high = self._ahead
+        return When(max(when.earliest + low - drift, self._time), when.latest + high + drift)
 
     def dated(self, clock: int, when: When, stated: int) -> When:
         """Return when a status was true that shows the clock and was read in an interval.
@@ -45,17 +52,14 @@ class Dating:
             return when
         last, self._last = self._last, (clock, when.latest)
         if last is None or when.latest - last[1] > _LONG:
-            self._counted, self._low, self._high = 0.0, *when
+            self._time = sum(when) / 2
+            self._ahead = self._time - when.latest, self._time - when.earliest
             return when
         passed, slack = ahead(clock, last[0]) / self.pace, _ERROR.from_wire(stated)
         drift = DRIFT * abs(passed)
-        self._counted += passed
-        low = max(self._low - drift, when.earliest - self._counted - slack)
-        high = min(self._high + drift, when.latest - self._counted + slack)
-        if low > high:
-            self.error = max(self.error, low - high)
-            self._counted, self._low, self._high = 0.0, *when
-            return when
-        self._low, self._high = low, high
-        first, end = low + self._counted - _BESIDE, high + self._counted + _BESIDE
-        return When(max(when.earliest, first), min(when.latest, end))
+        self._time += passed
+        first, latest = self._time - when.latest - slack, self._time - when.earliest + slack
+        low, high = max(self._ahead[0] - drift, first), min(self._ahead[1] + drift, latest)
+        self.error = max(self.error, low - high)
+        self._ahead = (low, high) if low <= high else (first, latest)
+        return When(self._time - _BESIDE, self._time)

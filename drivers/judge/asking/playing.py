@@ -7,17 +7,17 @@ from functools import partial
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import require, require_in_time
-from drivers.judge.asking.material import Rows, layer, play, send
+from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
-from drivers.protocol.table import SHORTENED_FADE
-from registry import clock
+from drivers.protocol.sets import Command, Envelope
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.2  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
-_PAUSE = 0.004  # s; between the sets of voices, at least
+_SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
+_LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
 
 
@@ -61,11 +61,13 @@ def renew(subject: Subject) -> Rows:
         subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
         layer(1, subject.beside(1, 0.25)),
     )
-    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(60))
+    sooner = layer(0, renew=True, valid_for=subject.lasting(100))
+    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(120))
     return [
         (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
-        (third, layer(3, renew=True), 0.12 * subject.slowness),
+        (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.15 * subject.slowness),
+        *((subject.one(valid_for=subject.lasting(before)), sooner) for before in (0, 400)),
     ]
 
 
@@ -92,7 +94,8 @@ def after(subject: Subject) -> Rows:
 @driving(_SETS)
 def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
-    long, short = subject.long_onset, subject.envelope(0.02, 0.5)
+    long = subject.long_onset
+    short = subject.envelope(max(0.02, 2 * min(subject.exchange_time, 0.1)), 0.5)
     last = len(subject.channels) - 1
     both, exchanged = (
         [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
@@ -133,7 +136,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
     together = subject.one(subject.tone(0, 0.5, onset=quarter), valid_for=250)
     sooner = replace(other, commands=(replace(other.commands[0], onset=subject.short_onset),))
     return [
-        (half, timed),
+        (half, replace(timed, valid_for=2 * lasts)),
         *([(half, kept)] if subject.can["frequency_step"] == 1 else []),  # else it may be another
         (half, other, timed, beside),
         (play(half, sooner), play(timed, beside)),
@@ -197,7 +200,7 @@ def onsets(subject: Subject) -> Rows:
         subject.envelope(0.05, *fractions)
         for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
     ]
-    alone = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
+    alone = [[subject.one(subject.tone(0, 0.5, 90.0, onset=shape))] for shape in shapes]
     kept = subject.one(subject.tone(0, 0.5, onset=shapes[0], keep=True))
     again = subject.one(subject.tone(0, 0.5, onset=shapes[0]), ramp=subject.ramp)
     rising = subject.one(ramp=subject.ramp), 0.4 * subject.ramp / 1000
@@ -222,6 +225,7 @@ def endings(subject: Subject) -> Rows:
         (first, layer(0, replace(quiet, skip_ending=True), ramp=ramp)),
         (first, layer(0, replaced, ramp=ramp)),
         (first, layer(0, subject.tone(last, keep=True), ramp=ramp), layer(0, ramp=ramp)),
+        (layer(0, unshaped), layer(0, replace(tone, keep_phase=True)), layer(0)),
     ]
 
 
@@ -239,7 +243,7 @@ def endings_amid(subject: Subject) -> Rows:
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
         (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
-        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 20)),
+        (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 75)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
         (layer(0, towards_0), half, send("Silence", ramp=long)),
     ]
@@ -302,82 +306,50 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 
 
 @driving(_PLACE)
-async def voices(subject: Subject) -> None:
-    """It refuses no set for its fades: the oldest fade ends within 2 ms, and what lasts stays."""
-    ramp, sets = subject.can["ramp_max"], min(subject.can["voices"], _MAX_VOICES) + 4
-    # Each tone is at its level at once, and falls along the ramp of the next set.
-    onset = subject.envelope(0.0001)
-    tones = [
-        subject.tone(0, 1 / sets, frequency=subject.near(at), onset=onset) for at in range(sets)
-    ]
-    await subject.arm()
-    subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
-    # Apart, so that the oldest has faded further than the newest, but none ends before the last.
-    pause = max(0.4 * ramp / 1000 / sets - subject.exchange_time, _PAUSE + onset.step / 10_000)
-    began = clock.now()
-    for tone in tones:
-        last = await subject.play(layer(0, tone, ramp=ramp))
-        await subject.status()  # amid the 2 ms of what is cut, on a quick line
-        await asyncio.sleep(pause)
-    require_in_time(
-        last.when.latest - began <= 0.8 * ramp / 1000,
-        "sets were too far apart for so many voices",
-    )
-    cut = 2 * SHORTENED_FADE + 16 * subject.level / sets / (subject.can["slew"] or math.inf)
+def voices(subject: Subject) -> Rows:
+    """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
+    channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
+    count = min(subject.can["voices"], _MAX_VOICES)
+    fades, apart = count - others, math.ceil(5 * subject.exchange_time * 1000) + 5
+    at_once, shape = subject.envelope(0.0001), subject.envelope(0.1, *[_SHARES[1]] * 8)
+    pause = 0.004 + at_once.step / 10_000  # s; until a tone is at its level
+    time = (count + 3) * (subject.exchange_time + pause) + 3 * apart / 1000
+    subject.require_ramp(time)
+    ramp = min(max(math.ceil(2500 * time), 200), subject.can["ramp_max"])
+    ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
+    quiet = (1 - sum(_SHARES)) / (count + 2)
+
+    def tones(at: int, ending: Envelope | None = None) -> list[Command]:
+        share = _SHARES[at] if at < len(_SHARES) else quiet
+        made = partial(subject.tone, fraction=share, frequency=subject.near(at), onset=at_once)
+        return [made(each, ending=ending) for each in channels]
+
+    async def fade(number: int) -> None:
+        """Have tones fade before one that lasts: the first the longest, the next by its ending."""
+        for at in range(number + 1):
+            await subject.play(layer(0, *tones(at, ending if at == 1 else None), ramp=ramp - at))
+            await asyncio.sleep(pause)
+            if at == 1 and ending:
+                await subject.play(layer(0))
+
+    def from_a_moment(at: int, ramp: int = ramp, apart: float = 0.0) -> Row:
+        return partial(subject.at, layer(0, *tones(at), ramp=ramp), apart=apart)
+
+    look = partial(subject.follow, 0.008)
+    cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
+    lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
-    others = [play(layer(each, tones[each], ramp=ramp)) for each in subject.layers[1:3]]
-    fade = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
-    await asyncio.sleep(cut)  # in which the oldest fade may end as it likes
-    await subject.follow(0.05)
-    for row in (*others, fade, play(subject.one())):
-        await subject.send(row)
-    await asyncio.sleep(cut)
-    await subject.follow()
-
-
-def _fading(subject: Subject) -> int:
-    """Return a ramp [ms] that is longer than the sets of as many voices as are tried."""
-    return min(subject.lasting(450), int(subject.can["ramp_max"]))
-
-
-@driving(_PLACE)
-def voices_of_layers(subject: Subject) -> Rows:
-    """It cuts fades only: what lasts on all layers plays on while others fade."""
-    ramp, share = _fading(subject), 1 / (2 * len(subject.layers))
-    others = subject.layers[1:]
-    count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
-    near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
-    least = max(near[0].level // 4, subject.can["level_step"])
-    quiet = [replace(each, level=least) for each in near[len(others) + 1 :]]
-    lasting = play(*(layer(number, near[number]) for number in others))
-
-    async def fade() -> None:
-        for tone in quiet:
-            await subject.play(layer(0, tone, ramp=ramp))
-
-    return [(lasting, fade, layer(0))]
-
-
-@driving(_PLACE)
-def voices_of_channels(subject: Subject) -> Rows:
-    """It counts the voices of each channel by itself: fades of others cut none of it."""
-    require(len(subject.channels) > 1, "it has one channel")
-    ramp, count = _fading(subject), min(subject.can["voices"], _MAX_VOICES)
-    onset = subject.envelope(0.0001)  # at its level at once
-    tones = [
-        [
-            subject.tone(channel, 1 / count, frequency=subject.near(at), onset=onset)
-            for channel in (0, 1)
-        ]
-        for at in range(count)
+    fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
+    silence = send("Silence", ramp=0)
+    full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one()), silence
+    counted = [
+        (from_a_moment(fades - 1, apart), from_a_moment(fades, ramp, apart / 1000 - left), look)
+        for left in _LEFT
     ]
-
-    async def fade() -> None:
-        for each in tones:
-            await subject.play(layer(0, *each, ramp=ramp))
-            await asyncio.sleep(_PAUSE + onset.step / 10_000)
-
-    return [(fade, layer(0, ramp=ramp))]
+    return [
+        (lasting, partial(fade, fades - 1), *cuts, *full),
+        *((lasting, partial(fade, fades - 2), *each, silence) for each in counted),
+    ]
 
 
 @driving(_PLACE)
@@ -389,6 +361,6 @@ async def limited(subject: Subject) -> None:
         "it has one frequency, whose tones interfere",
     )
     over = layer(1, subject.tone(frequency=subject.other))
-    near = layer(1, subject.tone(0, 0.995 / subject.level - 1.0, frequency=subject.other))
+    near = layer(1, subject.tone(0, 1.0 / subject.level - 1.0, frequency=subject.other))
     rows = near, over, layer(1), near, layer(1), over, layer(1)
     await subject.run([subject.arm, subject.one(), *rows])

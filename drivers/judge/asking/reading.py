@@ -89,7 +89,9 @@ async def replies_in_time(subject: Subject) -> None:
 @driving("protocol.md#times")
 async def obeys_in_time(subject: Subject) -> None:
     """It begins each reply to what feeds, plays and silences within 10 ms."""
+    refused = send("Ping", session=77, code="WRONG_SESSION")
     requests: dict[str, Callable[[], Awaitable[object]]] = {
+        "refusals": partial(subject.send, refused),
         "Arm": partial(subject.request, "Arm", watchdog=subject.can["watchdog_max"]),
         "Ping": subject.ping,
         "Set": partial(subject.send, stage(subject.one())),
@@ -135,7 +137,9 @@ def lengths(subject: Subject) -> Rows:
     known = [name for name in MESSAGES if subject.has(_FEATURE_OF.get(name, ""))]
     shorter = [(name, words[:-1]) for name in known if (words := _shortest(name))]
     longer = [(name, [*_shortest(name), 0]) for name in known if name != "Set"]
-    return [send(name, raw=words, code="BAD_LENGTH") for name, words in (*shorter, *longer)]
+    first_wrong = [send("Ping", raw=[0, 0, 0][:count], code="BAD_VALUE") for count in (1, 3)]
+    rows = [send(name, raw=words, code="BAD_LENGTH") for name, words in (*shorter, *longer)]
+    return [*rows, *first_wrong]
 
 
 @reading("protocol.md#messages")
@@ -160,9 +164,13 @@ async def hello_for_ever(subject: Subject) -> None:
     for version in (0, 2, 3, 255):
         answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
         expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
-    for number, code in ((MESSAGES["Ping"].number, "BAD_LENGTH"), (_UNKNOWN[0], "UNKNOWN_TYPE")):
-        answer = await client.exchange(number, [1, 0], behind=b"\0")
-        expect_equal(answer.code, code, f"refusal of message {number} of two and a half words")
+    ping = MESSAGES["Ping"].number
+    for number, words, code in (
+        *((ping, [1, 0], "BAD_LENGTH"), (ping, [1], "BAD_LENGTH")),
+        (_UNKNOWN[0], [1, 0], "UNKNOWN_TYPE"),
+    ):
+        answer = await client.exchange(number, words, behind=b"\0")
+        expect_equal(answer.code, code, f"refusal of message {number} with half a word")
 
 
 def _shortest(name: str) -> list[int]:
@@ -247,7 +255,7 @@ async def broadcasts(subject: Subject) -> None:
         data = subject.client.request(message.number, words, to=0)
         await subject.client.expect_silence(data, f"a {name} for all")
         if is_obeyed:
-            subject.shown.granted(name, values, {}, When(sent, clock.now()))
+            subject.shown.granted(name, values, {}, subject.since(sent))
         await subject.request("GetStatus")
 
     await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
@@ -257,15 +265,17 @@ async def broadcasts(subject: Subject) -> None:
         ("Set", subject.parts(half, token=2)[0]),
         *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
         ("Clear", {"latch": subject.latch}),
-        ("Commit", {"session": 77, "token": 2, "at": 0}),
     ):
         await subject.run([subject.one(), subject.ping, _UNFED])
         await send_to_all(name, **values)
     await subject.run([stage(half), 0.1])
-    await send_to_all("Commit", is_obeyed=True, token=subject.token)
+    await send_to_all("Commit", session=77, token=subject.token)
+    at = subject.moment(0.1 * subject.slowness)
+    commit = partial(send_to_all, "Commit", is_obeyed=True, token=subject.token, at=at)
+    await subject.run([commit, subject.follow, commit])
     await subject.starve()
-    await send_to_all("Stop", is_obeyed=True, ramp=0)
-    await subject.settle()
+    await send_to_all("Stop", is_obeyed=True, ramp=subject.ramp)
+    await subject.run([subject.settle, 0.02])
     await send_to_all("Clear", latch=subject.latch)
 
 
@@ -281,7 +291,8 @@ async def mark(subject: Subject) -> None:
         sent = clock.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))
         await asyncio.sleep(_MARKED)
-        subject.shown.carry_out("Mark", {}, {}, When(sent, sent + REACTION + client.transit))
+        when = subject.dating.interval(When(sent, sent + REACTION + client.transit))
+        subject.shown.carry_out("Mark", {}, {}, when)
         await subject.run([_MARKED, 0.1])
         expect_equal(len(client.heard), 0, "replies to a Mark for all")
 

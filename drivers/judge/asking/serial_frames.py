@@ -15,6 +15,7 @@ from drivers.judge.asking.client import (
     Heard,
     When,
     altered,
+    expect,
     expect_equal,
     message_name,
     read_as,
@@ -130,7 +131,13 @@ class SerialClient(Client):
             (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
         )
         yield from ((what, _framed(each)) for what, each in bits)
+        stuffed, at = bytearray(good[1:-1]), 0
+        while at + stuffed[at] < len(stuffed):
+            at += stuffed[at]
+        stuffed[at] += 1
         yield from {
+            "a byte of its last block missing": b"\0" + stuffed + b"\0",
+            "eight bytes": _framed(_checked(content[:4])),
             "its last byte missing": good[:-2] + b"\0",
             "its first byte missing": b"\0" + good[2:],
             "a broken stuffing": b"\0\xff" + good[2:],
@@ -151,19 +158,28 @@ def _framed(content: bytes) -> bytes:
 
 
 _PLACE = "protocol.md#checks-in-this-order"
+_UNFED = 0.01  # s; before what must not feed
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 
 
 @driving(_PLACE)
 async def damaged_frames(subject: Subject) -> None:
     """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
-    await subject.client.look_around()
+    client = subject.client
+    await client.look_around()
+    own = client.address
+    for other in client.neighbours if client.kind == "serial" else ():
+        client.address = other
+        named = await client.hello()
+        expect(named != subject.identity, "addresses that reply", expected=own, seen=other)
+    client.address = own
     await subject.arm()
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
     for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
-        for what, data in subject.client.damaged(number, sent):
-            await subject.client.expect_silence(data, f"message {number} with {what}")
+        for what, data in client.damaged(number, sent):
+            await asyncio.sleep(_UNFED)
+            await client.expect_silence(data, f"message {number} with {what}")
             await subject.request("GetStatus")
             await subject.ping()
 
@@ -178,7 +194,7 @@ async def doubled_frames(subject: Subject) -> None:
     for (part, _), data in zip(made, frames, strict=True):
         began = clock.now()
         await subject.client.send(data)
-        subject.played(part, When(began, clock.now()))
+        subject.played(part, began)
     for at, pause in ((0, 0.0), (1, 0.25), (1, 0.0)):
         await subject.client.send(frames[at])
         await subject.run([subject.ping, pause])
@@ -192,7 +208,13 @@ async def discarded_frames(subject: Subject) -> None:
     subject.require_alone()
     event = pack_words(EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1}))
     await client.expect_silence(client.frame(EVENT, event), "an Event")
-    await subject.run([subject.arm, subject.one(), stage(subject.one(level=0.5))])
+    await client.expect_silence(client.question(0), "a Hello for all")
+    await subject.run([subject.arm, subject.one()])
+    answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
+    expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")
+    head = pack_words([subject.session, subject.token + 1, 2 << 1])
+    await client.expect_silence(client.frame(_SET, head + b"\0"), "a part with half a word")
+    await subject.run([stage(subject.one(level=0.5))])
     for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
         message = MESSAGES[name]
         words = pack_words(message.request.pack(subject.filled(values)))

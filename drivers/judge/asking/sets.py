@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, require
@@ -43,13 +44,17 @@ def levels_of_every_frequency(subject: Subject) -> Rows:
 async def achieved(subject: Subject) -> None:
     """It says what each layer plays within half a step, and *exact* where that was asked."""
     await subject.arm()
-    for number in subject.layers:
+    shape = subject.envelope(0.0001)
+    for number, first in product(subject.layers, (0.5, 0.98765)):
         tones = [
             subject.tone(
                 channel,
-                (0.98765 - 0.05 * channel) / len(subject.layers),
-                20.0 * channel - 160.12,
+                (first - 0.02 * channel) / len(subject.layers),
+                20.0 * channel - 160.12 * first,
                 frequency=min(subject.frequency + 7 * channel + 40 * number, subject.highest),
+                keep=True,
+                onset=shape,
+                ending=shape,
             )
             for channel in subject.channels
         ]
@@ -118,7 +123,9 @@ def _flawed_shapes(subject: Subject) -> Iterator[list[int]]:
     count, knot = subject.can["knots"], (100, 0)
     wrong = (_LEVEL + 1, 0), (100, _PHASE.maximum + 1), (100, 0x10000 + _PHASE.minimum - 1)
     bare = Envelope(low, ())
-    for tone in (subject.tone(0, 0.5, onset=bare), subject.tone(0, 0.0, ending=bare)):
+    onset = subject.tone(0, 0.5, onset=bare)
+    ended = [replace(each, ending=bare) for each in (onset, subject.tone(0, 0.0))]
+    for tone in (onset, *ended):
         start = pack_layers([layer(0, tone)])[: -ENVELOPE.words]
         yield from ([*start, 0, step] for step in (low - 1, high + 1))
         yield [*start, count + 1, low, *knot * (count + 1)]
@@ -139,6 +146,7 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         yield _part(beyond, "BAD_CHANNEL", channels)
     for layer_set in (
         *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
+        layer(0, renew=True, after=True),
         *([layer(layers, tone)] if layers < 16 else []),
     ):
         yield _part(pack_layers([good, layer_set]))
@@ -151,11 +159,11 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
     words = pack_layers([layer(0, tone)])
     head, command = LAYER.places, COMMAND.places
     for at, word, named in (
-        (head["layer"], words[head["layer"]] | 1 << 15, (None,)),
+        *((head["layer"], words[head["layer"]] | 1 << bit, (None,)) for bit in range(11, 16)),
         *(
             (LAYER.words + command[name], word, (0,))
             for name, word in (
-                ("channel", words[LAYER.words + command["channel"]] | 1 << 12),
+                *(("channel", 1 << bit) for bit in range(8, 16)),
                 ("level", _LEVEL + 1),
                 ("phase", _PHASE.maximum + 1),
                 ("phase", 0x10000 + _PHASE.minimum - 1),

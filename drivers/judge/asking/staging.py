@@ -8,12 +8,13 @@ from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
-from drivers.protocol.table import COMMAND, LAYER
+from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
 from registry import clock
 
 _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
-_AROUND, _NEAR = 0.015, 0.001  # s; of a moment, in which statuses are dense; that may be either
+_AROUND, _NEAR = 0.015, 0.0005  # s; of a moment, in which statuses are dense; that may be either
+_FASTEST, _LONG = QUANTITIES["rate"].maximum, 0.2  # of the clock; s in which it shows
 
 
 @driving(_PLACE)
@@ -24,6 +25,7 @@ def stage_and_commit(subject: Subject) -> Rows:
     others = (send("Commit", token=other, code=_OLD) for other in (3, 302, 2 ^ 0x100, 0))
     return [
         subject.arm,
+        send("Commit", token=0, code=_OLD),
         subject.one(),
         stage(*both),
         *others,
@@ -106,9 +108,10 @@ async def starts_at_its_moment(subject: Subject) -> None:
 async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     """Commit a set for a moment a time [s] ahead, which repeats do not move."""
     await subject.arm(shift=shift)
+    await subject.request("Ping", rate=_FASTEST if duration > _LONG else 0)
     one = subject.one()
     await subject.run([stage(one)])
-    at, began = await _commit(subject, duration), clock.now()
+    at, began = await subject.commit_in(duration), clock.now()
     await subject.run([play(one, token=1), send("Commit", token=1)])
     is_ahead = 0 < duration <= MAX_AHEAD
     await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
@@ -122,35 +125,27 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.run([subject.follow])
 
 
-async def _commit(subject: Subject, duration: float) -> int:
-    """Commit the staged set for a moment that is a time [s] ahead of its last status."""
-    await subject.status()
-    at = subject.moment(duration)
-    await subject.request("Commit", token=subject.token, at=at)
-    return at
-
-
 @driving(_PLACE)
 def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
     left = min(0.1 * subject.slowness, 0.4)
-    waits: Rows = [stage(subject.one(level=0.25)), partial(_commit, subject, left)]
+    waits: Rows = [stage(subject.one(level=0.25)), partial(subject.commit_in, left)]
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     first, *_ = subject.parts(half, token=2, now=0, count=3)
     ends: list[Rows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
         [arm],
-        [play(half)],
+        *([play(one)] for one in (half, subject.one(level=0.5))),
         # It starts before what comes for its own layer.
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],
-        [stage(half), partial(_commit, subject, left / 2)],
+        [stage(half), partial(subject.commit_in, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
-    later = [waits[0], partial(_commit, subject, min(3 * left, 0.45)), *trips, 2 * left]
+    later = [waits[0], partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
     # No status is read as it starts.
-    unseen = stage(subject.one(ramp=subject.ramp)), partial(_commit, subject, left)
+    unseen = stage(subject.one(ramp=subject.ramp)), partial(subject.commit_in, left)
     return [*([*waits, *each, 1.25 * left] for each in ends), later, [*unseen, 1.25 * left]]

@@ -1,19 +1,15 @@
 """Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
 
 import asyncio
-import math
 from functools import partial
 from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_within, require, require_in_time
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
-from drivers.judge.states import FADE
-from drivers.protocol.clock import ahead
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import ENABLED, QUANTITIES
+from drivers.protocol.table import QUANTITIES
 from registry import clock
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
@@ -52,7 +48,8 @@ async def watchdog_ranges(subject: Subject) -> None:
     outer = QUANTITIES["watchdog"]
     times = low - 1, high + 1, outer.minimum - 1, outer.maximum + 1, 0, 0xFFFF
     beyond = [time for time in times if not low <= time <= high]
-    await subject.run([send("Arm", watchdog=time, code="BAD_VALUE") for time in beyond])
+    arm = partial(send, "Arm", session=subject.next_session, code="BAD_VALUE")
+    await subject.run([arm(watchdog=time) for time in beyond])
     await subject.send(send("Arm", session=0, watchdog=low, code="BAD_VALUE"))
     # No feeding is needed, and none may be possible on a slow line.
     await subject.arm(low / 1000, is_fed=False)
@@ -93,13 +90,13 @@ def sessions(subject: Subject) -> Rows:
         stage(subject.one()),
         *others,
         send("Ping", session=0, code="BAD_VALUE"),
-        *(send("Disarm", ramp=0), subject.settle),
+        *(send("Disarm", ramp=0), subject.settle, play(quarter, session=0x1235, code=_WRONG)),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
         partial(_arm_as, subject, own ^ 0x100),
         play(quarter, session=own, code="WRONG_SESSION"),
         *(send("Stop", ramp=0), subject.settle, subject.clear),
         send("Arm", watchdog=maximum, code="WRONG_SESSION"),
-        partial(_arm_as, subject, (own ^ 0x100) + 1),
+        partial(_arm_as, subject, own - 7),
     ]
 
 
@@ -112,7 +109,8 @@ async def _arm_as(subject: Subject, session: int) -> None:
 def arming_ends_fades(subject: Subject) -> Rows:
     """It is silent 5 ms after an Arm amid the fade of a Disarm."""
     disarm = send("Disarm", ramp=subject.can["ramp_max"])
-    return [subject.arm, subject.one(), disarm, subject.arm, 0.02, subject.one()]
+    fades = partial(subject.follow, 0.02)
+    return [subject.arm, subject.one(), disarm, subject.arm, fades, subject.one()]
 
 
 @driving(_STATES)
@@ -150,6 +148,8 @@ def silence_never_later(subject: Subject) -> Rows:
         (subject.whole(), slow, quick),
         (subject.whole(), quick, slow),
         (subject.one(), fading, slow),
+        # It is what is left of a fade that counts, not how long it was.
+        (subject.whole(), send("Stop", ramp=400), 0.3, send("Stop", ramp=200)),
     ]
 
 
@@ -169,7 +169,8 @@ def stops_are_numbered(subject: Subject) -> Rows:
     return [
         *(send("Stop", ramp=0), send("Stop", ramp=0), send("Stop", ramp=0)),
         *(send("Clear", latch=other, code="WRONG_LATCH") for other in others),
-        *(subject.clear, subject.clear, subject.arm, subject.one(), subject.clear),
+        *(subject.clear, subject.clear, subject.arm, subject.clear),
+        *(subject.one(), subject.clear),
     ]
 
 
@@ -219,7 +220,7 @@ async def _trips_for_good(subject: Subject, time: int) -> None:
     await subject.run(
         [
             play(subject.one(), code=_WRONG),
-            0.05,
+            *(0.05, send("Stop", ramp=0)),
             arm(session=77, code=_WRONG),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
             *(send("Disarm", ramp=0), subject.clear, arm(code="WRONG_SESSION")),
@@ -232,39 +233,6 @@ async def watchdog(subject: Subject) -> None:
     """It falls silent along 5 ms when its watchdog time has passed, and the fault is latched."""
     for time in (subject.shortest_watchdog, subject.can["watchdog_max"]):
         await subject.in_time(partial(_trips_for_good, subject, time))
-
-
-@driving(_SESSIONS)
-async def watchdog_fade(subject: Subject) -> None:
-    """It fades as its watchdog expires along 5 ms of its clock, neither at once nor slower."""
-    require(subject.exchange_time < _DENSE, "its exchanges are too long to see a fade of 5 ms")
-    await subject.in_time(partial(_fades, subject))
-
-
-async def _fades(subject: Subject) -> None:
-    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    due = subject.shown.fed[0] + 0.95 * subject.shown.watchdog
-    await asyncio.sleep(due - clock.now())
-    armed = seen = await subject.status()
-    while seen["state"] == ENABLED:
-        armed, seen = seen, await subject.status()
-    began, full = seen["clock"], armed["levels"][0]
-    require_in_time(ahead(began, armed["clock"]) <= _DENSE, "statuses were too far apart")
-    while True:
-        since = (ahead(seen["clock"], each) for each in (armed["clock"], began))
-        low, high = (
-            _faded(time + by) * full for time, by in zip(since, (_NEAR, -_NEAR), strict=True)
-        )
-        what = "level amid the fade of the watchdog"
-        expect_within(seen["levels"][0], low - _ROUGH, high + _ROUGH, what)
-        if not seen["levels"][0]:
-            break
-        seen = await subject.status()
-
-
-def _faded(time: float) -> float:
-    """The share of a level that is left a time [s] after a fade of 5 ms has begun."""
-    return (1 + math.cos(math.pi * min(max(time / FADE, 0.0), 1.0))) / 2
 
 
 @driving(_SESSIONS)
@@ -289,7 +257,8 @@ def what_feeds(subject: Subject) -> Rows:
     long, *_ = subject.parts(*long_set(subject), token=3, now=0)
     feeds = (
         *(subject.ping, subject.one(), stage(subject.one(level=0.5))),
-        *(send("Commit", token=2), send("Commit", token=2), send("Set", **long)),
+        *(send("Commit", token=2), send("Commit", token=2), stage(subject.one(), token=2)),
+        send("Set", **long),
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
     return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.05, feed))]
@@ -310,7 +279,8 @@ def what_does_not_feed(subject: Subject) -> Rows:
         play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
         play(subject.one(), token=0x8001, code="BAD_TOKEN"),
         send("Set", **flawed, code=flaws),
-        *(send("Set", **first, session=77), send("Set", **{**first, "token": 0x8001})),
+        send("Set", **first, session=77),
+        *(send("Set", **{**first, "token": token}) for token in (1, 0x8001)),
         send("Commit", token=20_000, code="BAD_TOKEN"),
         send("Commit", token=1, session=77, code="WRONG_SESSION"),
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),

@@ -33,9 +33,10 @@ from drivers.judge.asking.material import (
     layer,
     play,
     send,
+    stage,
 )
 from drivers.judge.states import OFF
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
+from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
@@ -45,12 +46,13 @@ from registry import clock
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
-_PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest that count
+_PROMPT, _SLOWEST = 0.02, 0.1  # s; exchanges of a quick line, and the longest that count
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
-_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.012  # s
+_LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 RATE = 1 / QUANTITIES["rate"].per_unit
@@ -63,6 +65,7 @@ class Subject(Material):
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
     sent_set: the parts of the last set that was sent. dating: of its statuses, by its clock.
+    is_at_rest: nothing was sent since it was brought to rest.
     """
 
     def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
@@ -70,9 +73,10 @@ class Subject(Material):
         self.client, self.identity = client, identity
         self.session, self.token = 1, 0
         self.expected: Judge | None = None
-        self.is_starving, self._is_at_rest = True, False
+        self.is_starving, self.is_at_rest = True, False
         self.sent_set: list[Sequence[int]] = []
         self.dating = Dating()
+        self._moment = 0  # at which a set started last, a high word of its clock
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
@@ -146,7 +150,7 @@ class Subject(Material):
         self._check_fed()
         message, values = MESSAGES[name], self.filled(values)
         has_reply = _has_reply(name, raw, values)
-        self._is_at_rest = False
+        self.is_at_rest = False
         if raw is None:
             try:
                 raw = message.request.pack(values)
@@ -168,13 +172,13 @@ class Subject(Material):
         before = self._parts_came(answer.when.latest)
         if "index" in values and answer.code and self.expected is not None:
             self.expected.part_refused(values, answer.code)
+        bits = client.wire_time(len(raw), len(answer.words))
         if not answer.code:  # a refusal may come sooner
-            bits = client.wire_time(len(raw), len(answer.words))
             client.pace = min(client.pace, took / bits if bits else 0.0)
-            beyond = max(took - client.pace * (before + bits), 0.0)
-            count = 1 if name in _READ_ALONE else client.transactions
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
-            client.reactions[name].append(beyond / count)
+        beyond = max(took - client.pace * (before + bits), 0.0)
+        count = 1 if name in _READ_ALONE else client.transactions
+        client.reactions["refusals" if answer.code else name].append(beyond / count)
         self.heard_at = answer.when.latest
         return answer
 
@@ -193,7 +197,7 @@ class Subject(Material):
         if made:
             expect_equal(len(self.client.heard), 0, "number of replies to parts but the last")
         for sent, part, _ in made if self.expected is not None else ():
-            self.shown.part_came(part, When(sent, latest))
+            self.shown.part_came(part, self.dating.interval(When(sent, latest)))
         if self.client.transactions > 1:  # each had its response
             return 0.0
         return sum(self.client.wire_time(words, 0) for _, _, words in made)
@@ -211,8 +215,7 @@ class Subject(Material):
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
-        if "clock" in shown:
-            answer = replace(answer, when=self._dated(name, values, shown, answer.when))
+        answer = replace(answer, when=self._dated(name, values, shown, answer.when))
         if self.expected is not None:
             if name == "Set":
                 self.token = values["token"]
@@ -231,8 +234,9 @@ class Subject(Material):
         That may have been read later than the request was carried out, but for a GetStatus.
         """
         dating, judge = self.dating, self.expected
-        if name == "Mark" or (judge is not None and judge.clock.is_marked):
-            return when
+        between = dating.interval(when)
+        if "clock" not in shown or name == "Mark" or (judge and judge.clock.is_marked):
+            return between
         if name == "Arm" and not (
             judge and judge.is_enabled and judge.session == values["session"]
         ):
@@ -242,7 +246,7 @@ class Subject(Material):
             dating.pace = 1.0
         elif name == "Ping":
             dating.pace = 1 + values["rate"] * RATE
-        return dated if name == "GetStatus" else When(when.earliest, dated.latest)
+        return dated if name == "GetStatus" else When(between.earliest, dated.latest)
 
     async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
         """Read what is played of a set that is not played to the word."""
@@ -315,11 +319,11 @@ class Subject(Material):
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
-        self.expected = None
+        self.expected, self.dating, self._parts = None, Dating(), []
         stopped = await self.settle(await self.request("Stop", ramp=0))
         cleared = await self.request("Clear", latch=stopped["latch"])
         expect_equal(cleared["state"], OFF, "state after Clear")
-        self.expected, self._is_at_rest = Judge(self.can, cleared.values, cleared.when), True
+        self.expected, self.is_at_rest = Judge(self.can, cleared.values, cleared.when), True
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
@@ -351,14 +355,33 @@ class Subject(Material):
         self.sent_set = [words]
         return part, words
 
-    def played(self, part: Values, when: When) -> None:
-        """Note that a set of one part was carried out."""
+    def since(self, sent: float) -> When:
+        """Return what is between a time of this machine and now, by the amplifier's clock."""
+        return self.dating.interval(When(sent, clock.now()))
+
+    def played(self, part: Values, sent: float) -> None:
+        """Note that a set of one part was carried out that was sent at a time."""
         self.shown.sets.sent(part)
-        self.shown.carry_out("Set", part, {}, when)
+        self.shown.carry_out("Set", part, {}, self.since(sent))
 
     async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""
         return await self.send(play(*layers))
+
+    async def commit_in(self, duration: float) -> int:
+        """Commit the staged set for a moment a time [s] ahead of the last status; return that."""
+        at = self.moment(duration)
+        await self.request("Commit", token=self.token, at=at)
+        return at
+
+    async def at(self, *layers: LayerSet, apart: float = 0.0) -> None:
+        """Play a set from a moment of its clock on, a time [s] apart from the last such moment."""
+        await self.send(stage(*layers))
+        since = ahead(self._moment * HIGH_STEPS, self.shown.clock.present * HIGH_STEPS)
+        ahead_by = apart + since if apart else 2.5 * self.exchange_time + _LEAD
+        self._moment = await self.commit_in(ahead_by)
+        while ahead((await self.status())["clock"], self._moment * HIGH_STEPS) <= 0:
+            pass
 
     # In time
 
@@ -376,7 +399,7 @@ class Subject(Material):
 
     @property
     def slowness(self) -> float:
-        """By what times must be longer than those for a line with exchanges of 10 ms or less."""
+        """By what times must be longer than those for a line with exchanges of 20 ms or less."""
         return max(min(self.exchange_time, _SLOWEST) / _PROMPT, 1.0)
 
     def lasting(self, milliseconds: int) -> int:
@@ -392,7 +415,7 @@ class Subject(Material):
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        required = max(150, math.ceil(16_000 * min(self.exchange_time, 0.05)))
+        required = max(100, math.ceil(8_000 * min(self.exchange_time, 0.1)))
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
@@ -405,7 +428,7 @@ class Subject(Material):
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
-        duration = max(0.2, 16 * min(max(self.exchange_time, self.client.transit / 2), 1.0))
+        duration = max(0.2, 12 * min(max(self.exchange_time, self.client.transit / 2), 1.3))
         step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
         self.require_knots()
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
@@ -462,7 +485,7 @@ class Subject(Material):
         """Try a case, each time from rest, until this machine was in time."""
         while True:
             began = clock.now()
-            if not self._is_at_rest:
+            if not self.is_at_rest:
                 await self.rest()
             try:
                 await case()

@@ -1,40 +1,31 @@
 """What moving fingers are answered for, and what is promised of it."""
 
-import asyncio
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from controller.play.ahead import MARGIN_DB, STRETCH, felt_on_ways, with_ways
-from controller.play.capabilities import PlaybackCapabilities
-from controller.play.chooser import Choice, ChoiceRequest, Chooser
-from controller.play.intent import HapticIntent, Target
+from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
-from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.motion import AT_REST, Motion
 from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
 from several_fingers import playable, table
-from virtual_loop import in_virtual_time
 
 MOVER, OTHER = (0.10, 0.08), (0.22, 0.12)
 NOW = 5.0
 
 
-def contact(
-    number: int, at: tuple[float, float], vx: float = 0.0, vy: float = 0.0, now: float = NOW
-) -> Contact:
-    """A contact with a velocity [m/s], at its place now [s], reported every 10 ms."""
+def contact(number: int, at: tuple[float, float], vx: float = 0.0, vy: float = 0.0) -> Contact:
+    """A contact with a velocity [m/s], at its place now, reported every 10 ms."""
     motion = AT_REST
     for step in range(-5, 1):
         time = 0.01 * step
-        motion = motion.followed(now + time, at[0] + vx * time, at[1] + vy * time)
+        motion = motion.followed(NOW + time, at[0] + vx * time, at[1] + vy * time)
     return Contact(ContactKey("a", number), *at, since=0.0, motion=motion)
 
 
@@ -118,65 +109,6 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
         least.append(20 * math.log10(own / foreign))
     assert min(least[:-1]) >= (moving.promised_contrast_db or 0.0)
     assert least[-1] < min(least[:-1])
-
-
-@pytest.mark.parametrize(
-    ("at", "other", "is_retuned"),
-    [
-        ((0.215, 0.047), (0.162, 0.186), True),  # 16.6 in place of 7.1 dB
-        ((0.037, 0.056), (0.077, 0.182), False),  # 0.7 dB more
-        ((0.075, 0.142), (0.204, 0.075), False),  # 8.4 dB, but 10 Hz from what the other feels
-    ],
-)
-def test_frequencies_are_those_for_the_place_50_mm_on(
-    at: tuple[float, float], other: tuple[float, float], is_retuned: bool
-) -> None:
-    """As of fingers that rest there, where they promise 6 dB more and keep 30 Hz; else as felt."""
-
-    def frequencies(mover: Contact, **given: Any) -> tuple[list[float | None], Mapping[Any, Any]]:
-        targets = [
-            (each, Target(each.key, 14.0, content=str(each.key.id)))
-            for each in (mover, contact(2, other))
-        ]
-        found = answered(table(), targets, (), playable(), **given)
-        played = selection_of(table(), found, targets, (), before={}).contents
-        return [each.frequency for each in played], {each.key: each for each in played}
-
-    felt, before = frequencies(contact(1, at), before={})
-    there, _ = frequencies(contact(1, (at[0] + 0.05, at[1])), before={})
-    moving = partial(frequencies, contact(1, at, vx=0.2), before=before, now=NOW)
-    assert moving()[0] == felt
-    assert moving(retunes=True)[0] == (there if is_retuned else felt)
-    assert there != felt
-
-
-@in_virtual_time
-async def test_frequencies_change_on_the_way_once_a_second_at_most() -> None:
-    """For so long after they have, answers are asked for that keep them."""
-    (x, y), other = (0.203, 0.122), contact(2, (0.022, 0.032))
-    retuned, chooser = list[bool](), Chooser(table())
-
-    class Asked:
-        def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
-            retuned.append(requested.retunes)
-            return chooser.choose(requested, capabilities)
-
-    selector = Selector(cast(Chooser, Asked()))
-    intent = HapticIntent(tuple(Target(ContactKey("a", id), 14.0) for id in (1, 2)))
-
-    async def frequencies(time: float, way: float) -> list[float | None]:
-        now = NOW + time
-        contacts = (contact(1, (x + way, y), vx=0.2 if way else 0.0, now=now), other)
-        selector.select(contacts, intent, playable(), now=now)
-        await asyncio.sleep(0.01)
-        found = selector.select(contacts, intent, playable(), now=now)
-        return [each.frequency for each in found.contents]
-
-    rested = await frequencies(0.0, 0.0)
-    assert await frequencies(0.05, 0.01) != rested
-    for time, way in ((0.1, 0.02), (1.04, 0.03), (1.06, 0.04)):
-        await frequencies(time, way)
-    assert retuned == [True, True, False, False, True]
 
 
 def test_a_finger_that_rests_is_answered_where_it_is() -> None:

@@ -145,7 +145,6 @@ def test_amplifier_with_the_least_of_all_passes(knots: int) -> None:
     far.capabilities.update(least | times)
     far.restart(0.0)
     short = {"silence_never_later", "stop_ends_all", "clear_too_early", "voices"}
-    short.add("voices_of_channels")
     shaped = {"after", "onsets", "endings", "endings_amid", "extreme_envelopes"}
     shaped |= {"after_the_last_onset", "what_waits_for_an_onset"}
     skipped = SKIPPED["serial"] | short | (set() if knots else shaped)
@@ -333,7 +332,7 @@ def test_amplifier_that_replies_just_in_time_passes(
 ) -> None:
     """After 9 ms, where 10 are allowed: every check has its verdict, or says what is not seen."""
     monkeypatch.setattr("judged_line.DELAY", 0.0045)
-    unseen = {"watchdog_fade", "clock_rate"}  # of exchanges that are too long
+    unseen = {"clock_rate"}  # of exchanges that are too long
     skipped = set() if names else SKIPPED[kind] | unseen
     twice = kind == "tcp"  # each request that changes something is a write and a read
     expect_passed(judged(kind, names), skipped, within=(1.5 if twice else 1.2) * MINUTE)

@@ -14,7 +14,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}
 FOR_ALL = {
-    "serial": {"broadcasts"},
+    "serial": {"broadcasts", "discarded_frames"},
     "rtu": {"broadcasts", "present_areas", "events"},
     "tcp": {"events"},
     "can": {"broadcasts", "network_management"},
@@ -49,7 +49,7 @@ def neighbours_of(kind: str) -> dict[int, Neighbour]:
 
 REACHING_OTHERS = [
     *("damaged_frames", "doubled_frames", "broadcasts", "present_areas", "events", "addresses"),
-    *("network_management", "exceptions", "limited"),
+    *("network_management", "exceptions", "limited", "discarded_frames"),
 ]
 """Checks that send what others hear, or listen to what all may say; and one that is skipped."""
 

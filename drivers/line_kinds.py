@@ -10,18 +10,19 @@ from urllib.parse import parse_qsl
 
 CLOCK_ERRORS: Mapping[str, float] = {
     "prompt": 0.0,
-    "native": 2e-6,
-    "usb-high-speed": 16e-6,
-    "usb-full-speed": 21e-6,
-    "ftdi": 390e-6,
-    "ftdi-low-latency": 20e-6,
+    "native": 3e-6,
+    "usb-high-speed": 15e-6,
+    "usb-full-speed": 40e-6,
+    "ftdi": 51e-6,
+    "ftdi-low-latency": 95e-6,
     "can": 5e-6,
-    "can-usb": 166e-6,
-    "ethernet": 10e-6,
+    "can-usb": 42e-6,
+    "ethernet": 8e-6,
 }
 """Error of a clock that is held over a line of a kind, rms [s].
 
-The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on.
+The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on, on lines
+of their own or with Marks.
 """
 
 SIMULATED: Final = "usb-high-speed"

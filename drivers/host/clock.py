@@ -6,8 +6,8 @@ from it, so a reading less the soonest arrival of its request is the lead of the
 the lowest ones are nearly right; the way back, with its latency timers and the waking of this
 process, does not count. Of each quarter of a second the lowest is kept, and a line is laid by least
 squares through the lower half of these: the lowest alone are the nearest where frames add, their
-mean where the operating system does. Shift and rate of the host are taken off before, so that
-steering feeds nothing back into what is measured.
+mean where the operating system does. The one above these tells how late they may be. Shift and rate
+of the host are taken off before, so that steering feeds nothing back into what is measured.
 
 The shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
 crystal's and leads the rest to zero: soon while nothing plays, else within what is not felt. A

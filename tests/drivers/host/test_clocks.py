@@ -98,13 +98,21 @@ def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> None:
     run_virtual(run())
 
 
-def test_frames_of_full_speed_are_read_at_all_phases() -> None:
-    """Heartbeats in step with frames of 1 ms would show one phase of them: 200 us and more."""
+@pytest.mark.parametrize(
+    ("kind", "seed", "bound"), [("usb-full-speed", 2, 17e-6), ("ftdi", 0, 105e-6)]
+)
+def test_frames_of_full_speed_are_read_at_all_phases(kind: str, seed: int, bound: float) -> None:
+    """In step with frames of 1 ms readings would show one phase of them: 290 us rms on each line.
+
+    Where replies take 16 ms there is one reading a heartbeat. By hand: the lowest of five at any
+    phase is late by 170 us, with a standard deviation of 140; at the end of a parabola through 16
+    of them that is 140 x 3 / sqrt(16) = 105.
+    """
 
     async def run() -> None:
-        group, clocks = await held("usb-full-speed", 2, "a", "b", "c")
+        group, clocks = await held(kind, seed, "a", "b", "c")
         await skew(group, clocks, 6.0)
-        assert await skew(group, clocks, 4.0) < 17e-6
+        assert await skew(group, clocks, 4.0) < bound
 
     run_virtual(run())
 
@@ -198,7 +206,7 @@ def test_a_clock_that_is_not_held_spoils_no_other_of_its_line(ahead: float) -> N
         end.far["a"].capabilities["clock_error"] = CLOCK_UNKNOWN
         end.far["a"].clock = AmplifierClock(Crystal(ahead=ahead))
         group = await group_of(end)
-        await skew(group, [end.far["b"].clock, end.far["c"].clock], 9.0)
+        await skew(group, [end.far["b"].clock, end.far["c"].clock], 11.0)
         assert group.clock_errors["a"] == math.inf
         assert max(group.clock_errors[each] for each in "bc") < 20e-6
 

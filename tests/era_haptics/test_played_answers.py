@@ -86,7 +86,7 @@ async def test_amplifiers_play_an_answer_as_the_plate_does(answer: era.Answer) -
         )
         await hosted.group.arm()
         await hosted.group.apply(era.commands_for(RIG, answer))
-        await hosted.beat_until(clock.now() + 1.5)
+        await hosted.beat_until(clock.now() + 4)
         hosted.bench.advance(clock.now())
         records = hosted.bench.fingers.felt(clock.now() - 0.5, clock.now())
     for number, record in enumerate(played.records):

@@ -85,7 +85,7 @@ def _exchanged(rig: Rig) -> Rig:
 
 
 def _thinner(rig: Rig) -> Rig:
-    return replace(rig, plate=replace(rig.plate, thickness=0.9 * rig.plate.thickness))
+    return replace(rig, plate=replace(rig.plate, thickness=0.87 * rig.plate.thickness))
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_faults_of_wiring_and_plate_are_told(
     if spoil is _thinner:
         likeliest = told["plate"]["explanations"][0]
         assert likeliest["key"] == "plate.thickness"
-        assert likeliest["found"] == pytest.approx(0.9 * plate.plate.thickness, rel=0.02)
+        assert likeliest["found"] == pytest.approx(0.87 * plate.plate.thickness, rel=0.02)
 
 
 def test_daemon_that_runs_keeps_its_amplifiers(typed: Typed, plate: Rig, tmp_path: Path) -> None:

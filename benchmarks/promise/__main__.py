@@ -1,6 +1,6 @@
 """What is promised to each finger and what it feels, over the wire, on plates that deviate.
 
-    python -m benchmarks.promise [--plates 60] [--cases 1,2] [--workers 2] [--report]
+    python -m benchmarks.promise [--plates 60] [--first 0] [--cases 1,2] [--workers 2] [--report]
 
 Fingers anywhere on the plate, 5 cm apart, with contents of 14 dB SL; another plate, ERAs, drives
 and fingertips for each set, drawn within the rig's uncertainty as by `era sim --seed`: the rig's
@@ -33,6 +33,7 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--plates", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first plate")
     parser.add_argument("--cases", help="numbers from 0, in the order of the table; default: all")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--report", action="store_true")
@@ -45,9 +46,9 @@ def main() -> None:
 
     numbers = [int(n) for n in options.cases.split(",")] if options.cases else [*range(len(CASES))]
     jobs = [
-        (number, seed)
+        (number, options.first + plate)
         for number in numbers
-        for seed in range(options.plates // (QUARTER if CASES[number].events else 1))
+        for plate in range(options.plates // (QUARTER if CASES[number].events else 1))
     ]
     found: dict[int, list[Outcome]] = {number: [] for number in numbers}
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:

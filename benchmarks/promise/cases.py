@@ -200,4 +200,8 @@ CASES = (
     *_clicks("where nothing else is felt", (0,), contents=0, quiet=2),
     *_clicks("beside another's content", (1,), contents=1, quiet=1),
     *_clicks("at a finger with its own buzz, beside another", (0, 1)),
+    *[
+        Case("two contents, one moves", None, is_identified=known, events=(MOVES,))
+        for known in (False, True)
+    ],
 )

@@ -70,17 +70,19 @@ async def clock_rate(subject: Subject) -> None:
     duration = max(0.35, 1.5 * width / (_HIGHEST * RATE - DRIFT))
     require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
+    silence = send("Silence", ramp=0)  # which feeds, and leaves the rate as it is
+
     async def read() -> None:
         end = clock.now() + duration
         while clock.now() < end:
-            await subject.request("GetStatus")
+            await subject.run([silence if subject.is_hungry else send("GetStatus")])
             await asyncio.sleep(_APART / 2)
         await _expect_steady(subject)
 
     fast, slow = (send("Ping", rate=each) for each in (_HIGHEST, _LOWEST))
     changing_nothing: Rows = (
         *(send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"), subject.one()),
-        *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"], shift=1)),
+        *(silence, send("Arm", watchdog=subject.can["watchdog_max"], shift=1)),
     )
     falls_silent = send("Disarm", ramp=subject.ramp), slow, subject.settle
     trips = subject.starve, subject.shortest_watchdog / 1000, subject.settle, slow

@@ -14,7 +14,7 @@ from drivers.protocol.sets import Command, Envelope
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 1.2  # s; in which errors of a phase add up
+_LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
 _SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
@@ -233,7 +233,7 @@ def endings(subject: Subject) -> Rows:
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     subject.require_knots()
-    knots = math.ceil(subject.slowness)
+    knots = math.ceil(min(subject.exchange_time, 0.1) / 0.01)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
     over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]
@@ -242,7 +242,10 @@ def endings_amid(subject: Subject) -> Rows:
     return [
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
-        (subject.one(subject.tone(ending=ending)), layer(0), over[1], layer(0)),
+        *(
+            (subject.one(subject.tone(ending=ending)), layer(0), at, layer(0))
+            for at in (part, over[1])
+        ),
         (layer(0, towards_0), half, subject.one(subject.tone(keep=True), ramp=subject.ramp + 75)),
         (subject.one(subject.tone(ending=ending)), layer(0), part, send("Silence", ramp=long)),
         (layer(0, towards_0), half, send("Silence", ramp=long)),
@@ -335,7 +338,7 @@ def voices(subject: Subject) -> Rows:
     def from_a_moment(at: int, ramp: int = ramp, apart: float = 0.0) -> Row:
         return partial(subject.at, layer(0, *tones(at), ramp=ramp), apart=apart)
 
-    look = partial(subject.follow, 0.008)
+    look = partial(subject.follow, 0.015)
     cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
     lasting = play(*(layer(number, *tones(count + number)) for number in subject.layers[1:]))
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.

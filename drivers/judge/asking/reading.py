@@ -186,7 +186,7 @@ def _shortest(name: str) -> list[int]:
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _TYPE = 0x7F  # of a frame, without the bit of a reply
-_MARKED = 0.2  # s; from a Mark until it is read
+_MARKED = 0.1  # s; from a Mark until it is read
 _UNFED, _TRIPPED = 0.05, 0.05  # s; before what must not feed; until a trip shows
 _MOVED = 0.1  # s; until an amplifier has taken its address
 

@@ -247,7 +247,7 @@ async def trips_amid_fades(subject: Subject) -> None:
 async def watchdog_unread(subject: Subject) -> None:
     """It trips at its time though nothing is asked of it, and lists the fault with its age."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    await asyncio.sleep(subject.shown.watchdog + 0.2)
+    await asyncio.sleep(subject.shown.watchdog + 0.1)
     await subject.run([send("GetFaults")])
 
 

@@ -51,7 +51,7 @@ _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
-_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.012  # s
+_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
@@ -264,7 +264,7 @@ class Subject(Material):
 
     async def status(self) -> Answer:
         """Read the status; feeds the watchdog where that is due."""
-        if self._is_hungry:
+        if self.is_hungry:
             return await self.ping()
         return await self.request("GetStatus")
 
@@ -310,7 +310,8 @@ class Subject(Material):
         return (clock.now() - self.expected.fed[0]) / self.expected.watchdog
 
     @property
-    def _is_hungry(self) -> bool:
+    def is_hungry(self) -> bool:
+        """Whether its watchdog is to be fed."""
         return self._since_fed > 0.25
 
     async def starve(self) -> None:
@@ -443,7 +444,7 @@ class Subject(Material):
         """Wait for a time [s], feeding the watchdog."""
         end = clock.now() + duration
         while (left := end - clock.now()) > 0:
-            if self._is_hungry:
+            if self.is_hungry:
                 await self.ping()
                 continue
             is_fed = self.is_starving or self.shown.state != ENABLED

@@ -1,0 +1,30 @@
+"""How long a run of conformance takes on each wire, in virtual time.
+
+    python -m benchmarks.conformance [--reply MS]
+
+Of a simulated amplifier; --reply: time from a request to its reply on the line. Printed are the
+duration of all checks [s] and how many have no verdict.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+
+import judged_line
+from drivers.judge.asking.client import Late
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.conformance")
+    parser.add_argument("--reply", type=float, default=0.4)
+    judged_line.DELAY = parser.parse_args().reply / 2000
+    for kind, name in judged_line.PROTOCOLS.items():
+        results = judged_line.judged(kind)
+        late = sum(isinstance(each.finding, Late) for each in results)
+        print(f"{name:11} {sum(each.seconds for each in results):5.1f} s, {late} without a verdict")
+
+
+if __name__ == "__main__":
+    main()

@@ -8,12 +8,14 @@ duration of all checks [s] and how many have no verdict.
 
 import argparse
 import sys
+from importlib import import_module
 from pathlib import Path
+from typing import Any
+
+from drivers.judge.asking.client import Late
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-
-import judged_line
-from drivers.judge.asking.client import Late
+judged_line: Any = import_module("judged_line")
 
 
 def main() -> None:

@@ -23,10 +23,6 @@ class Dating:
 
     def __init__(self) -> None:
         self.pace, self.error = 1.0, 0.0
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew with the next reading."""
         self._last: tuple[int, float] | None = None  # the clock, and until when it was read
         self._time, self._ahead = 0.0, (0.0, 0.0)  # of the last reading; of this machine's
 

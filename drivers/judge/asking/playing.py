@@ -287,11 +287,11 @@ async def _expect_cancelled(subject: Subject) -> None:
     left = HIGH_WORDS - subject.shown.clock.present - round(_LONG / 2 / HIGH_TIME)
     await subject.arm(shift=left % HIGH_WORDS)
     subject.shown.outputs.interferes = True
-    halves = (subject.tone(0, 0.5, each, frequency=subject.near(1) | 1) for each in (0.0, 180.0))
-    for number, tone in enumerate(halves):
-        await subject.play(layer(number, tone))
-        await subject.pause(_LONG * (number == 0))
-    await subject.run([subject.status])
+    one, opposite = (
+        layer(number, subject.tone(0, 0.5, 180.0 * number, frequency=subject.near(1) | 1))
+        for number in (0, 1)
+    )
+    await subject.run([one, _LONG, opposite, subject.status])
 
 
 async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
@@ -299,13 +299,10 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
     await subject.arm()
     subject.shown.outputs.interferes = True
     first, second = (
-        replace(subject.tone(0, 0.5, each), frequency=max(subject.lowest, _SLOW))
-        for each in (0.0, phase)
+        layer(number, subject.tone(0, 0.5, each, frequency=max(subject.lowest, _SLOW)))
+        for number, each in enumerate((0.0, phase))
     )
-    for number, tone in ((0, first), (1, second), (0, first)):
-        await subject.play(layer(number, tone))
-        await subject.pause(time)
-        await subject.status()
+    await subject.run([first, time, second, time, first, time, subject.status])
 
 
 @driving(_PLACE)

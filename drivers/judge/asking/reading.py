@@ -138,8 +138,8 @@ def lengths(subject: Subject) -> Rows:
     shorter = [(name, words[:-1]) for name in known if (words := _shortest(name))]
     longer = [(name, [*_shortest(name), 0]) for name in known if name != "Set"]
     first_wrong = [send("Ping", raw=[0, 0, 0][:count], code="BAD_VALUE") for count in (1, 3)]
-    rows = [send(name, raw=words, code="BAD_LENGTH") for name, words in (*shorter, *longer)]
-    return [*rows, *first_wrong]
+    lengths = (*shorter, *longer)
+    return [*(send(name, raw=words, code="BAD_LENGTH") for name, words in lengths), *first_wrong]
 
 
 @reading("protocol.md#messages")

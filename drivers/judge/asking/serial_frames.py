@@ -131,12 +131,11 @@ class SerialClient(Client):
             (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
         )
         yield from ((what, _framed(each)) for what, each in bits)
-        stuffed, at = bytearray(good[1:-1]), 0
-        while at + stuffed[at] < len(stuffed):
-            at += stuffed[at]
-        stuffed[at] += 1
+        # Without zeros, so that it is one block, whose length is wrong.
+        statuses = (self.request(_STATUS, []) for _ in range(_SEQUENCES))
+        plain = next(each for each in statuses if each[1] == len(each) - 2)
         yield from {
-            "a byte of its last block missing": b"\0" + stuffed + b"\0",
+            "a block that goes on behind its end": b"\0\xff" + plain[2:],
             "eight bytes": _framed(_checked(content[:4])),
             "its last byte missing": good[:-2] + b"\0",
             "its first byte missing": b"\0" + good[2:],
@@ -159,7 +158,7 @@ def _framed(content: bytes) -> bytes:
 
 _PLACE = "protocol.md#checks-in-this-order"
 _UNFED = 0.01  # s; before what must not feed
-_PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
+_PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))
 
 
 @driving(_PLACE)

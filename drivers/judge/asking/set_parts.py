@@ -183,8 +183,8 @@ def empty_sets(subject: Subject) -> Rows:
     empty = [_with(first, index=at, parts=4, stream=[]) for at in (0, 2)]
     empty_set = _with(last, token=2, index=0, parts=1, stream=[])
     # Modbus has a response to each, which takes longer than a set lives.
-    parts = 127 if subject.client.transactions == 1 else 9
-    many = [_with(first, token=5, index=at, parts=parts, stream=[]) for at in range(parts)]
+    count = 127 if subject.client.transactions == 1 else 9
+    many = [_with(first, token=5, index=at, parts=count, stream=[]) for at in range(count)]
     return [
         *(subject.arm, one, empty_set, send("Commit", token=2)),
         *(_with(empty_set, token=3, now=1), 0.1),

@@ -315,9 +315,8 @@ async def trips_amid_other_requests(subject: Subject) -> None:
 
 
 @driving("protocol.md#messages")
-async def fault_list(subject: Subject) -> None:
+def fault_list(subject: Subject) -> Rows:
     """It lists faults, the newest first, by their ages, also after they were cleared."""
-    for _ in range(2):
-        await _trips(subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
-        await subject.clear()
-    await subject.run([send("GetFaults"), 0.1, send("GetFaults")])
+    trip = partial(_trips, subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
+    listed = send("GetFaults")
+    return [trip, subject.clear, trip, subject.clear, listed, 0.1, listed]

@@ -210,13 +210,15 @@ def check(path: Path, text: str | None = None) -> tuple[int, list[dict[str, str]
 
 
 def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
-    """The example has none, nor have two links, of which `clocks` tells; an exact thickness has."""
+    """The example has none; two links that cost some of the promise have, as an exact thickness."""
     assert check(example_rig_path()) == (0, [], [])
     links = EXAMPLE.replace(
         'main: {url: "sim://"}',
         "main: {url: 'serial:///dev/ttyUSB0'}\n  two: {url: 'can+python-can://virtual/v#1'}",
     ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
-    assert check(tmp_path / "rig.yaml", links) == (0, [], [])
+    status, errors, (warning,) = check(tmp_path / "rig.yaml", links)
+    assert (status, errors) == (0, [])
+    assert "ftdi-low-latency" in warning
     exact = EXAMPLE + "\nuncertainty: {thickness: 0}\n"
     status, errors, (warning,) = check(tmp_path / "rig.yaml", exact)
     assert (status, errors) == (0, [])

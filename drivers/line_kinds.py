@@ -21,8 +21,8 @@ CLOCK_ERRORS: Mapping[str, float] = {
 }
 """Error of a clock that is held over a line of a kind, rms [s].
 
-The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on, on lines
-of their own or with Marks.
+The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on; not
+of Modbus RTU, nor of a bus without Marks, whose clocks are known less well at first.
 """
 
 SIMULATED: Final = "usb-high-speed"

@@ -376,13 +376,21 @@ class Subject(Material):
         return at
 
     async def at(self, *layers: LayerSet, apart: float = 0.0) -> None:
-        """Play a set from a moment of its clock on, a time [s] apart from the last such moment."""
+        """Play a set from a moment of its clock on, a time [s] apart from the last such moment.
+
+        Raises Late where its Commit may have come behind that.
+        """
         await self.send(stage(*layers))
-        since = ahead(self._moment * HIGH_STEPS, self.shown.clock.present * HIGH_STEPS)
-        ahead_by = apart + since if apart else 2.5 * self.exchange_time + _LEAD
-        self._moment = await self.commit_in(ahead_by)
-        while ahead((await self.status())["clock"], self._moment * HIGH_STEPS) <= 0:
-            pass
+        lead = 2.5 * self.exchange_time + _LEAD
+        self._moment = await self.commit_in(self._until_moment + apart if apart else lead)
+        require_in_time(self._until_moment > HIGH_TIME, "a Commit came behind its moment")
+        while self._until_moment >= 0:
+            await self.status()
+
+    @property
+    def _until_moment(self) -> float:
+        """The time [s] from the last status until that moment, less than a step more or less."""
+        return ahead(self._moment * HIGH_STEPS, self.shown.clock.present * HIGH_STEPS)
 
     # In time
 

@@ -153,7 +153,9 @@ export class EraClient extends EventEmitter {
     const socket = connect(this.#path);
     await new Promise((resolve, reject) => socket.once("connect", resolve).once("error", reject));
     this.#socket = socket;
-    createInterface({ input: socket }).on("line", (line) => this.#received(JSON.parse(line)));
+    createInterface({ input: socket })
+      .on("line", (line) => this.#received(JSON.parse(line)))
+      .on("error", () => {}); // those of the socket are its own, too
     socket.on("error", () => {}); // "close" follows
     socket.on("close", () => this.#rejectPending());
     this.hello = await this.call("hello", { client: this.#name });

@@ -3,10 +3,10 @@
     python -m benchmarks.identification [--plates 50] [--sets 2] [--kinds plain,form,hard,uneven]
         [--rounds 4] [--sensors 4] [--report]
 
-Hidden plates are thin plates in Hermite elements with viscous modal losses, in a process of their
-own; measured are responses at the four ERAs to 27 tones with 1 % noise. Judged is the contrast of
-the model's answers on the hidden plate with drives good to 1 % and 1°, for the rig as written, as
-identified, and for the plate known exactly. --rounds: of interleaved tones, 1 is the quick check.
+Hidden plates are thin plates in Hermite elements with viscous modal losses; measured are responses
+at the four ERAs to 27 tones with 1 % noise. Judged is the contrast of the model's answers on the
+hidden plate with drives good to 1 % and 1°, for the rig as written, as identified, and for the
+plate known exactly. --rounds: of interleaved tones, 1 is the quick check.
 --sensors: how many, such as 3,4,6: at the first ERAs, then inside the plate; of several, or of
 kinds outside the model's family (wedge, bumps, frame, loose, heavy, two), it is counted how many
 plates are refused, and how the others keep what is promised.
@@ -35,30 +35,30 @@ def main() -> None:
     use_one_thread()
 
     from benchmarks.identification.answers import table_of
-    from benchmarks.identification.hidden import FAMILY
+    from benchmarks.identification.hidden import FAMILY, draw
     from benchmarks.identification.plates import FREQUENCIES, outcome
-    from benchmarks.identification.server import hidden_plates
     from benchmarks.identification.tables import PAGE, contrasts, fits, kept_or_refused, promises
     from model.rig.file import load_rig
 
     rig = load_rig(RIG)
     written = {loaded: table_of(rig, FREQUENCIES, loaded=loaded) for loaded in (False, True)}
     found = []
-    with hidden_plates() as plates:
-        for seed in range(options.first, options.first + options.plates):
-            for kind, sensors in product(options.kinds.split(","), options.sensors.split(",")):
-                one = outcome(
-                    *(plates, rig, written, kind, seed),
-                    sets=options.sets,
-                    rounds=options.rounds,
-                    sensors=int(sensors),
-                )
-                found.append(one)
-                print(
-                    f"plate {seed} {kind}, {sensors} sensors: chi² {one.chi2:.2f}, modes shifted "
-                    f"by {one.mode_shift:.2f} {one.refusal}",
-                    flush=True,
-                )
+    seeds = range(options.first, options.first + options.plates)
+    for seed, kind in product(seeds, options.kinds.split(",")):
+        hidden = draw(kind, seed)
+        for sensors in options.sensors.split(","):
+            one = outcome(
+                *(hidden, rig, written, kind, seed),
+                sets=options.sets,
+                rounds=options.rounds,
+                sensors=int(sensors),
+            )
+            found.append(one)
+            print(
+                f"plate {seed} {kind}, {sensors} sensors: chi² {one.chi2:.2f}, modes shifted "
+                f"by {one.mode_shift:.2f} {one.refusal}",
+                flush=True,
+            )
     is_outside = options.sensors != "4" or not {*options.kinds.split(",")} <= {*FAMILY}
     texts = {"outside": kept_or_refused(found)} if is_outside else {}
     if not is_outside:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.identification.server import HiddenPlates
+from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted, Reals
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
@@ -56,9 +56,7 @@ def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
     return errors
 
 
-def fields_held(
-    found: Identification, plates: HiddenPlates, kind: str, seed: int, frequencies: Reals
-) -> Reals:
+def fields_held(found: Identification, hidden: Hidden, frequencies: Reals) -> Reals:
     """Squared distances of true fields from those identified, in their covariance, (values,)."""
     plate, model = found.before.plate, found.fitted.problem.model
     points = _PLACES * [plate.length, plate.width]
@@ -71,7 +69,7 @@ def fields_held(
     J = jacobian(at)[:, len(model.sensors) :]
     own_fields = at.responses[:, len(model.sensors) :]
     nothing = np.zeros((0, 4))
-    true = np.array([plates.felt(kind, seed, float(f), points, points, nothing) for f in tones])
+    true = np.array([hidden.felt(float(f), points, points, nothing) for f in tones])
     error = own_fields - true
     parts = np.stack([J.real, J.imag], axis=-2)
     spread = parts @ known.covariance @ parts.swapaxes(-1, -2)

@@ -45,6 +45,16 @@ class Hidden:
         parts = noise[:, 0] + 1j * noise[:, 1]
         return np.asarray(clean + NOISE * np.abs(clean) * parts[0] + FLOOR * rms * parts[1])
 
+    def felt(self, frequency: float, points: Reals, fingers: Reals, factors: Reals) -> Complexes:
+        """Acceleration at points (p, 2) per base displacement (p, n) [1/s²].
+
+        fingers (k, 2) [m], factors (k, 4) of their loads, (0, 4) for weightless ones.
+        """
+        loads = np.array([finger_stiffness(frequency, each) for each in factors], dtype=complex)
+        return self.mounted.accelerations(
+            frequency, points, fingers=fingers if len(loads) else None, loads=loads
+        )
+
 
 def draw(kind: str, seed: int) -> Hidden:
     """Draw a plate of a set.

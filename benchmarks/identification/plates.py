@@ -7,8 +7,7 @@ import numpy as np
 
 from benchmarks.identification.answers import Answer, answer, known_table, table_of
 from benchmarks.identification.coverage import fields_held, parameters_held
-from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD
-from benchmarks.identification.server import HiddenPlates
+from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD, Hidden
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
 from model.errors import InputError
@@ -51,7 +50,7 @@ class Outcome:
 
 
 def outcome(
-    plates: HiddenPlates,
+    hidden: Hidden,
     rig: Rig,
     written: dict[bool, LocalizationTable],
     kind: str,
@@ -69,7 +68,7 @@ def outcome(
     found = Outcome(kind, {}, sensors=sensors)
     started = time.process_time()
     try:
-        measured = _measurement(plates, rig, kind, seed, rounds, sensors)
+        measured = _measurement(hidden, rig, seed, rounds, sensors)
         identified = identify(rig, measured, seed=seed)
     except InputError as refusal:
         found.refusal = str(refusal)
@@ -80,10 +79,10 @@ def outcome(
     if identified.held_out:
         found.held_out = identified.held_out.total
         found.unexplained = identified.held_out.unexplained
-    truth = plates.truth(kind, seed)
-    shapes = truth.plate.shapes(written[False].raster.points)
-    found.errors = parameters_held(identified, truth)
-    found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
+    own = hidden.mounted
+    shapes = own.plate.shapes(written[False].raster.points)
+    found.errors = parameters_held(identified, own)
+    found.fields = fields_held(identified, hidden, FREQUENCIES)
     is_judged = identified.is_explained or kind in FAMILY
     for loaded in (False, True) if sets and is_judged else ():
         tables = {"written": written[loaded], "identified": _table(identified, loaded)}
@@ -95,15 +94,13 @@ def outcome(
                 factors = np.exp(LOAD_STD * rng.standard_normal((quiet + 1, 4)))
                 if not loaded:
                     factors = factors[:0]
-                known = known_table(written[loaded], truth, shapes, factors)
+                known = known_table(written[loaded], own, shapes, factors)
                 error = 1 + GAIN * rng.standard_normal(len(rig.eras))
                 turn = np.radians(PHASE_DEG) * rng.standard_normal(len(rig.eras))
                 drives = error * np.exp(1j * turn)
                 for way, table in {**tables, "known": known}.items():
                     tone = answer(table, places)
-                    contrast, level = _felt(
-                        plates, rig, (kind, seed), places, factors, tone, drives
-                    )
+                    contrast, level = _felt(hidden, rig, places, factors, tone, drives)
                     found.contrasts.setdefault((way, loaded, quiet), []).append(contrast)
                     if way == "identified":
                         for what, reached in (
@@ -118,10 +115,8 @@ def _table(identified: Identification, loaded: bool) -> LocalizationTable:
     return table_of(identified.rig, FREQUENCIES, loaded=loaded)
 
 
-def _measurement(
-    plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int, count: int
-) -> Measurement:
-    values = plates.measured(kind, seed, FREQUENCIES, count)
+def _measurement(hidden: Hidden, rig: Rig, seed: int, rounds: int, count: int) -> Measurement:
+    values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]), count)
     played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     sensors += [Sensor(f"inside {n}", x=x, y=y) for n, (x, y) in enumerate(INSIDE.tolist())]
@@ -129,9 +124,8 @@ def _measurement(
 
 
 def _felt(
-    plates: HiddenPlates,
+    hidden: Hidden,
     rig: Rig,
-    which: tuple[str, int],
     places: Reals,
     factors: Reals,
     tone: Answer,
@@ -143,7 +137,7 @@ def _felt(
     """
     discs = [fingertip_points(float(x), float(y), rig.plate) for x, y in places]
     points = np.concatenate(discs)
-    unit = plates.felt(*which, tone.frequency, points, places, factors)
+    unit = hidden.felt(tone.frequency, points, places, factors)
     fields = np.abs(unit @ (tone.bases * drives))
     weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), rig.plate)
     own = len(discs[0])

@@ -7,15 +7,12 @@ duration of all checks [s] and how many have no verdict.
 """
 
 import argparse
-import sys
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
+from benchmarks.setting import support
 from drivers.judge.asking.client import Late
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-judged_line: Any = import_module("judged_line")
+judged_line: Any = support("judged_line")
 
 
 def main() -> None:

@@ -1,15 +1,18 @@
 """What benchmarks on the paper's plate have in common; numpy is loaded only when it is used."""
 
 import os
+import sys
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
 
     from model.arrays import FloatArray
 
-RIG = Path(__file__).parents[1] / "examples" / "paper_plate.yaml"
+_ROOT = Path(__file__).parents[1]
+RIG = _ROOT / "examples" / "paper_plate.yaml"
 APART = 0.05  # m; between the fingers of a contact set
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -17,6 +20,14 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_
 def use_one_thread() -> None:
     """Let linear algebra use one thread; call before numpy is loaded."""
     os.environ.update(ONE_THREAD)
+
+
+def support(module: str) -> Any:
+    """Return a module of the support of the tests, which they import by its name alone."""
+    folder = str(_ROOT / "tests" / "support")
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    return import_module(module)
 
 
 def random_contacts(

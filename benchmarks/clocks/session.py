@@ -5,15 +5,13 @@ Crystals are 50 ppm off and warm up, as `draw_imperfections` has them.
 
 import asyncio
 import math
-import sys
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
+from benchmarks.setting import support
 from controller.play.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
@@ -24,12 +22,11 @@ from registry import clock
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
-_rig_on_wire: Any = import_module("rig_on_wire")
-_small_table: Any = import_module("small_table").small_table
-_intents: Any = import_module("newest_contact").BuzzNewestContact
-_paper_rig: Any = import_module("paper_plate").make_paper_rig
-run_virtual: Any = import_module("virtual_loop").run_virtual
+_rig_on_wire: Any = support("rig_on_wire")
+_small_table: Any = support("small_table").small_table
+_intents: Any = support("newest_contact").BuzzNewestContact
+_paper_rig: Any = support("paper_plate").make_paper_rig
+run_virtual: Any = support("virtual_loop").run_virtual
 
 NAMES = ("west", "middle", "east")
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}

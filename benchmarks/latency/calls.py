@@ -7,12 +7,11 @@ a second.
 """
 
 import asyncio
-import sys
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from benchmarks.setting import support
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
@@ -30,9 +29,8 @@ from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(_ROOT / "tests" / "support"))
-_run_virtual: Any = import_module("virtual_loop").run_virtual
-_Recorder: Any = import_module("own_calls").Recorder
+_run_virtual: Any = support("virtual_loop").run_virtual
+_Recorder: Any = support("own_calls").Recorder
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
 

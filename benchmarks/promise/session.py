@@ -6,14 +6,11 @@ a witness reads every byte.
 
 import asyncio
 import math
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib import import_module
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +28,7 @@ from benchmarks.promise.cases import (
 )
 from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
 from benchmarks.promise.heard import Heard, Log, Span
-from benchmarks.setting import random_contacts
+from benchmarks.setting import random_contacts, support
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
 from controller.play.layers import CROSSFADE, FALL_AFTER
@@ -43,9 +40,8 @@ from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.line_kinds import PROMPT
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the chain
-_chain: Any = import_module("chain").Chain
-_run_virtual: Any = import_module("virtual_loop").run_virtual
+_chain: Any = support("chain").Chain
+_run_virtual: Any = support("virtual_loop").run_virtual
 
 SETTLING, STEADY, FIRST, NEXT = 2.0, 0.25, 0.100, 0.080  # s
 EARLY = 0.020  # s; by which amplifiers may start before another: less than between two cross-fades

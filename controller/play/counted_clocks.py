@@ -25,15 +25,24 @@ class CountedClocks:
     def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
         self._rig, self._now = rig, now
         self._names = sorted(rig.channel_counts)
-        self._known: Mapping[str, float] = {}  # by the plan that is being made
         self.errors: dict[str, float] = {}
         """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
 
-    def counted_by(self, table: LocalizationTable) -> LocalizationTable:
-        """The table with the clocks as they are counted now; takes no time."""
+    @property
+    def known(self) -> Mapping[str, float]:
+        """What is known by name now, rms [s]; empty where nothing is counted."""
+        return self._now() if self.errors else {}
+
+    def counted_by(
+        self, table: LocalizationTable, known: Mapping[str, float] | None = None
+    ) -> LocalizationTable:
+        """The table with the clocks as they are counted now; takes no time.
+
+        known: of now, if that was looked up.
+        """
         if len(self._names) < 2:
             return table
-        known = self._known or self._now()
+        known = known or self._now()
         if self._is_other(known):
             before = self.errors
             self.errors = {name: MARGIN * known[name] for name in self._names}
@@ -41,10 +50,11 @@ class CountedClocks:
         eras = [era.name for era in table.eras]
         return table.with_clocks(ClockErrors.of(eras, self._rig.wiring, self.errors))
 
-    @property
-    def is_one_lost(self) -> bool:
-        """Whether a clock is held no longer to those with which its amplifier shares contents."""
-        self._known = known = self._now() if self.errors else {}
+    def is_one_lost(self, known: Mapping[str, float]) -> bool:
+        """Whether one is held no longer to those with which its amplifier shares contents.
+
+        known: of now.
+        """
         for name, counted in self.errors.items():  # with each plan: no further calls
             if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
                 return True

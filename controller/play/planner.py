@@ -125,15 +125,10 @@ class Planner:
         layers.builder = replace(layers.builder, timing=timing)
         self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
 
-    def _count_clocks(self, *, is_one_lost: bool) -> None:
-        """Answer by the clocks as they are now.
-
-        What plays stays until it changes, but for what one that is lost may be part of.
-        """
-        if is_one_lost:
-            self._selector.choose_anew()
+    def _count_clocks(self, known: Mapping[str, float] | None = None) -> None:
+        """Answer by the clocks as they are now; what plays stays until it changes."""
         chooser = self._selector.chooser
-        counted = self.clocks.counted_by(chooser.table)
+        counted = self.clocks.counted_by(chooser.table, known)
         if counted is not chooser.table:
             self._selector.chooser = replace(chooser, table=counted)
 
@@ -145,7 +140,7 @@ class Planner:
         """
         mode, timing = self.capabilities.drive_mode, self.timing
         prepare_answers(self._selector.chooser.table, mode)
-        self._count_clocks(is_one_lost=False)
+        self._count_clocks()
         table = self._selector.chooser.table
         timing.prepare(table.frequencies.tolist())
         plate, support = table.plate, self.capabilities.envelope_support
@@ -248,12 +243,15 @@ class Planner:
         before, contacts = self._plan, self._tracker.contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
-            is_one_lost = self.clocks.is_one_lost
+            known = self.clocks.known
+            is_one_lost = self.clocks.is_one_lost(known)
             is_due = self._tracker.changed or now >= self.due or is_one_lost
             if before is not None and not is_due:
                 return self._go_on(before, now)
             self._seen = contacts
-            self._count_clocks(is_one_lost=is_one_lost)
+            if is_one_lost:  # what plays may be part of it
+                self._selector.choose_anew()
+            self._count_clocks(known)
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)
             self._intent_due = intent.due(now)

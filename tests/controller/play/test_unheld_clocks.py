@@ -89,7 +89,7 @@ async def test_promise_is_kept_beside_a_clock_that_is_not_steered() -> None:
 @in_virtual_time
 async def test_promise_is_broken_if_clocks_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """So what plays over both amplifiers is felt by who should not."""
-    monkeypatch.setattr(CountedClocks, "counted_by", lambda clocks, table: table)
+    monkeypatch.setattr(CountedClocks, "counted_by", lambda clocks, table, known: table)
     assert min((await beyond_the_promise()).values()) < -1
 
 

@@ -200,7 +200,8 @@ class HeldClock:
         far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
         # What was read before came late where it is above, each by no more than its exchange took.
         sure = max(
-            [low - late - line.rate * (at - time) for at, low, late in self._lowest] or [-math.inf]
+            [low - late - line.rate * (at - time) for at, low, late in self._lowest],
+            default=-math.inf,
         )
         if not sure - lead - far - earlier <= off <= later + far:
             if is_reported:
@@ -232,7 +233,7 @@ class HeldClock:
         What is likely of crystals counts as if it were measured, too.
         """
         rate, bend = self._line.rate, self._line.bend
-        aged = [(time - at, lead) for at, lead, _ in self._lowest]
+        aged = [(time - at, lead, late) for at, lead, late in self._lowest]
         # Marks share what scatters; what is likely would bend each line as its crystal is not.
         is_common = self._is_by_marks(time)
         count = len(aged) if is_common else max(len(aged) // 2, 1)
@@ -240,7 +241,7 @@ class HeldClock:
         delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
         least = (delay / len(aged) ** 2) ** 2 / 12 + _LEAST**2
         for _ in range(_ROUNDS):  # what leads are at that time
-            above = sorted([(lead + (rate - bend * age) * age, age) for age, lead in aged])
+            above = sorted([(lead + (rate - bend * age) * age, age) for age, lead, _ in aged])
             lowest = above[:count]
             mean = middle = breadth = scatter = slope = curve = wide = 0.0
             for high, age in lowest:
@@ -266,11 +267,8 @@ class HeldClock:
         rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
         error = errors * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
         recent = [
-            (
-                lead_then + (rate - bend * (time - at)) * (time - at) - lead,
-                late - self.shortest - self._bits,
-            )
-            for at, lead_then, late in self._lowest[-_RECENT:]
+            (high + (rate - bend * age) * age - lead, late - self.shortest - self._bits)
+            for age, high, late in aged[-_RECENT:]
         ]
         # None is later than its exchange took longer than the promptest one.
         if min([off - late for off, late in recent]) > _FAR / 2:

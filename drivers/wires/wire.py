@@ -180,7 +180,7 @@ class Wire(Protocol):
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the bytes of a request, which is on the wire from now on; address 0: of all.
 
-        has_reply: not to one of all, nor a part of a set but the last: what comes to it is none.
+        has_reply: whether one is awaited: of no request of all, nor of an earlier part of a set.
         """
 
     def received(self, data: bytes) -> list[Arrival]:

@@ -38,10 +38,8 @@ def ramped_ringing(
 ) -> RampedRinging:
     """Solve ringing at each of the frequencies (f,) [Hz]; ramp, duration [s]."""
     spacing = duration / RINGING_TIMES
-    n, end = (
-        RINGING_TIMES + math.ceil(max(duration / 2, _MIN_RINGING_TIME) / spacing),
-        RINGING_TIMES,
-    )
+    end = RINGING_TIMES
+    n = end + math.ceil(max(duration / 2, _MIN_RINGING_TIME) / spacing)
     times = spacing * (np.arange(n) + 0.5)
     every = np.append(times, times[end:] - duration)
     risen = rise(every, ramp)

@@ -20,6 +20,7 @@ DRIFT = 1e-3
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
+_PERIOD = 0.1  # s; in which a sum of tones has its peak
 _LASTING = 3.0  # s; what ends after it is not awaited
 _AMBIGUOUS = "a request came as a layer ended by itself, or its onset"
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
@@ -78,6 +79,7 @@ class ExpectedOutputs:
         self.lasting: dict[int, set[int]] = {}
         self._before: Sequence[float] = ()  # levels of channels before the last set
         self._highest = 0.0  # of the sums of a channel since the last status, at most
+        self._checked = -math.inf  # when that was
 
     def forget(self) -> None:
         """Treat what plays as unknown."""
@@ -206,13 +208,14 @@ class ExpectedOutputs:
                     self._report("token", when[1], what, must=one_of(possible), seen=token)
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
-            must_be = is_beyond and self.is_exact and not self.may_derate
+            is_seen = start - max(self.began[1], self._checked) > _PERIOD
+            must_be = is_beyond and is_seen and self.is_exact and not self.may_derate
             if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):
             if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
                 self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
-        self._highest = self._peak(start)
+        self._highest, self._checked = self._peak(start), when[1]
 
     def _peak(self, time: float) -> float:
         """The largest sum of a channel from a time on, with endings; infinite if a set waits."""

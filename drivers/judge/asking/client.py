@@ -304,15 +304,18 @@ class Client(ABC):
         """Note why the line was lost."""
         self.loss = cause
 
-    async def expect_silence(self, data: bytes, what: str) -> None:
-        """Send bytes, to which nothing must be heard."""
-        heard = await self.send(data)
-        expect(not heard, f"replies to {what}", expected="none", seen=len(heard))
+    async def expect_silence(self, data: bytes, what: str, *before: bytes) -> None:
+        """Send frames, data the last of them, to which nothing must be heard."""
+        heard = await self.send(data, *before)
+        expect(not heard, f"replies to {what}", expected="none", seen=heard)
 
-    async def send(self, data: bytes) -> list[Heard]:
-        """Send bytes; return what is heard until a reply must have come."""
+    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+        """Send frames, data the last; return what is heard until a reply must have come."""
         self.heard.clear()
         self.came = b""
+        for each in before:
+            self.write(each)
+            await asyncio.sleep(self.quiet / 4)  # also what ends a frame of Modbus RTU
         self.write(data)
         await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []

@@ -169,10 +169,10 @@ class ModbusClient(Client):
             for at in (-2, -1, -4):
                 yield f"a wrong byte {at}", altered(frame, at)
 
-    async def send(self, data: bytes) -> list[Heard]:
-        """Send bytes; return what is heard until a reply must have come."""
+    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+        """Send frames, data the last; return what is heard until a reply must have come."""
         self._reader.end()
-        heard = await super().send(data)
+        heard = await super().send(data, *before)
         if self.is_rtu:
             await asyncio.sleep(QUIET)  # ends a frame that is not whole
         return heard

@@ -6,11 +6,12 @@ from dataclasses import replace
 from functools import partial
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import require, require_in_time
+from drivers.judge.asking.client import expect_equal, require, require_in_time
 from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.sets import Command, Envelope
+from drivers.protocol.table import has_flag
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
@@ -19,6 +20,7 @@ _MAX_VOICES = 24  # that are tried
 _SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
+_AMID = 0.15  # s; in which a sum comes to its peak
 
 
 @driving(_SETS)
@@ -360,7 +362,13 @@ async def limited(subject: Subject) -> None:
         abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
         "it has one frequency, whose tones interfere",
     )
+    last = subject.channels[-1]
     over = layer(1, subject.tone(frequency=subject.other))
-    near = layer(1, subject.tone(0, 1.0 / subject.level - 1.0, frequency=subject.other))
-    rows = near, over, layer(1), near, layer(1), over, layer(1)
-    await subject.run([subject.arm, subject.one(), *rows])
+    near, just = (layer(1, subject.tone(last, each / subject.level - 1.0)) for each in (1.0, 1.01))
+    shown = _AMID, over, _AMID, layer(1), near, _AMID
+    await subject.run([subject.arm, subject.whole(), near, *shown, just, _AMID, *shown])
+    for row in (over, layer(1)):  # unseen
+        await subject.play(row)
+        await asyncio.sleep(_AMID)
+    flags = await subject.request("GetStatus")
+    expect_equal(has_flag(flags.values, "limited"), True, "limited, by a sum that is over")

@@ -207,7 +207,6 @@ async def discarded_frames(subject: Subject) -> None:
     subject.require_alone()
     event = pack_words(EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1}))
     await client.expect_silence(client.frame(EVENT, event), "an Event")
-    await client.expect_silence(client.question(0), "a Hello for all")
     await subject.run([subject.arm, subject.one()])
     answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
     expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")

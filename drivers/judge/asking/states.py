@@ -5,11 +5,12 @@ from functools import partial
 from itertools import chain, cycle
 
 from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import FAULTS, NO_CHANNEL, QUANTITIES
 from registry import clock
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
@@ -21,13 +22,23 @@ _ROUGH = 20  # steps of level
 @driving(_STATES)
 def plays_nothing_disarmed(subject: Subject) -> Rows:
     """It plays nothing before it is armed."""
-    return [
-        play(subject.one(), code=_WRONG),
-        stage(subject.one(), code=_WRONG),
-        send("Commit", token=1, code=_WRONG),
-        send("Silence", ramp=0, code=_WRONG),
-        subject.ping,
-    ]
+    return _unarmed(subject)
+
+
+def _unarmed(subject: Subject, ramp: int = 0) -> list[Row]:
+    """Make what is refused, or changes no state, unless it is armed; ramp: of a Disarm [ms]."""
+    one = subject.one(level=0.75)
+    others: list[Row] = [each(one, token=9, code=_WRONG) for each in (play, stage)]
+    refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=0, code=_WRONG)
+    return [*others, *refused, send("Ping", session=77), send("Disarm", ramp=ramp)]
+
+
+def _latched(subject: Subject) -> list[Row]:
+    """Make the same for an amplifier that is stopped or in a fault, which does not arm either."""
+    serial = subject.identity["serial_number"]
+    moves = [send("SetAddress", address=9, serial_number=serial, code=_WRONG)]
+    arm = send("Arm", watchdog=subject.can["watchdog_max"], session=77, code=_WRONG)
+    return [arm, *moves * subject.has("address"), *_unarmed(subject)]
 
 
 @driving(_STATES)
@@ -118,23 +129,21 @@ def stop(subject: Subject) -> Rows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
     return [
         *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
-        send("Arm", watchdog=subject.can["watchdog_max"], code=_WRONG),
-        *(send("Commit", token=2, code=_WRONG), play(subject.one(), code=_WRONG)),
-        *(send("Silence", ramp=0, code=_WRONG), send("Disarm", ramp=0), 0.1),
+        *(*_latched(subject), send("Commit", token=2, code=_WRONG), 0.1),
     ]
 
 
 @driving(_STATES)
 def stop_ramps(subject: Subject) -> Rows:
     """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
-    whole, refused = subject.whole(), play(subject.one(), code=_WRONG)
+    whole, fading = subject.whole(), _unarmed(subject, 0xFFFF)
     amid = partial(subject.follow, 0.35 * subject.slowness)
     (stop, slowest_stop), (disarm, slowest_disarm) = (
         [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
     )
     return [
-        *((whole, stop), (whole, disarm, refused), (whole, slowest_stop, amid, disarm)),
-        (whole, slowest_disarm, refused, amid, stop),
+        *((whole, stop), (whole, disarm), (whole, slowest_stop, amid, disarm)),
+        (whole, slowest_disarm, *fading, subject.clear, amid, stop),
     ]
 
 
@@ -216,14 +225,11 @@ async def _trips(subject: Subject, time: float, *sets: Row) -> None:
 async def _trips_for_good(subject: Subject, time: int) -> None:
     """Have it trip after a time [ms]: it plays and arms no more until it is cleared."""
     await _trips(subject, time / 1000, subject.whole(), stage(subject.one(level=0.5)))
-    arm = partial(send, "Arm", watchdog=time)
     await subject.run(
         [
-            play(subject.one(), code=_WRONG),
-            *(0.05, send("Stop", ramp=0)),
-            arm(session=77, code=_WRONG),
+            *(*_latched(subject), 0.05, send("Stop", ramp=0)),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
-            *(send("Disarm", ramp=0), subject.clear, arm(code="WRONG_SESSION")),
+            *(subject.clear, send("Arm", watchdog=time, code="WRONG_SESSION")),
         ]
     )
 
@@ -315,8 +321,15 @@ async def trips_amid_other_requests(subject: Subject) -> None:
 
 
 @driving("protocol.md#messages")
-def fault_list(subject: Subject) -> Rows:
+async def fault_list(subject: Subject) -> None:
     """It lists faults, the newest first, by their ages, also after they were cleared."""
+
+    async def listed() -> list[tuple[int, int]]:
+        rows = (await subject.request("GetFaults"))["faults"]
+        return [(each["fault"], each["channel"]) for each in rows]
+
     trip = partial(_trips, subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
-    listed = send("GetFaults")
-    return [trip, subject.clear, trip, subject.clear, listed, 0.1, listed]
+    before = [(FAULTS["WATCHDOG"], NO_CHANNEL)] * 2 + await listed()
+    await subject.run([trip, subject.clear, trip, subject.clear, listed, 0.1])
+    found = await listed()
+    expect_equal(found, before[: max(len(found), 2)], "faults and channels that are listed")

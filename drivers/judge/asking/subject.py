@@ -215,6 +215,7 @@ class Subject(Material):
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
+        is_dated = self._is_dated(name, shown)
         answer = replace(answer, when=self._dated(name, values, shown, answer.when))
         if self.expected is not None:
             if name == "Set":
@@ -225,8 +226,15 @@ class Subject(Material):
                 is_exact = shown.get("exact", self.expected.sets.is_exact)
                 await self._learn_achieved(values["token"], is_exact=bool(is_exact))
             self.expected.granted(name, values, shown, answer.when)
+            if is_dated:
+                self.expected.clock.check(shown["clock"], (answer.when.latest,) * 2)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(answer, values=shown)
+
+    def _is_dated(self, name: str, shown: Values) -> bool:
+        """Whether a reply shows the clock as it is."""
+        is_marked = name == "Mark" or (self.expected and self.expected.clock.is_marked)
+        return "clock" in shown and not is_marked
 
     def _dated(self, name: str, values: Values, shown: Values, when: When) -> When:
         """Return between which times a status was true, and its request carried out, by its clock.
@@ -235,7 +243,7 @@ class Subject(Material):
         """
         dating, judge = self.dating, self.expected
         between = dating.interval(when)
-        if "clock" not in shown or name == "Mark" or (judge and judge.clock.is_marked):
+        if not self._is_dated(name, shown):
             return between
         if name == "Arm" and not (
             judge and judge.is_enabled and judge.session == values["session"]

@@ -317,7 +317,7 @@ async def heartbeats(subject: Subject) -> None:
         await asyncio.sleep(0.06)
         client.frames.clear()
         began = clock.now()
-        await asyncio.sleep(0.4)
+        await asyncio.sleep(0.3)
         took, beats = clock.now() - began, b"".join(client.data_of("heartbeat"))
         count = 1000 * took / interval if interval else 0
         slack, what = 0.15 * count + (interval > 0), f"heartbeats of {interval} ms in {took:.3g} s"

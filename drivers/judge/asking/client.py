@@ -110,6 +110,8 @@ _STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
+_AT_ONCE = 16  # addresses
+_SILENCE = 0.002  # s; between frames
 QUIET = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 
@@ -248,24 +250,39 @@ class Client(ABC):
     async def look_around(self) -> None:
         """Learn who else is on the line, by what only reads; once.
 
-        Every address is asked where a broadcast would reach it, else until one is free.
+        Every address is asked where a broadcast would reach it, else until one is free. Many are
+        asked at once, and each of them alone where anything is heard.
         """
         if self.free:
             return
-        wait = REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT
         addresses = [each for each in range(self.addresses, 0, -1) if each != self.address]
-        for address in addresses:
-            self.write(self.question(address))
-            found = await self.next(lambda each: True, wait)
-            if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
-                self._others.add(address)
-            if not (self.has_broadcasts or address in self._others):
+        for asked in in_batches(addresses, _AT_ONCE if self.has_broadcasts else 1):
+            is_heard = await self._is_heard(asked)
+            for each in asked if is_heard and self.is_shared else ():
+                if await self._is_heard([each]) and not self.heard:  # several at this address
+                    self._others.add(each)
+            if not (self.has_broadcasts or is_heard):
                 break
         await asyncio.sleep(self.quiet)  # in which a late one is heard
         self.heard.clear()
         self.free = next((each for each in addresses if each not in self._others), 0)
         expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
+
+    async def _is_heard(self, addresses: Sequence[int]) -> bool:
+        """Whether anything is heard once addresses were asked, one after the other."""
+        self.heard.clear()
+        self.came = b""
+        for each in addresses:
+            self.write(self.question(each))
+            await asyncio.sleep(_SILENCE + self.wire_time(0, 0))
+        await asyncio.sleep(REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT)
+        return bool(self.heard or (self.came and self.is_shared))
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether replies of several amplifiers may collide."""
+        return self.kind in ("serial", "rtu")
 
     @property
     def slow_reply(self) -> str:
@@ -368,6 +385,11 @@ class Client(ABC):
         nak = read_as("Nak", read_nak, words, is_strict=True)
         expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")
         return Answer(nak.code, nak.channel, (), When(sent, came))
+
+
+def in_batches(rows: Sequence[_T], size: int) -> list[Sequence[_T]]:
+    """Cut rows into batches of a size, the last of which may be smaller."""
+    return [rows[at : at + size] for at in range(0, len(rows), size)]
 
 
 def altered(data: bytes, at: int) -> bytes:

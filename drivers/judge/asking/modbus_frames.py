@@ -291,7 +291,7 @@ async def exceptions(subject: Subject) -> None:
         # On RTU the length of a frame follows from its function: of others it ends with a pause.
         if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
             continue
-        await subject.run([subject.ping, 0.02])
+        await subject.unfed()
         response, _ = await client.transact(pdu)
         expect_equal(response, bytes([pdu[0] | EXCEPTION, code]), f"response to {what}")
         await subject.request("GetStatus")

@@ -18,6 +18,7 @@ from drivers.judge.asking.client import (
     expect_equal,
     expect_one_of,
     expect_within,
+    in_batches,
     require,
 )
 from drivers.judge.asking.material import Rows, send, stage
@@ -40,7 +41,7 @@ from drivers.protocol.table import (
 from registry import clock
 
 _UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors
-_TRIES = 20
+_TRIES, _AT_ONCE = 20, 4
 _FEATURE_OF = {
     **{"GetMeasured": "electrical", "SetAddress": "address"},
     **{"GetSensors": "sensors", "Measure": "sensors", "GetReading": "sensors", "Mark": "mark"},
@@ -139,7 +140,8 @@ def lengths(subject: Subject) -> Rows:
     longer = [(name, [*_shortest(name), 0]) for name in known if name != "Set"]
     first_wrong = [send("Ping", raw=[0, 0, 0][:count], code="BAD_VALUE") for count in (1, 3)]
     lengths = (*shorter, *longer)
-    return [*(send(name, raw=words, code="BAD_LENGTH") for name, words in lengths), *first_wrong]
+    rows = [send(name, raw=words, code="BAD_LENGTH") for name, words in lengths] + first_wrong
+    return [partial(subject.send_all, each) for each in in_batches(rows, _AT_ONCE)]
 
 
 @reading("protocol.md#messages")
@@ -261,11 +263,11 @@ async def broadcasts(subject: Subject) -> None:
         }
         requests = [
             (each.number, _shortest(name, **values))
-            for name, each in reversed(MESSAGES.items())
+            for name, each in reversed([*MESSAGES.items()])
             if not each.is_broadcast or name == "SetAddress"
         ]
         stop, commit = MESSAGES["Stop"].number, MESSAGES["Commit"].number
-        flawed = (stop, []), (stop, [0, 0]), (_UNKNOWN[0], [])
+        flawed: list[tuple[int, list[int]]] = [(stop, []), (stop, [0, 0]), (_UNKNOWN[0], [])]
         foreign = commit, _shortest("Commit", session=77, token=subject.token)
         frames = [client.request(*each, to=0) for each in (foreign, *flawed, *requests)]
         await client.expect_silence(client.question(0), "what is for one alone, to all", *frames)
@@ -340,12 +342,13 @@ async def addresses(subject: Subject) -> None:
             await client.expect_silence(data, "SetAddress for all")
             await asyncio.sleep(_MOVED)
     finally:
-        if await _is_at(client, free):
+        if not (is_back := await _is_at(client, own)) and await _is_at(client, free):
             await subject.request("SetAddress", address=own, serial_number=serial)
             await asyncio.sleep(_MOVED)
+            is_back = await _is_at(client, own)
         client.address = own
         client.heard.clear()
-    expect_equal(await _is_at(client, own), True, "whether it replies at its first address again")
+    expect_equal(is_back, True, "whether it replies at its first address again")
 
 
 async def _is_at(client: Client, address: int) -> bool:

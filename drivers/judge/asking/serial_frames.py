@@ -157,7 +157,6 @@ def _framed(content: bytes) -> bytes:
 
 
 _PLACE = "protocol.md#checks-in-this-order"
-_UNFED = 0.01  # s; before what must not feed
 _PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))
 
 
@@ -177,10 +176,9 @@ async def damaged_frames(subject: Subject) -> None:
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
     for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
         for what, data in client.damaged(number, sent):
-            await asyncio.sleep(_UNFED)
+            await subject.unfed()
             await client.expect_silence(data, f"message {number} with {what}")
             await subject.request("GetStatus")
-            await subject.ping()
 
 
 @driving(_PLACE)

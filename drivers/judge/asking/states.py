@@ -1,8 +1,9 @@
 """Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
 
 import asyncio
+from dataclasses import replace
 from functools import partial
-from itertools import chain, cycle
+from itertools import cycle
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal
@@ -84,16 +85,19 @@ def sessions(subject: Subject) -> Rows:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
+    rows = (
+        play(quarter, token=3, code="WRONG_SESSION"),
+        send("Commit", token=2, code="WRONG_SESSION"),
+        send("Silence", ramp=0, code="WRONG_SESSION"),
+        send("Ping", code="WRONG_SESSION"),
+        send("Arm", watchdog=maximum, code="WRONG_SESSION"),
+    )
     others = [
-        request
-        for other in (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
-        for request in (
-            play(quarter, token=3, session=other, code="WRONG_SESSION"),
-            send("Commit", token=2, session=other, code="WRONG_SESSION"),
-            send("Silence", ramp=0, session=other, code="WRONG_SESSION"),
-            send("Ping", session=other, code="WRONG_SESSION"),
-            send("Arm", watchdog=maximum, session=other, code="WRONG_SESSION"),
+        partial(
+            subject.send_all,
+            [replace(each, values={**each.values, "session": other}) for each in rows],
         )
+        for other in (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
     ]
     return [
         subject.arm,
@@ -137,7 +141,7 @@ def stop(subject: Subject) -> Rows:
 def stop_ramps(subject: Subject) -> Rows:
     """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
     whole, fading = subject.whole(), _unarmed(subject, 0xFFFF)
-    amid = partial(subject.follow, 0.35 * subject.slowness)
+    amid = partial(subject.follow, 0.2 * subject.slowness)
     (stop, slowest_stop), (disarm, slowest_disarm) = (
         [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
     )
@@ -253,7 +257,7 @@ async def trips_amid_fades(subject: Subject) -> None:
 async def watchdog_unread(subject: Subject) -> None:
     """It trips at its time though nothing is asked of it, and lists the fault with its age."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    await asyncio.sleep(subject.shown.watchdog + 0.1)
+    await asyncio.sleep(subject.shown.watchdog + 0.03)
     await subject.run([send("GetFaults")])
 
 
@@ -267,11 +271,11 @@ def what_feeds(subject: Subject) -> Rows:
         send("Set", **long),
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
-    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.05, feed))]
+    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.02, feed))]
 
 
 @driving(_SESSIONS)
-def what_does_not_feed(subject: Subject) -> Rows:
+async def what_does_not_feed(subject: Subject) -> None:
     """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
@@ -298,10 +302,13 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
     collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
-    rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
     whole = [send("Set", **each) for each in subject.parts(*made, token=8, now=0, count=3)]
     staged: Rows = (*whole, 0.02, whole[0])  # which is dropped
-    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected, *staged]
+    await subject.run([subject.arm, subject.one()])
+    for each in idle:
+        await subject.unfed()
+        await subject.run([each])
+    await subject.run([*collected, *staged])
 
 
 @driving(_SESSIONS)

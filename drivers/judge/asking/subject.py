@@ -51,6 +51,7 @@ _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
+_MAX_UNFED, _UNFED = 0.1, 0.02  # of the watchdog; s before what must not feed
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
@@ -322,6 +323,12 @@ class Subject(Material):
         """Whether its watchdog is to be fed."""
         return self._since_fed > 0.25
 
+    async def unfed(self) -> None:
+        """Feed it where that is due, so that it was fed a while ago, and is not due soon."""
+        if self._since_fed > _MAX_UNFED:
+            await self.ping()
+        await asyncio.sleep(max(self.shown.fed[1] + _UNFED - clock.now(), 0.0))
+
     async def starve(self) -> None:
         """From now on the watchdog may expire."""
         self.is_starving = True
@@ -377,6 +384,11 @@ class Subject(Material):
         """Play a set at once."""
         return await self.send(play(*layers))
 
+    async def send_all(self, rows: Sequence[Send]) -> None:
+        """Send requests in one go, without a look at the status between."""
+        for row in rows:
+            await self.send(row)
+
     async def commit_in(self, duration: float) -> int:
         """Commit the staged set for a moment a time [s] ahead of the last status; return that."""
         at = self.moment(duration)
@@ -409,10 +421,15 @@ class Subject(Material):
         Lest an amplifier that is late has longer times. A line may delay more than is known of it,
         which a reading shows.
         """
-        count, fastest = self.client.transactions, self.client.fastest
-        read = min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
+        count, fastest, read = self.client.transactions, self.client.fastest, self._read_time
         slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
         return min(slowest, count * REACTION + max(self.client.transit, count * read))
+
+    @property
+    def _read_time(self) -> float:
+        """The shortest exchange [s] so far of a message that only reads."""
+        fastest = self.client.fastest
+        return min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
 
     @property
     def slowness(self) -> float:
@@ -426,13 +443,13 @@ class Subject(Material):
     @property
     def shortest_watchdog(self) -> int:
         """The shortest watchdog time [ms], or that in which it can be fed on a slow line."""
-        fed = math.ceil(10_000 * min(self.exchange_time, _SLOWEST))
+        fed = math.ceil(8_000 * min(self.exchange_time, _SLOWEST))
         return int(min(max(self.can["watchdog_min"], fed), self.can["watchdog_max"]))
 
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        required = max(100, math.ceil(8_000 * min(self.exchange_time, 0.1)))
+        required = max(100, math.ceil(6_000 * min(self.exchange_time, 0.1)))
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
@@ -486,7 +503,8 @@ class Subject(Material):
         began = self.shown.outputs.began
         end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
         end = end if duration is None else began[0] + duration
-        end = max(end, clock.now() + 2 * min(self.exchange_time, 1.0))  # of a slow line: a few
+        few = min(2 * self.exchange_time, 3 * self._read_time, 2.0)
+        end = max(end, clock.now() + few)  # of a slow line
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
         while clock.now() < end:

@@ -35,6 +35,7 @@ from drivers.judge.asking.material import (
     send,
     stage,
 )
+from drivers.judge.outputs import SAMPLE
 from drivers.judge.states import OFF
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
 from drivers.protocol.records import Values
@@ -227,8 +228,9 @@ class Subject(Material):
                 is_exact = shown.get("exact", self.expected.sets.is_exact)
                 await self._learn_achieved(values["token"], is_exact=bool(is_exact))
             self.expected.granted(name, values, shown, answer.when)
-            if is_dated:
-                self.expected.clock.check(shown["clock"], (answer.when.latest,) * 2)
+            if is_dated:  # what starts with the next sample may be shown by now
+                read = answer.when.latest - SAMPLE, answer.when.latest
+                self.expected.clock.check(shown["clock"], read)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(answer, values=shown)
 
@@ -335,11 +337,13 @@ class Subject(Material):
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
+        is_armed = self.expected is not None and self.expected.is_enabled
         self.expected, self.dating, self._parts = None, Dating(), []
-        stopped = await self.settle(await self.request("Stop", ramp=0))
-        cleared = await self.request("Clear", latch=stopped["latch"])
-        expect_equal(cleared["state"], OFF, "state after Clear")
-        self.expected, self.is_at_rest = Judge(self.can, cleared.values, cleared.when), True
+        reply = await self.settle(await self.request("Disarm" if is_armed else "Stop", ramp=0))
+        if reply["state"] != OFF:
+            reply = await self.request("Clear", latch=reply["latch"])
+            expect_equal(reply["state"], OFF, "state after Clear")
+        self.expected, self.is_at_rest = Judge(self.can, reply.values, reply.when), True
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""

@@ -79,7 +79,7 @@ class ExpectedOutputs:
         self.lasting: dict[int, set[int]] = {}
         self._before: Sequence[float] = ()  # levels of channels before the last set
         self._highest = 0.0  # of the sums of a channel since the last status, at most
-        self._checked = -math.inf  # when that was
+        self._unlimited_since = math.inf  # a sum is surely beyond full level, and not said to be
 
     def forget(self) -> None:
         """Treat what plays as unknown."""
@@ -208,14 +208,17 @@ class ExpectedOutputs:
                     self._report("token", when[1], what, must=one_of(possible), seen=token)
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
-            is_seen = start - max(self.began[1], self._checked) > _PERIOD
-            must_be = is_beyond and is_seen and self.is_exact and not self.may_derate
+            if is_limited or not is_beyond or not self.is_exact or self.may_derate:
+                self._unlimited_since = math.inf
+            else:
+                self._unlimited_since = min(self._unlimited_since, when[1])
+            must_be = start - self._unlimited_since > _PERIOD
             if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):
             if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
                 self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
-        self._highest, self._checked = self._peak(start), when[1]
+        self._highest = self._peak(start)
 
     def _peak(self, time: float) -> float:
         """The largest sum of a channel from a time on, with endings; infinite if a set waits."""

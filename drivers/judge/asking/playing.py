@@ -60,7 +60,7 @@ def valid_for(subject: Subject) -> Rows:
 def renew(subject: Subject) -> Rows:
     """It starts valid_for anew by a renewal, and changes nothing else."""
     first, second = (
-        subject.one(level=0.5, ramp=40, valid_for=subject.lasting(150)),
+        subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
         layer(1, subject.beside(1, 0.25)),
     )
     sooner = layer(0, renew=True, valid_for=subject.lasting(100))

@@ -202,12 +202,12 @@ def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=3)
-    shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)
+    part = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1)
     return [
-        *(subject.arm, subject.one(), first, 0.55 * STAGED_LIFE),
+        *(subject.arm, subject.one(), first, part),
         *others,
         # One that is confirmed once more lives no longer.
-        *(last, shorter - 0.55 * STAGED_LIFE, last, 1.03 * STAGED_LIFE - shorter),
+        *(last, part, last, 1.03 * STAGED_LIFE - 2 * part),
         *(send("Commit", token=3, code=_OLD), last),
         *others,
         *(0.55 * STAGED_LIFE, first, 0.48 * STAGED_LIFE, last),

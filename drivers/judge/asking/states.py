@@ -337,6 +337,7 @@ async def fault_list(subject: Subject) -> None:
 
     trip = partial(_trips, subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
     before = [(FAULTS["WATCHDOG"], NO_CHANNEL)] * 2 + await listed()
-    await subject.run([trip, subject.clear, trip, subject.clear, listed, 0.1])
+    stopped = send("Stop", ramp=0), subject.clear
+    await subject.run([trip, subject.clear, trip, subject.clear, *stopped, listed, 0.1])
     found = await listed()
     expect_equal(found, before[: max(len(found), 2)], "faults and channels that are listed")

@@ -341,6 +341,7 @@ async def addresses(subject: Subject) -> None:
             data = client.request(MESSAGES["SetAddress"].number, back, to=0)
             await client.expect_silence(data, "SetAddress for all")
             await asyncio.sleep(_MOVED)
+            expect_equal(await _is_at(client, own), True, "whether SetAddress for all moves it")
     finally:
         if not (is_back := await _is_at(client, own)) and await _is_at(client, free):
             await subject.request("SetAddress", address=own, serial_number=serial)

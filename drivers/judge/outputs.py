@@ -208,11 +208,10 @@ class ExpectedOutputs:
                     self._report("token", when[1], what, must=one_of(possible), seen=token)
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
-            if is_limited or not is_beyond or not self.is_exact or self.may_derate:
-                self._unlimited_since = math.inf
-            else:
-                self._unlimited_since = min(self._unlimited_since, when[1])
-            must_be = start - self._unlimited_since > _PERIOD
+            is_excused = is_limited or not is_beyond or not self.is_exact or self.may_derate
+            since = math.inf if is_excused else min(self._unlimited_since, when[1])
+            self._unlimited_since = since
+            must_be = start - since > _PERIOD
             if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):

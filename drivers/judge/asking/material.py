@@ -230,8 +230,8 @@ class Material:
         other = self.beside(len(self.layers), 0.25)
         others = [layer(number, self.beside(number, 0.05)) for number in self.layers[4:]]
         changes = [
-            *(layer(0, tones[0], ramp=ramp), layer(1, ramp=ramp), layer(2, other, ramp=ramp)),
-            layer(3, tones[3], valid_for=60_000),
+            layer(0, tones[0], ramp=ramp, valid_for=60_000),
+            *(layer(1, ramp=ramp), layer(2, other, ramp=ramp), layer(3, tones[3], ramp=ramp)),
         ]
         shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
         return [

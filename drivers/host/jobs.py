@@ -91,7 +91,7 @@ class Job:
     part: int = 0
     reached: int = 0
     attempts: int = ATTEMPTS
-    not_before: float = 0.0
+    is_pausing: bool = False
     sent_at: float = 0.0
     started_at: float = 0.0
     due: float = 0.0
@@ -169,6 +169,6 @@ class JobQueue:
         """Return the job whose turn it is; None while all pause, or a stop does."""
         first: Job | None = self.jobs[0]
         if len(self.jobs) > 1:
-            ready = [job for job in self.jobs if job.not_before <= now or job.is_stop_class]
+            ready = [job for job in self.jobs if job.is_stop_class or not job.is_pausing]
             first = min(ready, key=lambda job: self._rank(job, now), default=None)
-        return None if first is None or first.not_before > now else first
+        return None if first is None or first.is_pausing else first

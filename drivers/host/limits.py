@@ -129,7 +129,6 @@ class Rounding:
             if layer.after and not layer.tones:
                 raise CommandRefused("after must be with tones")
             commands = self._commands(layer.tones)
-            self._check_envelopes(layer.tones)
             rounded.append(
                 LayerSet(
                     number,
@@ -147,7 +146,7 @@ class Rounding:
 
     def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
         """Return the commands of tones by channel; few calls, since every set has some."""
-        limits, commands = self._limits, dict[int, Command]()
+        limits, commands, shaped = self._limits, dict[int, Command](), list[Tone]()
         for tone in tones:
             channel, level, onset = index(tone.channel), tone.level, tone.onset
             if not 0 <= channel < self._channels:
@@ -182,6 +181,10 @@ class Rounding:
                 onset,
                 tone.ending,
             )
+            if onset is not None or tone.ending is not None:
+                shaped.append(tone)
+        if shaped:
+            self._check_envelopes(shaped)
         return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
@@ -192,33 +195,25 @@ class Rounding:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
         low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
         limit = self._can["knots"]
-        knots: list[tuple[int, ...]] = []
         for tone in tones:
-            for envelope in (tone.onset, tone.ending):
-                if envelope is None:
+            for shape in (tone.onset, tone.ending):
+                if shape is None:
                     continue
-                if not low <= (step := envelope.step) <= high:
+                if not low <= (step := shape.step) <= high:
                     raise refused(
                         tone.channel,
                         f"step of an envelope must be {low} to {high} (0.1 ms), got {step}",
                     )
-                if (count := len(envelope.knots)) > limit:
+                if (count := len(shape.knots)) > limit:
                     raise refused(
                         tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
                     )
-                knots += envelope.knots
-        if not knots:
-            return
-        try:
-            KNOT.check_rows(knots)
-            if (peak := max(knots)[0]) > self._limits.level:
-                raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
-        except (CommandRefused, TypeError, ValueError) as error:
-            for one in tones if len(tones) > 1 else ():
-                self._check_envelopes([one])  # which of them
-            if isinstance(error, CommandRefused):
-                raise
-            raise refused(tone.channel, f"knot of an envelope: {error}") from error
+                try:
+                    KNOT.check_rows(shape.knots)
+                except (TypeError, ValueError) as error:
+                    raise refused(tone.channel, f"knot of an envelope: {error}") from error
+                if (peak := max(shape.knots, default=(0,))[0]) > self._limits.level:
+                    raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 
 def refused(channel: int, text: str) -> CommandRefused:

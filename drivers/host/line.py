@@ -335,15 +335,13 @@ class Line:
         if self._queue_again(job):
             member.counts.retries += 1
             if pause:
-                job.not_before = self.time() + pause
-                self._loop.call_at(job.not_before, self._pump_from, job.not_before)
+                job.is_pausing = True
+                self._loop.call_later(pause, self._resume, job)
 
-    def _pump_from(self, time: float) -> None:
-        """Pump at a time [s]; a timer may come too early, by up to a tick of the clock."""
-        if self.time() < time:
-            self._loop.call_at(time, self._pump_from, time)
-        else:
-            self.pump()
+    def _resume(self, job: Job) -> None:
+        """Send a request that has paused in its turn."""
+        job.is_pausing = False
+        self.pump()
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller has gone."""

@@ -402,27 +402,6 @@ class Record:
                     if not field.quantity.minimum <= number <= field.quantity.maximum:
                         raise ValueError(_out_of_range(field.name, field.quantity, number))
 
-    def read_rows(
-        self, words: Sequence[int], at: int, count: int
-    ) -> tuple[tuple[tuple[int, ...], ...], int]:
-        """Read so many rows of numbers, a word each, as `read` does."""
-        width = len(self.fields)
-        end = at + count * width
-        if end > len(words):
-            raise Refusal("message is too short", "BAD_LENGTH")
-        columns: list[Sequence[int]] = []
-        for first, field in enumerate(self.fields, at):
-            column = words[first:end:width]
-            if isinstance(field, Number) and count:
-                quantity = field.quantity
-                if quantity.minimum < 0:
-                    column = [word - WORD if word >= WORD // 2 else word for word in column]
-                for number in (min(column), max(column)):
-                    if not quantity.minimum <= number <= quantity.maximum:
-                        raise Refusal(_out_of_range(field.name, quantity, number))
-            columns.append(column)
-        return tuple(zip(*columns, strict=True)), end
-
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}

@@ -222,8 +222,14 @@ def _envelope(words: Sequence[int], at: int, can: Values) -> tuple[Envelope, int
         raise Refusal(f"step must be {low} to {high}, got {head['step']}")
     if head["knots"] > can["knots"]:
         raise Refusal(f"knots must be at most {can['knots']}, got {head['knots']}")
-    knots, at = KNOT.read_rows(words, at, head["knots"])
-    return Envelope(head["step"], knots), at
+    end = at + KNOT.words * head["knots"]
+    raw = struct.pack(f"={end - at}H", *words[at:end])
+    knots = tuple(struct.iter_unpack("=" + _KNOT_FORM, raw))
+    try:
+        KNOT.check_rows(knots)
+    except ValueError as error:
+        raise Refusal(str(error)) from None
+    return Envelope(head["step"], knots), end
 
 
 def parts(

@@ -213,7 +213,9 @@ class Rounding:
                 except (TypeError, ValueError) as error:
                     raise refused(tone.channel, f"knot of an envelope: {error}") from error
                 if (peak := max(shape.knots, default=(0,))[0]) > self._limits.level:
-                    raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
+                    raise self._level_refused(
+                        tone.channel, "level of a knot", peak / _LEVEL.per_unit
+                    )
 
 
 def refused(channel: int, text: str) -> CommandRefused:
@@ -266,9 +268,11 @@ class Budget:
         used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
-    def sent(self, now: float, *, lasts: float) -> Vibration:
+    def sent(self, now: float, *, lasts: float) -> Vibration | None:
         """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
         self._sent.append(now)
+        if self.is_unlimited:
+            return None
         self._close(now)
         before = self._start, self._end
         if self._start is None:

@@ -9,7 +9,7 @@ Plain loops and few calls: every set is played by host and far end.
 
 import cmath
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -213,37 +213,43 @@ class Voice:
 
 
 def voices_after(
-    voices: Sequence[Voice],
+    channels: Sequence[Sequence[Voice]],
     layer: int,
-    command: Command | None,
+    commands: Mapping[int, Command],
     time: float,
     ramp: float,
     uncertainty: float,
-) -> list[Voice]:
-    """Return the voices of a channel once a command of a layer plays; None silences the layer."""
-    # As `Command.is_driven`, without a call.
-    is_driven = command is not None and (command.level > 0 or command.onset is not None)
-    is_fading = is_driven or (command is not None and command.skip_ending)
-    is_new = is_driven
-    last = 0j if command is None else amplitude_of(command.level, command.phase)
-    after: list[Voice] = []
-    for voice in voices:
-        if voice.layer != layer or voice.has_ended:
-            after.append(voice)
-        elif command is not None and command.keep_phase and voice.is_continued_by(command):
-            is_new = False
-            first = voice.transition.reached(time, uncertainty)
-            transition = along(command.onset, time, ramp, first, last)
-            after.append(replace(voice, transition=transition, ending=command.ending))
-        elif is_fading:
-            after.append(voice.faded(time, ramp, uncertainty))
-        else:
-            after.append(voice.ended(time, ramp, uncertainty))
-    if is_new and command is not None:
-        transition = along(command.onset, time, ramp, 0j, last)
-        frequency = command.frequency / _PER_HERTZ
-        after.append(Voice(layer, frequency, time, transition, False, command.ending))
-    return after
+) -> list[tuple[Voice, ...]]:
+    """Return the voices of all channels once a layer plays commands by channel, else is silent."""
+    all_after: list[tuple[Voice, ...]] = []
+    for channel, voices in enumerate(channels):
+        command = commands.get(channel)
+        # As `Command.is_driven`, without a call.
+        is_driven = command is not None and (command.level > 0 or command.onset is not None)
+        is_fading = is_driven or (command is not None and command.skip_ending)
+        is_new = is_driven
+        last = 0j if command is None else amplitude_of(command.level, command.phase)
+        after: list[Voice] = []
+        for voice in voices:
+            if voice.layer != layer or voice.has_ended:
+                after.append(voice)
+            elif command is not None and command.keep_phase and voice.is_continued_by(command):
+                is_new = False
+                first = voice.transition.reached(time, uncertainty)
+                transition = along(command.onset, time, ramp, first, last)
+                after.append(replace(voice, transition=transition, ending=command.ending))
+            elif is_fading:
+                after.append(voice.faded(time, ramp, uncertainty))
+            else:
+                after.append(voice.ended(time, ramp, uncertainty))
+        if is_new and command is not None:
+            transition = Transition(time, ramp, 0j, last, time + ramp)
+            if command.onset is not None:  # seldom: without a call
+                transition = along(command.onset, time, ramp, 0j, last)
+            frequency = command.frequency / _PER_HERTZ
+            after.append(Voice(layer, frequency, time, transition, False, command.ending))
+        all_after.append(tuple(after))
+    return all_after
 
 
 def cut_to(voices: Sequence[Voice], time: float, max_voices: int, slew: float) -> list[Voice]:

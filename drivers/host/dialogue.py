@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeAlias
 
-from drivers.counters import LinkStatistics
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -21,7 +20,7 @@ from drivers.errors import (
 from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import Priority
+from drivers.host.jobs import LinkStatistics, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line

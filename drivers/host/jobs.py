@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol, TypeAlias
 
-from drivers.counters import LinkStatistics
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
-from drivers.wires.wire import Event, OtherHost, Several
+from drivers.wires.wire import Event, OtherHost, Several, WireCounters
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 
@@ -44,6 +43,21 @@ Make: TypeAlias = Callable[[], list[Values]]
 
 Called once, then; returns the values of its messages, or raises CommandRefused.
 """
+
+
+@dataclass
+class LinkStatistics(WireCounters):
+    """Statistics of a link at one moment.
+
+    Inherited counters restart when the link is opened, the following count since its construction.
+    retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
+    last_round_trip [s].
+    """
+
+    retries: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+    last_round_trip: float | None = None
 
 
 class Member(Protocol):

@@ -318,8 +318,8 @@ class Line:
         member.counts.refusals += 1
         if arrival.code == "BUSY" and job.attempts > 0:
             self._repeat(job, member, pause=BUSY_PAUSE)
-            return
-        self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
+        else:
+            self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
 
     def _queue_again(self, job: Job) -> bool:
         """Queue a request again, unless another one of its amplifier comes before it."""

@@ -9,7 +9,6 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.counters import WireCounters
 from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
@@ -52,6 +51,7 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
+    WireCounters,
     Written,
     read_nak,
     reply_words,

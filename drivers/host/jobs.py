@@ -7,7 +7,7 @@ operating system sends bytes. Times [s] are of the event loop's clock.
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol, TypeAlias
 
@@ -99,8 +99,8 @@ class Job:
     values: Values
     timeout: float
     queued_at: float
-    result: "asyncio.Future[Values]"
     make: Make | None = None
+    result: "asyncio.Future[Values]" = field(default_factory=asyncio.Future)
     parts: Sequence[Values] = ()
     part: int = 0
     reached: int = 0

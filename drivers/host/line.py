@@ -101,9 +101,9 @@ class Line:
         request came first. member: None for a broadcast, which has no reply: the future ends once
         it was sent.
         """
-        future, now = self._loop.create_future(), self.time()
         make, values = (values, Values()) if callable(values) else (None, values)
-        job = Job(member, priority, name, values, timeout, now, future, make)
+        job = Job(member, priority, name, values, timeout, self.time(), make)
+        future = job.result
         if trace.is_active():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -179,8 +179,8 @@ class Line:
                 else:
                     self.wire.counters.remark = f"part {job.part} of a set does not arrive"
                     self._give_up(job, member)
-                continue
-            job.result.set_result(arrival.values)
+            else:
+                job.result.set_result(arrival.values)
         if self._queue.jobs:
             self.pump()
         elif self.current is None and self._timer is not None:
@@ -226,9 +226,8 @@ class Line:
                 if self.ahead is not None and member is not None and not job.part:
                     ahead = self.ahead(job.name, job.priority)
                     if ahead is not None:
-                        now, result = self.time(), self._loop.create_future()
                         beat = Priority.HEARTBEAT
-                        self._start(Job(None, beat, "Commit", {}, 0.0, now, result, ahead))
+                        self._start(Job(None, beat, "Commit", {}, 0.0, self.time(), ahead))
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
                 if job.make is not None:

@@ -6,6 +6,7 @@ the wire cannot have, or limits forbid, is refused. Envelopes come in integers o
 """
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import KNOT, QUANTITIES
+from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
 FREQUENCY_FLOOR = 10.0
@@ -97,6 +98,7 @@ _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _FREQUENCY = QUANTITIES["frequency"]
 _VALID_FOR_MAX = _VALID_FOR.high
+_NO_KNOTS = ((0, 0),)
 
 
 class Rounding:
@@ -209,13 +211,18 @@ class Rounding:
                         tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
                     )
                 try:
-                    KNOT.check_rows(shape.knots)
+                    levels, phases = zip(*(shape.knots or _NO_KNOTS), strict=True)
+                    array("q", (*levels, *phases))  # which has no numbers with a fraction
                 except (TypeError, ValueError) as error:
-                    raise refused(tone.channel, f"knot of an envelope: {error}") from error
-                if (peak := max(shape.knots, default=(0,))[0]) > self._limits.level:
+                    raise refused(
+                        tone.channel, f"knots of an envelope must be pairs of integers: {error}"
+                    ) from error
+                if not 0 <= min(levels) <= (peak := max(levels)) <= self._limits.level:
                     raise self._level_refused(
                         tone.channel, "level of a knot", peak / _LEVEL.per_unit
                     )
+                if not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
+                    raise refused(tone.channel, "phase of a knot must be -180 to 179.99 degrees")
 
 
 def refused(channel: int, text: str) -> CommandRefused:

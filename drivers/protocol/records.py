@@ -8,7 +8,6 @@ and a number that `is_added` is None in the reply of an amplifier that does not 
 
 import math
 import struct
-from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -392,15 +391,6 @@ class Record:
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
         return self.append([], values)
-
-    def check_rows(self, rows: Sequence[Sequence[int]]) -> None:
-        """Raise TypeError or ValueError for a number of rows, in the order of the fields."""
-        for field, column in zip(self.fields, zip(*rows, strict=True), strict=False):
-            if isinstance(field, Number):
-                # An array has no numbers with a fraction, for which a comparison would do.
-                for number in (min(column), max(array("q", column))):
-                    if not field.quantity.minimum <= number <= field.quantity.maximum:
-                        raise ValueError(_out_of_range(field.name, field.quantity, number))
 
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""

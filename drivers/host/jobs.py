@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol, TypeAlias
 
+from drivers.counters import WireCounters
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
-from drivers.wires.wire import Event, OtherHost, Several, WireCounters
+from drivers.wires.wire import Event, OtherHost, Several
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeAlias
 
+from drivers.counters import WireCounters
 from drivers.protocol.records import (
     TEXT_MAX,
     Bits,
@@ -37,24 +38,6 @@ from drivers.protocol.table import (
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
 """Channels and layers of the largest amplifier there can be."""
 _CODES = {number: name for name, number in REFUSALS.items()}
-
-
-@dataclass
-class WireCounters:
-    """Frames counted by a backend since its wire was opened.
-
-    invalid_frames: frames with a wrong checksum, length, form or version, and events that cannot be
-    decoded; unexpected_frames: valid frames that no request was waiting for, such as late replies;
-    events: unsolicited messages. remark: what came last since a request in place of its reply, and
-    what to check.
-    """
-
-    frames_out: int = 0
-    frames_in: int = 0
-    invalid_frames: int = 0
-    unexpected_frames: int = 0
-    events: int = 0
-    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)

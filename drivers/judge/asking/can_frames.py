@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import cast
 
+from drivers.counters import WireCounters
 from drivers.judge.asking.check import driving, reading
 from drivers.judge.asking.client import (
     Answer,
@@ -39,7 +40,6 @@ from drivers.wires.can_bus.frames import (
     segments,
     unpack_frames,
 )
-from drivers.wires.wire import WireCounters
 from registry import clock
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]

@@ -7,6 +7,7 @@ masters read, concern no rule. Other text is ignored.
 import re
 from collections import deque
 
+from drivers.counters import WireCounters
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import (
     DecodedFrame,
@@ -22,7 +23,6 @@ from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
 from drivers.wires.can_bus.frames import Message as Words
 from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
-from drivers.wires.wire import WireCounters
 
 _MAX_REST = 512  # bytes kept of text that does not end
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames of the host, which an adapter may echo

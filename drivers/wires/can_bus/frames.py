@@ -10,9 +10,9 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from drivers.counters import WireCounters
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.can_bus.canopen import BLOCK, CanFrame
-from drivers.wires.wire import WireCounters
 
 REQUEST = 0x200
 """Identifier of requests; the node is added, none for a broadcast."""

@@ -5,6 +5,7 @@ Its bytes are packed frames (`drivers.wires.can_bus.frames`), for a port that ta
 
 from collections import deque
 
+from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
@@ -42,7 +43,6 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
-    WireCounters,
     read_event,
     read_nak,
 )

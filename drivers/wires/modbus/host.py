@@ -9,6 +9,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from drivers.counters import WireCounters
 from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
@@ -51,7 +52,6 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
-    WireCounters,
     Written,
     read_nak,
     reply_words,

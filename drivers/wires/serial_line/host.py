@@ -6,6 +6,7 @@ serial:///dev/ttyUSB0?baud=921600&address=1, or on a server serial+tcp://HOST:PO
 import random
 from collections.abc import Callable
 
+from drivers.counters import WireCounters
 from drivers.ports.port import Port
 from drivers.ports.serial_port import open_port
 from drivers.ports.tcp import NETWORK_DELAY
@@ -37,7 +38,6 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
-    WireCounters,
     read_event,
     read_nak,
 )

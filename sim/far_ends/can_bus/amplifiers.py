@@ -6,6 +6,7 @@ Frames come and go packed (`drivers.wires.can_bus.frames`), those of a message t
 import struct
 from collections.abc import Mapping
 
+from drivers.counters import WireCounters
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import (
@@ -32,7 +33,6 @@ from drivers.wires.can_bus.frames import (
     segments,
     unpack_frames,
 )
-from drivers.wires.wire import WireCounters
 from sim.amplifier.contract import SILENCING_RAMP
 from sim.far_ends.can_bus.word_objects import ObjectServer
 from sim.transport.far_end import AmplifierPort, FarEnd, Send

@@ -2,6 +2,7 @@
 
 import pytest
 
+from drivers.counters import WireCounters
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.protocol.table import MESSAGES
@@ -11,7 +12,6 @@ from drivers.wires.can_bus.frames import (
     frames_of,
     segments,
 )
-from drivers.wires.wire import WireCounters
 
 SET = ("1300050a34120700", "1301020081000100", "130200002000d007", "13038813d8dc0000")
 """Session 1234, token 7, part 0 of 1; layer 1 along 1 ms: channel 2, 100 Hz, 0.5, -90 degrees."""

@@ -258,9 +258,9 @@ class Client(ABC):
         if self.free:
             return
         addresses = [each for each in range(self.addresses, 0, -1) if each != self.address]
-        for asked in in_batches(addresses, _AT_ONCE if self.has_broadcasts else 1):
-            is_heard = await self._is_heard(asked)
-            for each in asked if is_heard and self.is_shared else ():
+        for batch in in_batches(addresses, _AT_ONCE if self.has_broadcasts else 1):
+            is_heard = await self._is_heard(batch)
+            for each in batch if is_heard and self.is_shared else ():
                 if await self._is_heard([each]) and not self.heard:  # several at this address
                     self._others.add(each)
             if not (self.has_broadcasts or is_heard):

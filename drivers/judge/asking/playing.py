@@ -151,12 +151,12 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
 @driving(_PLACE)
 def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
-    whole, longest = subject.whole(), subject.can["ramp_max"]
-    part = partial(subject.follow, 0.4 * longest / 1000)
+    whole, ramp_max = subject.whole(), subject.can["ramp_max"]
+    part = partial(subject.follow, 0.4 * ramp_max / 1000)
     return [
         *([replace(whole, ramp=time)] for time in {subject.ramp, 20}),
         *([whole, layer(0, ramp=time)] for time in (subject.ramp, 20)),
-        [replace(whole, ramp=longest), part, send("Silence", ramp=0)],
+        [replace(whole, ramp=ramp_max), part, send("Silence", ramp=0)],
     ]
 
 

@@ -270,8 +270,8 @@ async def broadcasts(subject: Subject) -> None:
         ]
         stop, commit = MESSAGES["Stop"].number, MESSAGES["Commit"].number
         flawed: list[tuple[int, list[int]]] = [(stop, []), (stop, [0, 0]), (_UNKNOWN[0], [])]
-        foreign = commit, _shortest("Commit", session=77, token=subject.token or 1)
-        frames = [client.request(*each, to=0) for each in (foreign, *flawed, *requests)]
+        unheld = commit, _shortest("Commit", session=77, token=subject.token or 1)
+        frames = [client.request(*each, to=0) for each in (unheld, *flawed, *requests)]
         await client.expect_silence(client.question(0), "what is for one alone, to all", *frames)
         await subject.request("GetStatus")
 

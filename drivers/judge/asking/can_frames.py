@@ -329,8 +329,8 @@ async def heartbeats(subject: Subject) -> None:
     head = known["code"], known["error_register"]
     tripped = [_EMERGENCY.pack(*head, fault | each, NO_CHANNEL) for each in (REACTING, FAULT)]
     *first, last = client.data_of("emergency") or [b""]
-    is_told = bool(first) and {*first} <= {*tripped}
-    expect(is_told, "emergencies of the watchdog", expected=tripped, seen=first)
+    is_reported = bool(first) and {*first} <= {*tripped}
+    expect(is_reported, "emergencies of the watchdog", expected=tripped, seen=first)
     expect_equal(last, _EMERGENCY.pack(0, 0, OFF, NO_CHANNEL), "emergency after Clear")
 
 

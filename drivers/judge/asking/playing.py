@@ -239,7 +239,8 @@ def endings(subject: Subject) -> Rows:
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     subject.require_knots()
-    knots = math.ceil(min(subject.exchange_time, 0.1) / 0.02)
+    slowest = min(subject.exchange_time, 0.1)
+    knots = 1 if subject.slowness == 1 else math.ceil(slowest / 0.01)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
     over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]

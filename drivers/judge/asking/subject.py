@@ -507,11 +507,11 @@ class Subject(Material):
         began = self.shown.outputs.began
         end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
         end = end if duration is None else began[0] + duration
-        few = min(2 * self.exchange_time, 3 * self._read_time, 2.0)
-        end = max(end, clock.now() + few)  # of a slow line
+        few = min(2 * self.exchange_time, 2.0)  # of a slow line
+        end = max(end, clock.now() + min(few, 3 * self._read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
-        while clock.now() < end:
+        while clock.now() < end + few * (seen < 2):
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)

@@ -342,9 +342,9 @@ def _beside_step(
     kept = [each.content for each in then.contents.values()]
     led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
     beside = [id for id in promises[1] if id not in led]
-    before = _above(beside, promises, heard, (span[0] - STRONGEST, span[0]))
-    above = _above(beside, promises, heard, span)
-    return [each - max(0.0, rings) for each, rings in zip(above, before, strict=True)]
+    before = [heard[id].foreign_db_sl((span[0] - STRONGEST, span[0])).max() for id in beside]
+    above = zip(beside, _above(beside, promises, heard, span), before, strict=True)
+    return [over - max(0.0, float(rings) - _most(id, *promises)) for id, over, rings in above]
 
 
 def _above(

@@ -243,9 +243,9 @@ class Selector:
             return
         new = {(each.key, each.frequency) for each in step.contents}
         old = [each for each in self._lasting.contents if (each.key, each.frequency) not in new]
-        self._fading = replace(self._lasting, contents=tuple(old))
+        if step.contents != self._lasting.contents:
+            self._fading, self._led_at = replace(self._lasting, contents=tuple(old)), now
         self._lasting = step
-        self._led_at = now
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
     def _request_again(self) -> None:

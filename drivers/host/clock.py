@@ -26,7 +26,7 @@ WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
 COMMON_AFTER = WINDOW + 2.0
 """Seconds of Marks after which clocks agree by them: what was led by single readings is over."""
-_PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
+_PARTS, _MIN_PART, _MAX_PART = 32, 2.0**-8, 0.25  # of what was read, lowest ones are kept; s of each
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
@@ -78,7 +78,6 @@ class HeldClock:
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
         self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
-        self._part_ends = -math.inf
         self._line = _Line(time)
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
 
@@ -119,7 +118,7 @@ class HeldClock:
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
         is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off and len(self._lowest) > _PARTS else None
+        return "clock_rate" if is_off and len(self._lowest) > _PARTS // 2 else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -212,19 +211,22 @@ class HeldClock:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
-            self._part_ends = time
-        if self._lowest and time < self._part_ends:
-            before, low, _ = self._lowest[-1]
-            if lead + off >= low + line.rate * (time - before) - _STEP / 2:  # as it is rounded
-                return
-            self._lowest.pop()
-        else:
-            marked = [each for each in self._lowest if each[0] > self.marked_from]
-            kept = marked if len(marked) >= _RECENT else self._lowest
-            self._lowest = [each for each in kept if time - each[0] <= WINDOW]
-            span = time - self._lowest[0][0] if self._lowest else 0.0
-            self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
-        self._lowest.append((time, lead + off, later))
+        part = _MIN_PART
+        while self._lowest and time - max(self._lowest[0][0], time - WINDOW) > _PARTS * part:
+            part *= 2
+        marked = [each for each in self._lowest if each[0] > self.marked_from]
+        kept = marked if len(marked) >= _RECENT else self._lowest
+        self._lowest = []
+        for each in (*kept, (time, lead + off, later)):
+            if time - each[0] > WINDOW:
+                continue
+            if self._lowest and each[0] // part == (before := self._lowest[-1])[0] // part:
+                if each[1] >= before[1] + line.rate * (each[0] - before[0]) - _STEP / 2:
+                    continue
+                self._lowest.pop()
+            self._lowest.append(each)
+        if self._lowest[-1][0] != time:
+            return
         self._fit(time)
 
     def _fit(self, time: float) -> None:

@@ -7,6 +7,7 @@ delays it is common to all of them.
 """
 
 import asyncio
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from itertools import cycle
 from statistics import median
 from typing import Any
 
+from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import COMMON_AFTER
 from drivers.host.jobs import Priority
@@ -25,6 +27,7 @@ from drivers.protocol.timing import HEARTBEAT
 _GOOD, _POOR = 5e-6, 12e-6  # s; an error that costs nothing of a promise, and one that does
 _MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
 _INTERVAL = 0.01  # s, at least, between these; half of that where an error is poor
+_SETTLING = 0.2  # s, at most, for readings before clocks are needed
 _FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
@@ -72,6 +75,30 @@ class Clocks:
             )
             for name, each in every.items()
         }
+
+    async def settle(self) -> None:
+        """Read clocks that are known poorly time and again, before anything plays: it costs none.
+
+        Of one that does not reply no more is read here.
+        """
+        every = self._amplifiers.values()
+        lines = {each.line for each in every if not each.clock.is_alone}
+        now = asyncio.get_running_loop().time()
+        await asyncio.gather(*[self._settle(line, now + _SETTLING) for line in lines])
+
+    async def _settle(self, line: Line, until: float) -> None:
+        of_line = [
+            each
+            for each in self._amplifiers.values()
+            if each.line is line and each.clock.can_be_steered
+        ]
+        with contextlib.suppress(DriverError):
+            while (now := line.time()) < until:
+                if max([each.clock.scatter(now) for each in of_line], default=0.0) <= _GOOD:
+                    break
+                for each in of_line:
+                    await each.read_status(Priority.READING)
+                    await asyncio.sleep(self.later())
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
         """Read clocks of lines beside their heartbeats, which go out next: more where needed.

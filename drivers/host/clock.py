@@ -120,24 +120,21 @@ class HeldClock:
         """Return the standard error of its lead as it is read [s]; infinite before that."""
         return self._seen(time).error
 
-    def error(self, time: float, *, is_common: bool = False) -> float:
-        """Return its error [s rms] against the host's, with what it states; infinite if unknown.
+    def error(
+        self, time: float, *, off: float | None = None, is_common: bool = False
+    ) -> float:
+        """Return its error [s rms] with what it states; infinite if unknown.
 
-        While armed with what is still to be led to zero. is_common: against the clock to which
-        others of its line are held, too.
+        off: by how much it is ahead of others [s], None: of the host's; counts while armed, as it
+        is led to zero. is_common: against others of its line that are held to the same clock.
         """
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
-        lead, seen = self.lead(time), self.scatter(time)
+        lead = (self.lead(time) if off is None else off) if self._is_armed else 0.0
+        seen = self.scatter(time)
         if is_common:
-            lead -= self._common(time)
             seen = self._beside.at(time).error if self.is_compared else 0.0
-        lead = lead if self._is_armed else 0.0
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
-
-    def _common(self, time: float) -> float:
-        """Return the lead [s] of the clock to which its line is held, which may be itself."""
-        return (self._other if self.is_compared else self).lead(time)
 
     def problem(self, time: float) -> ClockProblem | None:
         """Return what ails it at a time [s]; None if nothing."""
@@ -166,7 +163,8 @@ class HeldClock:
         within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
         # Those of a line together, and by itself what it differs.
-        common = self._common(time) if is_trusted and self.is_compared else 0.0
+        is_led = is_trusted and self.is_compared and self._other is not None
+        common = self._other.lead(time) if is_led else 0.0
         steps = [min(max(-each / within, -max_rate), max_rate) for each in (common, lead - common)]
         return round((min(max(sum(steps), -_FAST[1]), _FAST[1]) - crystal) * _PER_RATE)
 

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from operator import attrgetter
-from statistics import fmean
+from statistics import median
 from typing import Any
 
 from drivers.errors import DriverError
@@ -69,18 +69,18 @@ class Clocks:
         held = [each for each in every.values() if each.clock.error(now) < math.inf]
         is_common = len({each.line for each in every.values()}) == 1
         is_common &= sum(not each.clock.is_compared for each in held) == 1
-        errors = {
+        common = median([each.clock.lead(now) for each in held] or [0.0])
+        # So that the rms of what is known is no less than that of their differences.
+        wider = math.sqrt(len(held) / max(len(held) - 1, 1))
+        return {
             name: math.hypot(
-                each.clock.error(now, is_common=is_common),
+                each.clock.error(
+                    now, off=wider * (each.clock.lead(now) - common), is_common=is_common
+                ),
                 0.0 if self._are_alike else each.clock.shortest / 2,
             )
             for name, each in every.items()
         }
-        if is_common:  # that to which the others are held is off them by as much
-            first = next(each.name for each in held if not each.clock.is_compared)
-            squares = [errors[each.name] ** 2 for each in held if each.name != first]
-            errors[first] = max(errors[first], math.sqrt(fmean(squares or [0.0])))
-        return errors
 
     async def settle(self) -> None:
         """Read clocks that are known poorly time and again, before anything plays: it costs none.

@@ -4,14 +4,18 @@ Each Status is a reading, of a moment between the last bit of its request and th
 reply. USB frames, other traffic and operating systems add to the time of the bits and never take
 from it, so a reading less the soonest arrival of its request is the lead of the clock or more, and
 the lowest ones are nearly right; the way back, with its latency timers and the waking of this
-process, does not count. Of each quarter of a second the lowest is kept, and a line is laid by least
-squares through the lower half of these: the lowest alone are the nearest where frames add, their
-mean where the operating system does. The one above these tells how late they may be. Shift and rate
-of the host are taken off before, so that steering feeds nothing back into what is measured.
+process, does not count. Of each part of the time that was read, at most a quarter of a second, the
+lowest is kept, and a line is laid by least squares through the lower half of these: the lowest
+alone are the nearest where frames add, their mean where the operating system does. The one above
+these tells how late they may be. Shift and rate of the host are taken off before, so that steering
+feeds nothing back into what is measured.
 
 The shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
 crystal's and leads the rest to zero: soon while nothing plays, else within what is not felt. A
 clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
+
+Clocks of one line keep the same byte of a Mark, whatever delays it: what they differ by is known to
+what they state. One is held to the host's, and the others to it.
 """
 
 import math
@@ -93,7 +97,13 @@ class HeldClock:
     @property
     def is_compared(self) -> bool:
         """Whether it is known by Marks how it differs from the clock to which it is held."""
-        return self._other is not None and self._beside.time in self._other._marked
+        return self._first is not None
+
+    @property
+    def _first(self) -> "HeldClock | None":
+        """The clock to which it is held, if it is compared with it."""
+        other = self._other
+        return other if other is not None and self._beside.time in other._marked else None
 
     def compare(self, other: "HeldClock | None") -> None:
         """Hold it to another clock of its line, by Marks that both have shown.
@@ -106,10 +116,11 @@ class HeldClock:
 
     def _seen(self, time: float) -> _Line:
         """Return its line at a time [s]."""
-        if not self.is_compared:
+        if (first := self._first) is None:
             return self._line.at(time)
-        lines = zip(self._other._line.at(time), self._beside.at(time), strict=True)
-        return _Line(time, *[sum(both) for both in lines][1:])
+        line, beside = first._line.at(time), self._beside.at(time)
+        error, rate_error = line.error + beside.error, line.rate_error + beside.rate_error
+        return _Line(time, line.lead + beside.lead, line.rate + beside.rate, 0.0, error, rate_error)
 
     def lead(self, time: float) -> float:
         """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
@@ -120,9 +131,7 @@ class HeldClock:
         """Return the standard error of its lead as it is read [s]; infinite before that."""
         return self._seen(time).error
 
-    def error(
-        self, time: float, *, off: float | None = None, is_common: bool = False
-    ) -> float:
+    def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
         """Return its error [s rms] with what it states; infinite if unknown.
 
         off: by how much it is ahead of others [s], None: of the host's; counts while armed, as it
@@ -162,9 +171,9 @@ class HeldClock:
         is_gentle = is_playing or abs(lead) <= max(_NEAR, self._line.error)
         within, max_rate = _GENTLE if is_gentle else _FAST
         crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        # Those of a line together, and by itself what it differs.
-        is_led = is_trusted and self.is_compared and self._other is not None
-        common = self._other.lead(time) if is_led else 0.0
+        # All of a line together, and each by what it differs.
+        first = self._first if is_trusted else None
+        common = 0.0 if first is None else first.lead(time)
         steps = [min(max(-each / within, -max_rate), max_rate) for each in (common, lead - common)]
         return round((min(max(sum(steps), -_FAST[1]), _FAST[1]) - crystal) * _PER_RATE)
 
@@ -256,7 +265,7 @@ class HeldClock:
         return lead + off
 
     def _compare(self, time: float, lead: float) -> None:
-        """Note a Mark, and lay a line through what it differs from the other clock by all Marks.
+        """Note a Mark, and lay a line through what it differs by from the other clock.
 
         What is likely of two crystals counts as if it were measured, too.
         """
@@ -267,11 +276,13 @@ class HeldClock:
         if not both:
             return
         newest, count = both[-1][0], len(both)
-        ages = [newest - at for at, _ in both]
-        middle, mean = sum(ages) / count, sum([each for _, each in both]) / count
-        breadth = sum([(middle - age) ** 2 for age in ages]) + (_LEAST / _EXPECTED_RATE) ** 2
-        products = [(middle - age) * (each - mean) for age, (_, each) in zip(ages, both)]
-        rate = sum(products) / breadth
+        middle = sum([newest - at for at, _ in both]) / count
+        mean = sum([each for _, each in both]) / count
+        slope, breadth = 0.0, (_LEAST / _EXPECTED_RATE) ** 2
+        for at, each in both:
+            since = at - newest + middle
+            slope, breadth = slope + since * (each - mean), breadth + since**2
+        rate = slope / breadth
         error = _LEAST * math.sqrt(1 / count + middle**2 / breadth)
         rate_error = _LEAST / math.sqrt(breadth)
         self._beside = _Line(newest, mean + rate * middle, rate, 0.0, error, rate_error)

@@ -98,7 +98,9 @@ def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> None:
     run_virtual(run())
 
 
-@pytest.mark.parametrize(("kind", "bound"), [("usb-high-speed", 150e-6), ("usb-full-speed", 300e-6)])
+@pytest.mark.parametrize(
+    ("kind", "bound"), [("usb-high-speed", 150e-6), ("usb-full-speed", 300e-6)]
+)
 @pytest.mark.parametrize("lines", [("a", "b", "c", "d"), ("abcd",)], ids="-".join)
 def test_clocks_are_held_when_a_group_is_armed(
     lines: Sequence[str], kind: str, bound: float

@@ -38,7 +38,8 @@ _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it w
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
+_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
+_TOGETHER = 0.5, 2e-4  # all of a line: their Pings are some 50 ms apart
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
@@ -72,6 +73,7 @@ class HeldClock:
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self._other: HeldClock | None = None  # to which it is held, see `compare`
+        self._is_first = False  # whether others are held to it
         self._pace = 0.0  # seconds a second, by the rate of a Ping
         self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
         self._marks = 0  # since a Status, which may show any of them
@@ -113,6 +115,7 @@ class HeldClock:
         """
         if other is not self._other:
             self._other, self._beside = other, _Line(-math.inf)
+        self._is_first = other is None
 
     def _seen(self, time: float) -> _Line:
         """Return its line at a time [s]."""
@@ -168,14 +171,15 @@ class HeldClock:
         lead, line = self.lead(time) if is_trusted else 0.0, self._seen(time)
         if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
             self._near_at = time
-        is_gentle = is_playing or abs(lead) <= max(_NEAR, self._line.error)
-        within, max_rate = _GENTLE if is_gentle else _FAST
-        crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        # All of a line together, and each by what it differs.
-        first = self._first if is_trusted else None
-        common = 0.0 if first is None else first.lead(time)
-        steps = [min(max(-each / within, -max_rate), max_rate) for each in (common, lead - common)]
-        return round((min(max(sum(steps), -_FAST[1]), _FAST[1]) - crystal) * _PER_RATE)
+        first, common = self._first, 0.0
+        if is_trusted and (first is not None or self._is_first):
+            common = lead if first is None else first.lead(time)
+        own, seen = lead - common, self._line if first is None else self._beside
+        is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
+        rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
+        for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
+            rate += min(max(-off / within, -highest), highest)
+        return round(rate * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""

@@ -39,7 +39,7 @@ _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
-_TOGETHER = 0.5, 2e-4  # all of a line: their Pings are some 50 ms apart
+_TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
@@ -169,12 +169,13 @@ class HeldClock:
             return 0
         is_trusted = time - self._jumped_at >= CLOCK_SETTLING
         lead, line = self.lead(time) if is_trusted else 0.0, self._seen(time)
-        if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
-            self._near_at = time
         first, common = self._first, 0.0
         if is_trusted and (first is not None or self._is_first):
             common = lead if first is None else first.lead(time)
         own, seen = lead - common, self._line if first is None else self._beside
+        is_near = abs(lead if first is None else own) <= max(_NEAR, 2 * self.scatter(time))
+        if is_near:  # what is not seen accuses none
+            self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
         rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
         for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):

@@ -173,8 +173,8 @@ class HeldClock:
         if is_trusted and (first is not None or self._is_first):
             common = lead if first is None else first.lead(time)
         own, seen = lead - common, self._line if first is None else self._beside
-        is_near = abs(lead if first is None else own) <= max(_NEAR, 2 * self.scatter(time))
-        if is_near:  # what is not seen accuses none
+        near = max(_NEAR, 2 * self.scatter(time))  # what is not seen accuses none
+        if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
         rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal

@@ -11,13 +11,13 @@ from urllib.parse import parse_qsl
 CLOCK_ERRORS: Mapping[str, float] = {
     "prompt": 0.0,
     "native": 3e-6,
-    "usb-high-speed": 15e-6,
-    "usb-full-speed": 40e-6,
-    "ftdi": 51e-6,
-    "ftdi-low-latency": 95e-6,
-    "can": 5e-6,
-    "can-usb": 42e-6,
-    "ethernet": 8e-6,
+    "usb-high-speed": 5e-6,
+    "usb-full-speed": 27e-6,
+    "ftdi": 54e-6,
+    "ftdi-low-latency": 86e-6,
+    "can": 2e-6,
+    "can-usb": 3e-6,
+    "ethernet": 4e-6,
 }
 """Error of a clock that is held over a line of a kind, rms [s].
 

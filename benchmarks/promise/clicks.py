@@ -7,8 +7,7 @@ three of them quiet. On other plates for each set, drawn within the uncertainty 
 or one as after `era rig identify` (identified), the contrast over the click: at the target over its
 duration, at the loudest quiet point the strongest as long, ringing after it included. Median of
 what is promised, share of all plates that give it, and by how much it is beyond what nine of ten
-of them give [dB]. The correlation that the promise counts on was fitted to fingers and plates of
-seed 3; those of any other are held out.
+of them give [dB].
 """
 
 import argparse

@@ -4,14 +4,18 @@ Each Status is a reading, of a moment between the last bit of its request and th
 reply. USB frames, other traffic and operating systems add to the time of the bits and never take
 from it, so a reading less the soonest arrival of its request is the lead of the clock or more, and
 the lowest ones are nearly right; the way back, with its latency timers and the waking of this
-process, does not count. Of each quarter of a second the lowest is kept, and a line is laid by least
-squares through the lower half of these: the lowest alone are the nearest where frames add, their
-mean where the operating system does. The one above these tells how late they may be. Shift and rate
-of the host are taken off before, so that steering feeds nothing back into what is measured.
+process, does not count. Of each part of the time that was read, at most a quarter of a second, the
+lowest is kept, and a line is laid by least squares through the lower half of these: the lowest
+alone are the nearest where frames add, their mean where the operating system does. The one above
+these tells how late they may be. Shift and rate of the host are taken off before, so that steering
+feeds nothing back into what is measured.
 
 The shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
 crystal's and leads the rest to zero: soon while nothing plays, else within what is not felt. A
 clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
+
+Clocks of one line keep the same byte of a Mark, whatever delays it: what they differ by is known to
+what they state. One is held to the host's, and the others to it.
 """
 
 import math
@@ -24,9 +28,8 @@ from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIE
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
-COMMON_AFTER = WINDOW + 2.0
-"""Seconds of Marks after which clocks agree by them: what was led by single readings is over."""
-_PARTS, _MIN_PART, _MAX_PART = 16, 0.05, 0.25  # of what was read, lowest ones are kept; s of each
+_PARTS, _MIN_PART = 32, 2.0**-8  # of what was read, lowest ones are kept; s of each, or twice that
+_MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal bends
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
@@ -35,9 +38,9 @@ _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it w
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.2, 3e-3  # four Pings, or lost ones overshoot; within what a Ping can say
+_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
+_TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
 _NEAR = 20e-6  # s; or its error: what is led to zero
-_COMMON = 0.04  # of an error, between clocks that were read by the same Marks
 _SURELY = 4.0  # standard errors
 _STEP = CLOCK_TURN / SPAN  # s; of a clock on the wire
 _PER_RATE, _PER_ERROR = QUANTITIES["rate"].per_unit, QUANTITIES["clock_error"].per_unit
@@ -53,6 +56,12 @@ class _Line(NamedTuple):
     error: float = math.inf
     rate_error: float = _EXPECTED_RATE
 
+    def at(self, time: float) -> "_Line":
+        """Return it at another time [s]."""
+        later = time - self.time
+        error = self.error + self.rate_error * max(0.0, later)
+        return _Line(time, self.lead + self.rate * later, self.rate, 0.0, error, self.rate_error)
+
 
 class HeldClock:
     """The clock of an amplifier, by its messages; times [s] are of the host's clock."""
@@ -63,8 +72,8 @@ class HeldClock:
         """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
-        self.marked_from = math.inf
-        """Since when [s] only Marks are read, see `read_marks`."""
+        self._other: HeldClock | None = None  # to which it is held, see `compare`
+        self._is_first = False  # whether others are held to it
         self._pace = 0.0  # seconds a second, by the rate of a Ping
         self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
         self._marks = 0  # since a Status, which may show any of them
@@ -78,36 +87,65 @@ class HeldClock:
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
         self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
-        self._part_ends = -math.inf
         self._line = _Line(time)
+        self._marked: dict[float, float] = {}  # leads, by when a Mark arrived
+        self._beside = _Line(-math.inf)  # to the other's, from the newest Mark of both
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
 
     def identified(self, stated: int, *, bits: float) -> None:
         """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
         self.stated, self.can_be_steered, self._bits = stated, stated != CLOCK_UNKNOWN, bits
 
+    @property
+    def is_compared(self) -> bool:
+        """Whether it is known by Marks how it differs from the clock to which it is held."""
+        return self._first is not None
+
+    @property
+    def _first(self) -> "HeldClock | None":
+        """The clock to which it is held, if it is compared with it."""
+        other = self._other
+        return other if other is not None and self._beside.time in other._marked else None
+
+    def compare(self, other: "HeldClock | None") -> None:
+        """Hold it to another clock of its line, by Marks that both have shown.
+
+        None: to the host's. What delays a Mark is the same for all, so that nothing of it is in
+        their difference.
+        """
+        if other is not self._other:
+            self._other, self._beside = other, _Line(-math.inf)
+        self._is_first = other is None
+
+    def _seen(self, time: float) -> _Line:
+        """Return its line at a time [s]."""
+        if (first := self._first) is None:
+            return self._line.at(time)
+        line, beside = first._line.at(time), self._beside.at(time)
+        error, rate_error = line.error + beside.error, line.rate_error + beside.rate_error
+        return _Line(time, line.lead + beside.lead, line.rate + beside.rate, 0.0, error, rate_error)
+
     def lead(self, time: float) -> float:
         """Return by how much it is ahead of the host's clock at a time [s], 0 before it is read."""
-        line = self._line
-        unsteered = line.lead + line.rate * (time - line.time)
+        unsteered = self._seen(time).lead
         return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its lead as it is read [s]; infinite before that."""
-        line = self._line
-        return line.error + line.rate_error * max(0.0, time - line.time)
+        return self._seen(time).error
 
-    def error(self, time: float, *, common: float | None = None) -> float:
-        """Return its error [s rms] against the host's, with what it states; infinite if unknown.
+    def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
+        """Return its error [s rms] with what it states; infinite if unknown.
 
-        While armed with what is still to be led to zero. common: against those of others whose
-        readings have the same errors, the lead [s] that all of them have.
+        off: by how much it is ahead of others [s], None: of the host's; counts while armed, as it
+        is led to zero. is_common: against others of its line that are held to the same clock.
         """
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
-        lead = self.lead(time) - (common or 0.0) if self._is_armed else 0.0
-        is_common = common is not None and self._is_by_marks(time)
-        seen = self.scatter(time) * (_COMMON if is_common else 1.0)
+        lead = (self.lead(time) if off is None else off) if self._is_armed else 0.0
+        seen = self.scatter(time)
+        if is_common:
+            seen = self._beside.at(time).error if self.is_compared else 0.0
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
 
     def problem(self, time: float) -> ClockProblem | None:
@@ -119,7 +157,7 @@ class HeldClock:
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
         is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off and len(self._lowest) > _PARTS else None
+        return "clock_rate" if is_off and len(self._lowest) > _PARTS // 2 else None
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -130,17 +168,19 @@ class HeldClock:
         if not self.can_be_steered:
             return 0
         is_trusted = time - self._jumped_at >= CLOCK_SETTLING
-        lead, error = self.lead(time) if is_trusted else 0.0, self._line.error
-        if abs(lead) <= max(_NEAR, 2 * self.scatter(time)):  # what is not seen accuses none
+        lead, line = self.lead(time) if is_trusted else 0.0, self._seen(time)
+        first, common = self._first, 0.0
+        if is_trusted and (first is not None or self._is_first):
+            common = lead if first is None else first.lead(time)
+        own, seen = lead - common, self._line if first is None else self._beside
+        near = max(_NEAR, 2 * self.scatter(time))  # what is not seen accuses none
+        if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
-        is_gentle = is_playing or abs(lead) <= max(_NEAR, error)
-        within, max_rate = _GENTLE if is_gentle else _FAST
-        crystal = min(max(self._line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
-        return round((min(max(-lead / within, -max_rate), max_rate) - crystal) * _PER_RATE)
-
-    def read_marks(self, since: float) -> None:
-        """Count only readings of a Mark from a time [s] on, whose delay all on a line share."""
-        self.marked_from = since
+        is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
+        rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
+        for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
+            rate += min(max(-off / within, -highest), highest)
+        return round(rate * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
@@ -171,14 +211,14 @@ class HeldClock:
         self._arming = 0
         self.shortest = min(self.shortest, max(received - time - self._bits, 0.0))
         # Whether a Ping without reply was heard is not known before that to the next one.
-        is_kept = (self._pinged is None or name == "Ping") and (
-            marks == 1 or received < self.marked_from
-        )
+        is_kept = self._pinged is None or name == "Ping"
         if marks <= 1 and (is_kept or not self._lowest):
             is_reported = was_armed and self._is_armed
             # A reply that is here before its request can be: the bits take less than they should.
             late = abs(received - arrives)
-            self._read(status["clock"], time, time - sent, late, is_reported=is_reported)
+            lead = self._read(status["clock"], time, time - sent, late, is_reported=is_reported)
+            if is_kept and marks:
+                self._compare(time, lead)
             if not is_kept:  # until the first that counts
                 self._lowest.clear()
         if name == "Ping" or not self._is_armed:
@@ -189,8 +229,10 @@ class HeldClock:
 
     def _read(
         self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
-    ) -> None:
+    ) -> float:
         """Take a reading of a time, so much earlier [s] at the most, or so much later.
+
+        Returns its lead if it was not steered [s].
 
         is_reported: whether a jump is said, since no restart explains it.
         """
@@ -208,24 +250,47 @@ class HeldClock:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
-        elif time < self.marked_from and off < -_FAR - _SURELY * self.scatter(time):
+        elif off < -_FAR - _SURELY * self.scatter(time):
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
-            self._part_ends = time
-        if self._lowest and time < self._part_ends:
-            before, low, _ = self._lowest[-1]
-            if lead + off >= low + line.rate * (time - before) - _STEP / 2:  # as it is rounded
-                return
-            self._lowest.pop()
-        else:
-            marked = [each for each in self._lowest if each[0] > self.marked_from]
-            kept = marked if len(marked) >= _RECENT else self._lowest
-            self._lowest = [each for each in kept if time - each[0] <= WINDOW]
-            span = time - self._lowest[0][0] if self._lowest else 0.0
-            self._part_ends = time + min(max(span / _PARTS, _MIN_PART), _MAX_PART)
-        self._lowest.append((time, lead + off, later))
-        self._fit(time)
+        part = _MIN_PART
+        self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
+        while self._lowest and time - self._lowest[0][0] > _PARTS * part:
+            part *= 2
+        kept, self._lowest = (*self._lowest, (time, lead + off, later)), []
+        for each in kept:
+            if self._lowest and each[0] // part == (before := self._lowest[-1])[0] // part:
+                if each[1] > before[1] + line.rate * (each[0] - before[0]) + _STEP / 2:
+                    continue
+                self._lowest.pop()
+            self._lowest.append(each)
+        if self._lowest[-1][0] == time:
+            self._fit(time)
+        return lead + off
+
+    def _compare(self, time: float, lead: float) -> None:
+        """Note a Mark, and lay a line through what it differs by from the other clock.
+
+        What is likely of two crystals counts as if it were measured, too.
+        """
+        self._marked = {at: each for at, each in self._marked.items() if time - at <= _MARKED}
+        self._marked[time] = lead
+        others = {} if self._other is None else self._other._marked
+        both = [(at, each - others[at]) for at, each in self._marked.items() if at in others]
+        if not both:
+            return
+        newest, count = both[-1][0], len(both)
+        middle = sum([newest - at for at, _ in both]) / count
+        mean = sum([each for _, each in both]) / count
+        slope, breadth = 0.0, (_LEAST / _EXPECTED_RATE) ** 2
+        for at, each in both:
+            since = at - newest + middle
+            slope, breadth = slope + since * (each - mean), breadth + since**2
+        rate = slope / breadth
+        error = _LEAST * math.sqrt(1 / count + middle**2 / breadth)
+        rate_error = _LEAST / math.sqrt(breadth)
+        self._beside = _Line(newest, mean + rate * middle, rate, 0.0, error, rate_error)
 
     def _fit(self, time: float) -> None:
         """Lay a line that may bend through the lower half of what is kept, by least squares.
@@ -234,9 +299,7 @@ class HeldClock:
         """
         rate, bend = self._line.rate, self._line.bend
         aged = [(time - at, lead, late) for at, lead, late in self._lowest]
-        # Marks share what scatters; what is likely would bend each line as its crystal is not.
-        is_common = self._is_by_marks(time)
-        count = len(aged) if is_common else max(len(aged) // 2, 1)
+        count = max(len(aged) // 2, 1)
         # One alone may be as late as its whole exchange, few nearly so, though they lie on a line.
         delay = self.shortest if count > 1 else self._lowest[0][2] - self._bits
         least = (delay / len(aged) ** 2) ** 2 / 12 + _LEAST**2
@@ -254,7 +317,7 @@ class HeldClock:
                 square = (middle - age) ** 2 - breadth / count
                 curve, wide = curve + square * high, wide + square**2
             off_line = max(scatter - slope**2 / (breadth or 1.0), 0.0)
-            error = _LEAST**2 if is_common else off_line / count + least
+            error = off_line / count + least
             square = middle**2 - breadth / count
             breadth, wide = breadth + error / _EXPECTED_RATE**2, wide + error / _EXPECTED_BEND**2
             tilt = (slope - (rate - 2 * bend * middle) * error / _EXPECTED_RATE**2) / breadth
@@ -275,8 +338,3 @@ class HeldClock:
             del self._lowest[:-_RECENT]
         off = min(recent)[0]
         self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
-
-    def _is_by_marks(self, time: float) -> bool:
-        """Whether all that is kept was read by Marks, for as long as readings count."""
-        since = self._lowest[0][0] if self._lowest else math.inf
-        return self.marked_from < since < time - WINDOW + 2 * _MAX_PART

@@ -11,11 +11,12 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
+from operator import attrgetter
 from statistics import median
 from typing import Any
 
+from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
-from drivers.host.clock import COMMON_AFTER
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members
@@ -25,6 +26,7 @@ from drivers.protocol.timing import HEARTBEAT
 _GOOD, _POOR = 5e-6, 12e-6  # s; an error that costs nothing of a promise, and one that does
 _MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
 _INTERVAL = 0.01  # s, at least, between these; half of that where an error is poor
+_SETTLING = 0.2  # s, at most, for readings before clocks are needed
 _FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
 
@@ -38,13 +40,17 @@ class Clocks:
         self._dither = 0.0
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
         self._turns: dict[Line, Iterator[Amplifier]] = {}
+        self._marked: set[Line] = set()  # all on which know Mark, and are several
 
     def follow(self) -> None:
         """Know all from now on: one alone, or by which lines and amplifiers they differ."""
         every = self._amplifiers.values()
         self._are_alike = len({_kind(each) for each in every}) == 1
         for line in {each.line for each in every}:
-            self._turns[line] = cycle([each for each in every if each.line is line])
+            of_line = [each for each in every if each.line is line]
+            self._turns[line] = cycle(of_line)
+            if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
+                self._marked.add(line)
         for each in every:
             each.clock.is_alone = len(every) == 1
 
@@ -59,19 +65,60 @@ class Clocks:
         every = self._amplifiers
         if len(every) < 2:
             return dict.fromkeys(every, 0.0)
-        amplifiers, common = [*every.values()], None
-        now = amplifiers[0].line.time()
-        marked_from = max([each.clock.marked_from for each in amplifiers])
-        if len({each.line for each in amplifiers}) == 1 and now - marked_from > COMMON_AFTER:
-            held = [each.clock for each in amplifiers if each.clock.error(now) < math.inf]
-            common = median([each.lead(now) for each in held] or [0.0])
+        now = next(iter(every.values())).line.time()
+        held = [each for each in every.values() if each.clock.error(now) < math.inf]
+        is_common = len({each.line for each in every.values()}) == 1
+        is_common &= sum(not each.clock.is_compared for each in held) == 1
+        common = median([each.clock.lead(now) for each in held] or [0.0])
+        # So that the rms of what is known is no less than that of their differences.
+        wider = math.sqrt(len(held) / max(len(held) - 1, 1))
         return {
             name: math.hypot(
-                each.clock.error(now, common=common),
+                each.clock.error(
+                    now, off=wider * (each.clock.lead(now) - common), is_common=is_common
+                ),
                 0.0 if self._are_alike else each.clock.shortest / 2,
             )
             for name, each in every.items()
         }
+
+    async def settle(self) -> None:
+        """Read clocks that are known poorly time and again, before anything plays: it costs none.
+
+        No more once one does not reply.
+        """
+        every = self._amplifiers.values()
+        lines = {each.line for each in every if not each.clock.is_alone}
+        now = asyncio.get_running_loop().time()
+        try:
+            async with asyncio.TaskGroup() as settling:
+                for line in lines:
+                    settling.create_task(self._settle(line, now + _SETTLING))
+        except* DriverError:  # whoever arms is told of it
+            pass
+
+    async def _settle(self, line: Line, until: float) -> None:
+        of_line = [
+            each
+            for each in self._amplifiers.values()
+            if each.line is line and each.clock.can_be_steered
+        ]
+        while (now := line.time()) < until:
+            if max([each.clock.scatter(now) for each in of_line], default=0.0) <= _GOOD:
+                break
+            if line in self._marked:
+                self._compare(of_line, now)
+                await line.submit(None, Priority.READING, "Mark", {})
+            for each in of_line:
+                await each.read_status(Priority.READING)
+                await asyncio.sleep(self.later())
+
+    def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
+        """Hold clocks of a line to the first one that can be trusted."""
+        ordered = sorted(of_line, key=attrgetter("address"))
+        first = next((each.clock for each in ordered if each.clock.error(now) < math.inf), None)
+        for each in of_line:
+            each.clock.compare(None if each.clock is first else first)
 
     def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
         """Read clocks of lines beside their heartbeats, which go out next: more where needed.
@@ -86,7 +133,8 @@ class Clocks:
             takes = [each.exchange_time("GetStatus") for each in of_line]
             shown = [each.counts.last_round_trip or 0.0 for each in of_line]
             busy[line] = sum(map(max, takes, shown))
-            if of_line[0].clock.marked_from < now:
+            if line in self._marked:
+                self._compare(of_line, now)
                 # Behind the heartbeats: what waits for a reply is sent in step with frames.
                 later = self.later(_INTERVAL + busy[line])
                 loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
@@ -99,10 +147,7 @@ class Clocks:
             return
         least = _INTERVAL if worst <= _POOR else _INTERVAL / 2
         for line, of_line in unmarked:
-            if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
-                for each in of_line:
-                    each.clock.read_marks(now)
-            elif line.late <= GRACE:
+            if line.late <= GRACE:
                 # Each by itself: one behind the reply to another is sent in step with frames.
                 interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
                 for number in range(1, int(HEARTBEAT / interval)):

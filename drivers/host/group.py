@@ -142,6 +142,8 @@ class Group:
                 members.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
+            await self._clocks.settle()
+            members.check_none_since(before)
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
             arms = [each.arm(session, self._watchdog) for each in amplifiers]
             arming = asyncio.ensure_future(outcomes(arms))

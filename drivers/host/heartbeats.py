@@ -9,7 +9,6 @@ third of a watchdog: there all are fed ahead of what is sent to one.
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
-from operator import itemgetter
 from typing import TypeAlias
 
 from drivers.errors import LinkTimeout
@@ -69,7 +68,7 @@ class Heartbeats:
             if each.silence_cause is not None:
                 mute.add(each.line)
         self._clocks.look({line: by_line[line] for line in by_line if line not in mute})
-        feeds: list[tuple[float, Feed]] = []
+        feeds: list[Feed] = []
         for line, of_line in by_line.items():
             may_read, token = line not in mute, 0
             is_late, is_shared, now = line.late > GRACE, len(line.members) > 1, line.time()
@@ -92,10 +91,8 @@ class Heartbeats:
                 elif is_late and not each.clock.is_alone:  # heartbeats alone are readings of it
                     pause = asyncio.sleep(self._clocks.later())
                     feed = partial(self._feed_after, each, self._members.epoch, pause)
-                # A late line feeds all again ahead of each: after that the last one's status tells.
-                feeds.append((-due if is_late else 0.0, feed))
-        feeds.sort(key=itemgetter(0))
-        return self._members.all([feed() for _, feed in feeds])
+                feeds.append(feed)
+        return self._members.all([feed() for feed in feeds])
 
     def _first_token(self, of_line: Sequence[Amplifier]) -> int:
         """Return the token that one of a line has committed, or else a new one."""

@@ -414,7 +414,7 @@ class Line:
             return
         if self.seen is not None:
             self.seen("none", member.address, "no reply", "")
-        was_cut = job.priority is Priority.READING and self.time() - job.sent_at < job.timeout
+        was_cut = job.priority is Priority.READING and job.due < job.sent_at + job.timeout
         if was_cut or self._must_yield(job):
             job.attempts += 1
             self._repeat(job, member)

@@ -46,12 +46,9 @@ Weights keep them quiet as long as they are followed, and no longer: where that 
 rang after was up to 7 dB stronger on four ERAs, 18 dB on a large table.
 """
 
-_IN_PHASE = 0.1
-"""Correlation of what other plates add with the nominal plate's ringing.
-
-So about nine of ten plates keep what is promised of a click (docs/measured/promise.md); with none,
-four of five of those of four ERAs do.
-"""
+_BESIDE = 1.7
+"""Distance of the frequencies beside its own that count of a short drive, by the reciprocal of its
+duration: beyond it are 1.4 % of its energy."""
 
 
 def pulse_ramp(duration: float) -> float:
@@ -118,16 +115,16 @@ class OverDuration:
         return cls(felt / np.maximum(steady, 1e-30), power.max(axis=0))
 
 
-def on_drawn_plates(power: FloatArray, heard: FloatArray, gain: FloatArray | float) -> FloatArray:
-    """Power over a duration on drawn plates (..., 1 + d), from the steady one, nominal first.
+def on_drawn_plates(
+    energies: FloatArray, heard: FloatArray, factor: FloatArray | float
+) -> FloatArray:
+    """Power over a duration on drawn plates (..., 1 + d), from energies, nominal first.
 
-    heard (...): over the duration on the nominal plate; gain: amplitude at the target over the
-    duration relative to the steady one. What other plates add is felt over the duration as at the
-    target, in phase with the ringing by a part.
+    heard (...): over the duration on the nominal plate; factor: of power over the duration to
+    energies, as at the target. What other plates add to the energy is felt by as much.
     """
-    others = gain * np.sqrt(np.maximum(power - power[..., :1], 0.0))
-    own = np.sqrt(heard)[..., None]
-    return np.asarray(own * own + 2 * _IN_PHASE * own * others + others * others)
+    added = factor * (energies - energies[..., :1])
+    return np.asarray(np.maximum(heard[..., None] + added, 0.0))
 
 
 def forms_over(
@@ -229,6 +226,22 @@ class RingingUnderFingers:
             else cls(table, *fingers, each, max(pulse_ramp(each), contents.least_ramp))
             for each in contents.durations
         ]
+
+    def spectrum(self, row: int) -> tuple[IntArray, FloatArray]:
+        """Rows of the table's frequencies near its own (b,), and factors (b,) on weights.
+
+        Tones with these have together the energy of the drive on any plate (Parseval), but for what
+        its ramps excite far beside: of a duration T along raised cosines of r the amplitude is
+        sinc(f T) cos(pi f r) / (1 - 4 f² r²). Above the threshold at its own frequency.
+        """
+        table, ramp = self.table, self.ramp
+        off = table.frequencies - table.frequencies[row]
+        rows = np.flatnonzero(np.abs(off) * self.duration < _BESIDE)
+        off = off[rows]
+        edges = np.sinc(off * ramp - 0.5) + np.sinc(off * ramp + 0.5)
+        amplitudes = np.sinc(off * self.duration) * edges
+        thresholds = table.thresholds[rows] / table.thresholds[row]
+        return rows, thresholds * amplitudes / np.linalg.norm(amplitudes)
 
     def responses(self, rows: IntArray) -> PulseResponses:
         """Responses at ascending rows of the table's frequencies, solved once.

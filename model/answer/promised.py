@@ -64,9 +64,8 @@ def promised(
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
     harmonics = fingers.harmonics(PROMISED_DRAWS, rows, weights)
     if any(stream.duration is not None for stream in streams):
-        over = fingers, contents, steady, rows, weights, owners, ringing
-        power, gains_over = _over_durations(*over)
-        harmonics = harmonics * np.square(gains_over)[:, None, None]
+        over = fingers, contents, steady, harmonics, rows, weights, owners, ringing
+        power, harmonics = _over_durations(*over)
     by_tone, factor = gains, 1.0
     if by_tone is None:
         of_contents, factor = _gains_to_levels(
@@ -144,32 +143,40 @@ def _over_durations(
     fingers: FingersOnPlate,
     contents: Contents,
     steady: Float32Array,
+    harmonics: Float32Array,
     rows: IntArray,
     weights: Complex64Array,
     owners: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Float32Array, Float32Array]:
-    """Power (m, k, p, d) of tones over the durations of their contents, and gains (m,) over these.
+    """Power (m, k, p, d) of tones over the durations of their contents, and of harmonics (m, k, d).
 
-    Gains are those of amplitudes at the target.
+    By the energy of the tones in their spectrum, on each plate.
     """
-    power, table, gains = steady.copy(), fingers.table, np.ones(len(rows), dtype=np.float32)
-    strokes = np.array([era.stroke for era in table.eras])
+    power, harmonics, table = steady.copy(), harmonics.copy(), fingers.table
+    shares, strokes = fingers.tips.fine_weights, np.array([era.stroke for era in table.eras])
     for tone, owner in enumerate(owners.tolist()):
         stream, over = contents.streams[owner], ringing[owner]
         if stream.duration is None:
             continue
         if over is None:  # along a shaped onset
-            gains[tone] = shaped_gain(stream.duration)
-            power[tone] *= gains[tone] ** 2
+            factor = np.float32(shaped_gain(stream.duration) ** 2)
+            power[tone] *= factor
+            harmonics[tone] *= factor
             continue
-        frequency = float(table.frequencies[rows[tone]])
-        felt, own = over.over([(frequency, weights[tone] * strokes)]), [*stream.targets]
-        at_targets = power[tone, own] * np.square(felt.gains[own])[:, None, None]
-        gains[tone] = felt.gains[own].min()
-        power[tone] = on_drawn_plates(steady[tone], felt.heard, gains[tone])
-        power[tone, own] = at_targets
-    return power, gains
+        frequency, own = float(table.frequencies[rows[tone]]), [*stream.targets]
+        felt = over.over([(frequency, weights[tone] * strokes)])
+        near, factors = over.spectrum(int(rows[tone]))
+        beside = np.asarray(factors[:, None] * weights[tone], dtype=np.complex64)
+        energy = fingers.powers(PROMISED_DRAWS, near, beside).sum(axis=0)
+        lasting, nominal = (
+            (shares[own] * np.sqrt(each[own, :, 0])).sum(axis=1) for each in (steady[tone], energy)
+        )
+        by_target = np.square(felt.gains[own] * lasting / np.maximum(nominal, _TINY))
+        power[tone] = on_drawn_plates(energy, felt.heard, by_target.min())
+        power[tone, own] = energy[own] * by_target[:, None, None]
+        harmonics[tone] *= np.float32(felt.gains[own].min() ** 2)
+    return power, harmonics
 
 
 def _gains_to_levels(

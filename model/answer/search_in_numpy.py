@@ -294,7 +294,7 @@ def _judged(
             during = [responses.over(drive) for drive in drives]
             gains = np.array([each.gains[targets].min() for each in during])
             heard = np.array([each.heard.max(axis=1) for each in during])
-            loudest[of] = on_drawn_plates(loudest[of], heard, gains[:, None, None])
+            loudest[of] = on_drawn_plates(loudest[of], heard, gains[:, None, None] ** 2)
             own[of] *= gains[:, None]
             least[of] = own[of, 0]
         if len(contents.streams) > 1:

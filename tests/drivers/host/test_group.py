@@ -220,7 +220,7 @@ async def test_copy_of_an_old_status_is_no_reply(wire: str) -> None:
     assert group.is_armed
 
 
-@grouped(("a", "b"), wire="rtu")
+@grouped(("a", "b"), wire="serial")
 async def test_status_on_a_late_line_is_not_cut_short(group: Group, ends: list[MemoryLine]) -> None:
     """A heartbeat waits for it: one that may reply again would else never be heard."""
     first, second = group.amplifiers.values()

@@ -122,8 +122,7 @@ def measured(fault: Fault, seed: int) -> Responses:
 
 def verdict_on(rig: Rig, name: str, seed: int) -> Verdict:
     """The check's verdict on a hidden plate with a fault by name."""
-    observation = measured(FAULTS[name], seed)
-    return judged_by_promises(diagnose(rig, observation, has_form=True), rig, observation)
+    return judged_by_promises(diagnose(rig, measured(FAULTS[name], seed), has_form=True), rig)
 
 
 def main() -> None:

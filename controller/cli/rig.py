@@ -98,8 +98,7 @@ def check(
         observation = replace(observation, has_phases=False)
     started = time.perf_counter()
     # Sensors of amplifiers are of unknown scale.
-    verdict = diagnose(rig, observation, has_form=url is None)
-    verdict = judged_by_promises(verdict, rig, observation)
+    verdict = judged_by_promises(diagnose(rig, observation, has_form=url is None), rig)
     elapsed = time.perf_counter() - started
     low, high = verdict.frequencies.min(), verdict.frequencies.max()
     rows += [

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
@@ -62,10 +64,10 @@ def verdict_rows(verdict: Verdict) -> list[str]:
         )
     if verdict.beyond is not None:
         rows += _beyond_rows(verdict.beyond)
-    if verdict.promises is not None and verdict.misses_promises:
+    if verdict.misses_promises:
         rows.append(
             "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
-            f"by {-verdict.promises.margin_db:.1f} dB or more"
+            f"by {-np.median(verdict.promise_margins):.1f} dB or more"
         )
     if rows:
         return rows
@@ -76,8 +78,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
 
 def difference_rows(verdict: Verdict) -> list[str]:
     """Line on how far the plate is from the rig and what it keeps; none if it keeps enough."""
-    kept = verdict.promises
-    if verdict.changes is None or kept is None or kept.is_passed:
+    if verdict.changes is None or verdict.kept_share is None or not verdict.differs:
         return []
     names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
     changes = ", ".join(
@@ -90,7 +91,7 @@ def difference_rows(verdict: Verdict) -> list[str]:
         within, changes = "", "by what has no name"
     return [
         f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
-        f"{percent(kept.kept_share)} of what the rig's table promises: calibrate it with "
+        f"{percent(verdict.kept_share)} of what the rig's table promises: calibrate it with "
         "`era calibrate`"
     ]
 
@@ -181,7 +182,7 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Verdict as JSON; units are in the keys."""
-    match, kept = verdict.match, verdict.promises
+    match = verdict.match
     return {
         "all_well": verdict.is_well,
         "channels": [
@@ -205,8 +206,8 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             "matches": verdict.plate_matches,
             "beyond": None if verdict.beyond is None else _beyond_as_json(verdict.beyond),
             "changes": verdict.changes or {},
-            "kept_share": None if kept is None else kept.kept_share,
-            "promise_margin_db": None if kept is None else kept.margin_db,
+            "kept_share": verdict.kept_share,
+            "promise_margins_db": [*verdict.promise_margins],
             "unexplained": None if match is None else match.error,
             "farthest_standard_deviations": None if match is None else match.worst,
             "parameters": []

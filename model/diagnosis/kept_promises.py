@@ -1,44 +1,48 @@
-"""What a rig's table promises at the sensors of a measurement, and what of it the plate keeps.
+"""What a rig's table promises, and what of it the plate keeps that a measurement is most like.
 
-Whatever is off, contrast tells whether it matters: the answers of the rig's table are put together
-from the measured responses of the channels, and compared with what nine of ten plates would give.
+Whatever is off, contrast tells whether it matters.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from model.calibration.responses import Responses
+from model.answer.fingers import Placement
+from model.answer.plan import query
 from model.diagnosis.verdict import Verdict
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.study.promise_at_sensors import MeasuredVerification, measured_promise, promises
+from model.rig.uncertainty import Uncertainty
+from model.study.exact_plates import draw_plates, felt_on
+from model.study.random_contacts import random_contacts
 from model.table.build import build_table
-from model.vibration.excitation import base_amplitudes
 
-_ANSWERS = 30  # ten each with one, two and three quiet places
+_ANSWERS = 30  # ten each with one, two and three quiet fingers
 
 
-def judged_by_promises(verdict: Verdict, rig: Rig, observation: Responses) -> Verdict:
-    """The verdict with what the plate keeps of the table's promises.
+def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
+    """The verdict with what the plate keeps of the promises to random fingers, solved exactly.
 
-    As it is where nothing is promised or compared: without phases between channels, with one that
-    was not driven, for sensors that are no fingers' breadth apart, or ERAs that make no table.
+    As it is where no plate fits, and for a rig that makes no table or has no room for four fingers.
     """
-    observation = observation.without(~np.isin(observation.sensors, verdict.sensors))
-    rows = np.isfinite(observation.values).all(axis=(1, 2))
-    if not observation.has_phases or not rows.any():
+    if verdict.match is None or verdict.changes is None:
         return verdict
-    names, values = [*observation.sensors], observation.values[rows]
-    places = {name: (x, y) for name, (x, y) in zip(names, observation.points.tolist(), strict=True)}
-    found = []
+    rng, margins = np.random.default_rng(0), []
     try:
-        table = build_table(rig, frequencies=observation.frequencies[rows], drive_mode="phased")
-        for promise in promises(table, places, count=_ANSWERS, level=1.0, seed=0):
-            frequencies, bases = base_amplitudes(promise.layer.excitation, table.eras)
-            at = [names.index(each) for each in promise.sensors]
-            heard = np.einsum("fe,fes->fs", bases, values[table.rows_of(frequencies)][:, :, at])
-            found.append(measured_promise(table, promise, frequencies, np.abs(heard)))
+        table = build_table(rig, drive_mode="phased")
+        there = build_table(verdict.match.rig, frequencies=table.frequencies, drive_mode="phased")
+        for number in range(_ANSWERS):
+            fingers = 2 + number % 3
+            places = random_contacts(rng, fingers, rig.plate)
+            placed = Placement(places[:1], places[1:])
+            answer = query(table, placed)
+            size = {"era_count": len(rig.eras), "contact_count": fingers}
+            plate = draw_plates(rng, Uncertainty.none(), count=1, **size)
+            felt = felt_on(there, placed, answer.layers[0].excitation, plate).contrast
+            promised = answer.fingers[0].promised_contrast_db
+            assert felt is not None  # noqa: S101  there are quiet fingers
+            assert promised is not None  # noqa: S101
+            margins.append(float(20 * np.log10(felt[0])) - promised)
     except InputError:
         return verdict
-    return replace(verdict, promises=MeasuredVerification(tuple(found)))
+    return replace(verdict, promise_margins=tuple(margins))

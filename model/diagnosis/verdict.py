@@ -36,7 +36,7 @@ from model.diagnosis.plate_match import (
 )
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
-from model.study.promise_at_sensors import MeasuredVerification
+from model.study.verify import MIN_KEPT_SHARE
 
 MISSED_DB = 1.0
 """By which half of a table's answers may miss their promises [dB]."""
@@ -84,8 +84,9 @@ class Verdict:
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
     out; swapped: cycles of channels by their ERAs; changes: see `plate_changes`, None without a
     plate that fits; sensors: names of those that were not left out; beyond: what of a plate that
-    matches is beyond tolerances, None for nothing or where it was not sought; promises: of the
-    rig's table, with what the plate keeps, None where they were not compared.
+    matches is beyond tolerances, None for nothing or where it was not sought; promise_margins: by
+    what that plate exceeds the contrasts that the rig's table promises [dB], none where they were
+    not compared.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -98,7 +99,7 @@ class Verdict:
     sensors: tuple[str, ...]
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
-    promises: MeasuredVerification | None = None
+    promise_margins: tuple[float, ...] = ()
 
     @property
     def wiring_matches(self) -> bool:
@@ -116,9 +117,19 @@ class Verdict:
         )
 
     @property
+    def kept_share(self) -> float | None:
+        """Share of the table's promises that the plate keeps, None where they were not compared."""
+        return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
+
+    @property
+    def differs(self) -> bool:
+        """Whether it keeps fewer than a table must."""
+        return self.kept_share is not None and self.kept_share < MIN_KEPT_SHARE
+
+    @property
     def misses_promises(self) -> bool:
         """Whether half of all answers give clearly less contrast than the table promises."""
-        return self.promises is not None and self.promises.margin_db < -MISSED_DB
+        return self.differs and float(np.median(self.promise_margins)) < -MISSED_DB
 
 
 def diagnose(

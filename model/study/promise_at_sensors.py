@@ -69,12 +69,6 @@ class MeasuredVerification:
         return float(np.mean([each.is_kept for each in self.measured]))
 
     @property
-    def margin_db(self) -> float:
-        """Measured contrast above the promised one, the median of all."""
-        over = [each.contrast_db - each.promise.contrast_db for each in self.measured]
-        return float(np.median(over))
-
-    @property
     def is_passed(self) -> bool:
         """Whether enough were kept."""
         return self.kept_share >= MIN_KEPT_SHARE

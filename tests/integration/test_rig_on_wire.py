@@ -118,7 +118,7 @@ def test_faults_of_wiring_and_plate_are_told(
     assert told["plate"]["matches"] == plate_matches
     if spoil is _thinner:
         assert told["plate"]["changes"]["modulus"] == pytest.approx(0.9**2 - 1, abs=0.03)
-        assert told["plate"]["promise_margin_db"] < -1
+        assert told["plate"]["kept_share"] < 0.5
 
 
 def test_daemon_that_runs_keeps_its_amplifiers(typed: Typed, plate: Rig, tmp_path: Path) -> None:

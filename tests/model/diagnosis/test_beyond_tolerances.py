@@ -26,7 +26,10 @@ def rig() -> Rig:
     ],
 )
 def test_diagnose_passes_plates_within_tolerances(rig, name, seed):
-    """Dampers at 2.3 to 3.8 times what is written, of a spread by 1.5, and 3 g in one place, at last 10 mm from an edge."""
+    """Dampers at 2.3 to 3.8 times what is written, of a spread by 1.5, and 3 g in one place.
+
+    At last 10 mm from an edge.
+    """
     assert verdict_on(rig, name, seed).is_well
 
 

@@ -101,7 +101,7 @@ def verdict_on(rig: Rig, *, loss: float, stiffness: float) -> Verdict:
     plate = replace(rig.plate, loss_factor=loss * rig.plate.loss_factor)
     truth = replace(rig, plate=plate, eras=eras)
     responses = measured(truth, frequencies=FREQUENCIES, noise=0.005)
-    return judged_by_promises(diagnose(rig, responses), rig, responses)
+    return judged_by_promises(diagnose(rig, responses), rig)
 
 
 def test_plate_with_more_loss_and_less_stiffness_has_a_verdict_of_its_own() -> None:
@@ -120,5 +120,5 @@ def test_plate_as_written_costs_nothing() -> None:
     assert verdict.is_well
     assert verdict.changes is not None
     assert max(map(abs, verdict.changes.values())) < 0.05
-    assert verdict.promises is not None
-    assert verdict.promises.kept_share > 0.9
+    assert verdict.kept_share is not None
+    assert verdict.kept_share > 0.9

@@ -1,4 +1,4 @@
-"""Counters and timing of a link."""
+"""Counters of a wire."""
 
 from dataclasses import dataclass
 
@@ -19,18 +19,3 @@ class WireCounters:
     unexpected_frames: int = 0
     events: int = 0
     remark: str = ""
-
-
-@dataclass
-class LinkStatistics(WireCounters):
-    """Statistics of a link at one moment.
-
-    Inherited counters restart when the link is opened, the following count since its construction.
-    retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
-    last_round_trip [s].
-    """
-
-    retries: int = 0
-    timeouts: int = 0
-    refusals: int = 0
-    last_round_trip: float | None = None

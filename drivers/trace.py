@@ -1,11 +1,11 @@
 """Trace of everything on the wires, for `--trace FILE`.
 
-Layers log to children of one logger, each line with its time:
+Each line has its time and its kind:
 
-    trace.wire      every frame, both directions: in hexadecimal, with its meaning
-    trace.request   every request of an amplifier with its reply, its error and its duration
+    wire      every frame, both directions: in hexadecimal, with its meaning
+    request   every request of an amplifier with its reply, its error and its duration
 
-A line is formatted and written by a thread of its own. Logging never waits for it: records beyond
+A line is formatted and written by a thread of its own. Tracing never waits for it: records beyond
 MAX_PENDING are dropped, and their number is written as soon as there is room.
 """
 
@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import StrEnum
-from functools import partial
 from pathlib import Path
 from typing import TextIO
 
@@ -27,11 +26,7 @@ MAX_PENDING = 20_000
 """Records kept for the thread: more than a second of the fastest wire."""
 
 _POLL_INTERVAL = 0.05  # s
-_root = logging.getLogger("trace")
-_root.propagate = False
-_root.setLevel(logging.CRITICAL)
-_wire = logging.getLogger("trace.wire")
-_request = logging.getLogger("trace.request")
+_writers: "list[TraceWriter]" = []
 
 
 class Direction(StrEnum):
@@ -41,8 +36,8 @@ class Direction(StrEnum):
     IN = "<"
 
 
-is_active = partial(_wire.isEnabledFor, logging.DEBUG)
-"""Whether anything is traced; ask it where the bytes of a frame must be made first."""
+is_active = _writers.__len__
+"""How many traces are written; ask it where the bytes of a frame must be made first."""
 
 
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
@@ -51,13 +46,21 @@ def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], st
     decode: returns the meaning; called later in the writing thread, so its arguments must not
     change. Costs a comparison while nothing is traced.
     """
-    if is_active():
-        _wire.debug("%s %s %s  %s", where, direction, _Lazy(lambda: data.hex(" ")), _Lazy(decode))
+    for writer in _writers:
+        writer.add("wire", lambda: f"{where} {direction} {data.hex(' ')}  {_meaning(decode)}")
 
 
 def request(requested: object, outcome: object, duration: float) -> None:
     """Trace a request with its reply or error, and its duration [s]."""
-    _request.debug("%s -> %r in %.1f ms", requested, outcome, duration * 1e3)
+    for writer in _writers:
+        writer.add("request", lambda: f"{requested} -> {outcome!r} in {duration * 1e3:.1f} ms")
+
+
+def _meaning(decode: Callable[[], str]) -> str:
+    try:
+        return decode()
+    except Exception as error:  # a damaged frame must not end the trace
+        return f"not decoded: {error}"
 
 
 @contextmanager
@@ -73,42 +76,36 @@ def tracing(path: Path) -> Iterator[None]:
         file.close()
         raise CommandError(f"trace file must be a regular file, got {path}")
     writer = TraceWriter(file)
-    _root.addHandler(writer)
-    _root.setLevel(logging.DEBUG)
+    _writers.append(writer)
     try:
         yield
     finally:
-        _root.removeHandler(writer)
-        if not any(isinstance(handler, TraceWriter) for handler in _root.handlers):
-            _root.setLevel(logging.CRITICAL)
+        _writers.remove(writer)
         writer.close()
 
 
-class TraceWriter(logging.Handler):
-    """Writes records to a file in a thread; `dropped` counts those for which there was no room."""
+class TraceWriter:
+    """Writes lines to a file in a thread; `dropped` counts those for which there was no room."""
 
     def __init__(self, file: TextIO) -> None:
-        super().__init__()
         self.dropped = 0
         self._file = file
-        self._pending: deque[logging.LogRecord] = deque()
+        self._pending: deque[tuple[datetime, str, Callable[[], str]]] = deque()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
 
-    def handle(self, record: logging.LogRecord) -> bool:
-        """Queue a record without a lock."""
+    def add(self, kind: str, text: Callable[[], str]) -> None:
+        """Queue a line of a kind, whose text is made when it is written."""
         if len(self._pending) < MAX_PENDING:
-            self._pending.append(record)
+            self._pending.append((datetime.now(UTC), kind, text))
         else:
             self.dropped += 1
-        return True
 
     def close(self) -> None:
         """Write what is pending and close the file; waits for a slow one for at most a second."""
         self._ending.set()
         self._thread.join(1.0)
-        super().close()
 
     def _run(self) -> None:
         reported = 0
@@ -117,7 +114,9 @@ class TraceWriter(logging.Handler):
             is_last = self._ending.wait(_POLL_INTERVAL)
             try:
                 while self._pending:
-                    self._file.write(_line(self._pending.popleft()))
+                    moment, kind, text = self._pending.popleft()
+                    time = moment.isoformat(timespec="microseconds")
+                    self._file.write(f"{time} {kind} {text()}\n")
                 if self.dropped > reported:
                     self._file.write(f"trace: {self.dropped - reported} records dropped\n")
                     reported = self.dropped
@@ -128,23 +127,3 @@ class TraceWriter(logging.Handler):
                 logging.getLogger(__name__).warning("trace: not written: %s", error)
         with suppress(OSError):  # of a disk that is still full
             self._file.close()
-
-
-class _Lazy:
-    """Text that is made when it is written."""
-
-    __slots__ = ("_make",)
-
-    def __init__(self, make: Callable[[], str]) -> None:
-        self._make = make
-
-    def __str__(self) -> str:
-        try:
-            return self._make()
-        except Exception as error:  # a damaged frame must not end the trace
-            return f"not decoded: {error}"
-
-
-def _line(record: logging.LogRecord) -> str:
-    moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="microseconds")
-    return f"{moment} {record.name.rpartition('.')[2]} {record.getMessage()}\n"

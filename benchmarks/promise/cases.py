@@ -201,7 +201,7 @@ CASES = (
     *_clicks("beside another's content", (1,), contents=1, quiet=1),
     *_clicks("at a finger with its own buzz, beside another", (0, 1)),
     *[
-        Case("two contents, one moves", None, is_identified=known, events=(MOVES,))
-        for known in (False, True)
+        Case("two contents, one moves", None, name, is_identified=known, events=(MOVES,))
+        for name, known in (("paper_plate", False), ("paper_plate", True), ("car_display", True))
     ],
 )

@@ -7,7 +7,7 @@ a witness reads every byte.
 import asyncio
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -27,7 +27,7 @@ from benchmarks.promise.cases import (
     Point,
 )
 from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
-from benchmarks.promise.heard import Heard, Log, Span
+from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
@@ -52,6 +52,9 @@ reports every fourth."""
 ANSWERS = "answers while moving, above their promise"
 """Of the contrast over the next 80 ms; its share of 0 dB and more is what is kept."""
 STEPS = "cross-fades, foreign above promise"
+"""Until anything else happens, and above what has been felt before: a landing may ring yet."""
+LANDED = "100 to 300 ms after a landing, foreign above promise"
+RUNG = 0.300  # s
 LIFTING = np.arange(0.875, 0, -0.125)  # load of the finger, until the panel reports that it is off
 
 
@@ -303,10 +306,15 @@ def _measured(
         len(first.served) / (last + 1),
         start,
     )
-    for then, now in pairwise(applied):
-        span = now.time, now.time + FALL_AFTER + CROSSFADE
-        if now.settled_after == CROSSFADE and span[1] <= until:
+    ends = [*[each.time for each in applied[2:]], until]
+    for then, now, end in zip(applied, applied[1:], ends, strict=False):
+        span = now.time, min(now.time + FALL_AFTER + CROSSFADE, end)
+        if now.settled_after == CROSSFADE and span[1] - span[0] >= FIRST:
             found.events[STEPS] += _beside_step(then, now, heard, span)
+        rings = now.time + FIRST, now.time + RUNG
+        if _promises(now).keys() - _promises(then).keys() and rings[1] <= until:
+            soon = [_promises(each) for each in applied if now.time <= each.time < rings[1]]
+            found.events[LANDED] += _above(soon[0].keys(), soon, heard, rings)
     for event in events:
         found.fingers += pairs(event.after)
         if event.name == MOVES:
@@ -328,15 +336,27 @@ def _measured(
 def _beside_step(
     then: PlayReport, now: PlayReport, heard: Mapping[int, Heard], span: Span
 ) -> list[float]:
-    """Foreign level of the strongest 40 ms of a cross-fade where others feel the same, each above
-    what is promised before and after."""
-    before, promised = _promises(then), _promises(now)
+    """Foreign level of a cross-fade where others feel the same, each above what is promised before
+    and after, and what was felt just before."""
+    promises = _promises(then), _promises(now)
     kept = [each.content for each in then.contents.values()]
     led = {one.content.key[0].id for one in now.contents.values() if one.content not in kept}
+    beside = [id for id in promises[1] if id not in led]
+    before = [heard[id].foreign_db_sl((span[0] - STRONGEST, span[0])).max() for id in beside]
+    above = zip(beside, _above(beside, promises, heard, span), before, strict=True)
+    return [over - max(0.0, float(rings) - _most(id, *promises)) for id, over, rings in above]
+
+
+def _above(
+    ids: Iterable[int],
+    promises: Sequence[Mapping[int, Prediction]],
+    heard: Mapping[int, Heard],
+    span: Span,
+) -> list[float]:
+    """Foreign level of the strongest 40 ms at fingers, above the most of what is promised."""
     return [
-        float(heard[id].foreign_db_sl(span, strongest=True).max()) - _most(id, before, promised)
-        for id in promised
-        if id not in led
+        float(heard[id].foreign_db_sl(span, strongest=True).max()) - _most(id, *promises)
+        for id in ids
     ]
 
 

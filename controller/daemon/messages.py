@@ -32,9 +32,9 @@ from controller.play.intent import NO_CONTACTS
 from controller.play.observer import PlayReport, SilenceReport
 from controller.play.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
-from drivers.counters import LinkStatistics
 from drivers.host.amplifier import Amplifier
 from drivers.host.feeding import Stopped
+from drivers.host.jobs import LinkStatistics
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
 from drivers.protocol.table import (

@@ -19,6 +19,7 @@ from controller.demo.touch_row import (
 from controller.play.content import Prediction
 from controller.play.layers import LayerContent
 from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.play.selection import MOVE_TOLERANCE
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import HELD_BACK
 from model.transients.measures import ONSET_WINDOW
@@ -140,7 +141,7 @@ class TouchRecorder:
             self.touches[contact.key] = _Touch(contact, others, reason=self.fault)
         for contact in change.up:
             touch = self.touches.pop(contact.key)
-            touch.until = clock.now()
+            touch.contact, touch.until = contact, clock.now()
             self._complete(touch)
 
     def _pattern_applied(self, applied: PlayReport) -> None:
@@ -208,7 +209,7 @@ class TouchRecorder:
             self._tasks.create_task(self._plate.place_fingers(sensors, loads))
 
     async def _add_row(self, touch: _Touch) -> None:
-        """Make the row of a lifted touch from the pattern that played longest for it."""
+        """Make the row of a lifted touch."""
         contact = touch.contact
         row = TouchRow(
             target_id=_id(contact),
@@ -225,11 +226,14 @@ class TouchRecorder:
 
 
 async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
-    """The row with the longest pattern of a touch; latency and onset are of its first one."""
-    main_part = max(touch.patterns, key=lambda playing: playing.duration)
+    """The row with the pattern that played longest for a touch where it rested last.
+
+    Latency and onset are of its first one.
+    """
+    at, found = _place(touch.contact), [(_felt_by(touch, each), each) for each in touch.patterns]
+    rested = [each for each in found if math.dist(_place(each[0].contact), at) <= MOVE_TOLERANCE]
+    predicted, main_part = max(rested or found, key=lambda each: each[1].duration)
     first, applied = touch.patterns[0], main_part.applied
-    key = touch.contact.key
-    predicted = next(felt for felt in applied.targets if felt.contact.key == key)
     played = _content_of(predicted, applied)
     pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}
@@ -274,6 +278,12 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         ),
         measured_level_db_sl=target.level_db_sl if target else None,
     )
+
+
+def _felt_by(touch: _Touch, playing: _PlayedPattern) -> Prediction:
+    """What is predicted of a touch while a pattern plays for it."""
+    key = touch.contact.key
+    return next(felt for felt in playing.applied.targets if felt.contact.key == key)
 
 
 def _content_of(felt: Prediction, applied: PlayReport) -> LayerContent:

@@ -42,7 +42,7 @@ SILENT_SHARE = 0.2
 """Share of the plate's length between the strips of several people."""
 
 _TWO = {"left": None, "right": None}
-_THREE = {"left": (60, 110), "middle": (130, 180), "right": (220, 280)}  # Hz
+_THREE = {"left": (70, 110), "middle": (180, 220), "right": (250, 300)}  # Hz
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class FingerRow:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchRow:
-    """A touch from down to up, with the pattern that played longest for it.
+    """A touch from down to up, with the pattern that played longest where it rested last.
 
     Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
     fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a

@@ -53,14 +53,16 @@ class Crossfades:
     shape: Shape | None = None
 
     def steps(self) -> tuple[Selection, ...]:
-        """What plays after each step, the content that is led to marked; none if none is better.
+        """What plays after each step, the content that is led to marked.
 
         Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5;
         either to the same fingers, and not more weakly. It ends where a step promises no more.
+        Where nothing is better, what plays, if it promises another contrast where fingers rest by
+        0.5 dB than it did on their ways.
         """
         if self.capabilities.drive_mode != UNRESTRICTED:
             return ()
-        playing = _by_finger(self.playing.values())
+        playing, same = _by_finger(self.playing.values()), tuple[Selection, ...]()
         for keeps in (False, True):
             goal = answered(
                 self.table,
@@ -75,6 +77,7 @@ class Crossfades:
             if _served(found) != _served(playing) or len(goal.layers) != len(playing):
                 continue
             now = self._mixed(goal, playing)
+            same = self._restated(now, playing)
             led = {key: each for key, each in found.items() if _differ(each, playing[key])}
             is_tuned = any(_is_tuned(playing[key], each) for key, each in led.items())
             gain = worst_of(goal) - worst_of(now)
@@ -82,6 +85,18 @@ class Crossfades:
                 continue
             if steps := self._in_order(goal, playing, led):
                 return steps
+        return same
+
+    def _restated(self, now: Answer, playing: _Voices) -> tuple[Selection, ...]:
+        """What plays with what it promises now; nothing if that has been said."""
+        found, said = self._felt(now, playing), dict[ContactKey, float]()
+        for content in self.playing.values():
+            for each in content.predictions:
+                said[each.contact.key] = each.promised_contrast_db or 0.0
+        for each in found.predictions:
+            promised = each.promised_contrast_db or 0.0
+            if abs(promised - said.get(each.contact.key, promised)) >= WORTH_OF_WEIGHTS:
+                return (found,)
         return ()
 
     def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:

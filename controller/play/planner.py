@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.chooser import Chooser
-from controller.play.content import Selection, no_layer_free
+from controller.play.content import Prediction, Selection, no_layer_free
 from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import IntentSource, Pulse
 from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
@@ -286,7 +286,7 @@ class Planner:
         self._plan = plan = Plan(contacts, selection, from_rest, now, answered, sets)
         if sets or not (is_felt or is_awaited):
             return plan
-        is_said = is_awaited or _why_not(plan) == _why_not(before)
+        is_said = is_awaited or _predicted(plan) == _predicted(before)
         return self._go_on(plan, now) if is_said else plan
 
     def _go_on(self, plan: Plan, now: float) -> Plan | None:
@@ -365,7 +365,6 @@ class Planner:
         return pulses
 
 
-def _why_not(plan: Plan | None) -> dict[ContactKey, str | None]:
-    """Return why targets feel nothing of their own, by contact."""
-    held_back = () if plan is None else plan.selection.not_served
-    return {each.contact.key: each.held_back for each in held_back}
+def _predicted(plan: Plan | None) -> Sequence[Prediction]:
+    """Return what targets are predicted to feel, or why they feel nothing of their own."""
+    return () if plan is None else plan.selection.predictions

@@ -70,12 +70,20 @@ def _is_met_by(intended: Intention, chosen: Selection) -> bool:
     is_whole, then = chosen.is_whole, chosen.contacts
     now = {each.key: each for each in intended.contacts}
     same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
+    follows = not is_alone(intended.lasting, intended.protected)
     return same and all(
         math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
         and contact.load == then[key].load
         and (key in intended.protected) == (key in chosen.protected)
+        and not (follows and _has_set_out(contact, then[key]))
         for key, contact in now.items()
     )
+
+
+def _has_set_out(now: Contact, then: Contact) -> bool:
+    """Whether a contact that rested then is under way, and to be answered for the way ahead."""
+    has_moved = (now.x, now.y) != (then.x, then.y)
+    return has_moved and now.motion.is_under_way and not then.motion.is_under_way
 
 
 def _is_among(intended: Intention, chosen: Selection) -> bool:
@@ -109,13 +117,14 @@ class Selector:
 
     Each target has its own: all that last are chosen together, in a thread where they are several;
     a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
-    targets and their levels do, no contact has moved more than 8 mm, and none has another load,
-    which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
-    others as they are. Once all rest, contents are led to a better answer, if there is one, a step
-    after the other, until anything changes. An answer that takes too long is given up: all that
-    lasts is silent until its fingers change, or until that answer has ended at last. chooser:
-    answers the next question; what the thread computes goes on by the former one. arrived: called
-    when the thread is done; may_lead: whether contents may be led to from what plays at a time [s].
+    targets and their levels do, no contact has moved more than 8 mm, none of several has set out,
+    and none has another load, which changes by a factor of 1.5 or more. A contact that lifts, or
+    whose effect ends, leaves the others as they are. Once all rest, contents are led to a better
+    answer, if there is one, a step after the other, until anything changes. An answer that takes
+    too long is given up: all that lasts is silent until its fingers change, or until that answer
+    has ended at last. chooser: answers the next question; what the thread computes goes on by the
+    former one. arrived: called when the thread is done; may_lead: whether contents may be led to
+    from what plays at a time [s].
     """
 
     def __init__(
@@ -234,9 +243,9 @@ class Selector:
             return
         new = {(each.key, each.frequency) for each in step.contents}
         old = [each for each in self._lasting.contents if (each.key, each.frequency) not in new]
-        self._fading = replace(self._lasting, contents=tuple(old))
+        if step.contents != self._lasting.contents:
+            self._fading, self._led_at = replace(self._lasting, contents=tuple(old)), now
         self._lasting = step
-        self._led_at = now
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
     def _request_again(self) -> None:

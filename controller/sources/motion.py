@@ -36,6 +36,11 @@ class Motion:
         is_moving = math.hypot(vx, vy) * (places[-1][0] - places[0][0]) >= _LEAST_WAY
         return (vx, vy) if is_moving else (0.0, 0.0)
 
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it moved when its last place was reported."""
+        return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
+
 
 AT_REST = Motion()
 """Of a finger of which nothing is known."""

@@ -6,12 +6,11 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from drivers.counters import LinkStatistics
 from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import Stopped
-from drivers.host.jobs import Priority
+from drivers.host.jobs import LinkStatistics, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.protocol.achieved import achieved_layer, achieved_problem

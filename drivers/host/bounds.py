@@ -43,43 +43,48 @@ class Bounds:
         self._playback, self._since = playback, since
         self._middle, self._half = (since + until) / 2, (until - since) / 2
         named = [one for one in layers if not one.renew]
-        self._over = {one.layer for one in named if playback.end_of(one.layer) <= until}
+        over = {one.layer for one in named if playback.end_of(one.layer) <= until}
         every = (*named, *playback.waiting)
-        self._sets = [(one, {each.channel: each for each in one.commands}) for one in every]
         self._of_layer: dict[int, list[LayerSet]] = {}
         for one in every:
             self._of_layer.setdefault(one.layer, []).append(one)
-        self._courses = [*map(self._courses_of, range(playback.channels))]
+        before = playback.all_voices
+        after, self._courses = [*before], [list[_Course]() for _ in before]
+        for one in every:
+            commands, ramp = {each.channel: each for each in one.commands}, one.ramp / _PER_RAMP
+            is_over = one.layer in over  # it may have begun to end when the set comes
+            earlier, half = (
+                ([()] * len(before), 0.0) if one.after or is_over else (after, self._half)
+            )
+            played = voices_after(earlier, one.layer, commands, self._middle, ramp, half)
+            for channel, voices in enumerate(played):
+                if one.after:
+                    self._courses[channel] += [self._late(each, before[channel]) for each in voices]
+                else:
+                    after[channel] = (*after[channel], *voices) if is_over else voices
+        for courses, olds, voices in zip(self._courses, before, after, strict=True):
+            courses += [self._course(old, each) for old, each in zip_longest(olds, voices)]
 
-    def _courses_of(self, channel: int) -> list[_Course]:
-        """Return the voices of a channel once all sets play."""
-        before = self._playback.all_voices[channel]
-        after, courses = list(before), list[_Course]()
-        for one, commands in self._sets:
-            command, ramp = commands.get(channel), one.ramp / _PER_RAMP
-            if one.after:  # from wherever a voice that it continues is then
-                for voice in voices_after((), one.layer, command, self._middle, ramp, 0.0):
-                    name = voice.layer, voice.frequency
-                    olds = [old for old in before if (old.layer, old.frequency) == name]
-                    points = [(0j,), *(old.transition.points(self._since) for old in olds)]
-                    courses.append(_Course(voice, [*chain(*points)], is_late=True))
-            elif one.layer in self._over:  # it may have begun to end when the set comes
-                after += voices_after((), one.layer, command, self._middle, ramp, 0.0)
-            else:
-                after = voices_after(after, one.layer, command, self._middle, ramp, self._half)
-        for old, voice in zip_longest(before, after):
-            starts, sets, is_new = _SILENCE, self._of_layer.get(voice.layer, _NONE), True
-            if old is not None:
-                starts = old.transition.points(self._since)
-                is_new = old.transition is not voice.transition
-                # One that falls silent by itself goes on if it is silent before a fade would end.
-                latest = voice.transition.end + self._half + SAME
-                is_fading = is_new and voice.has_ended and not voice.transition.knots
-                if is_fading and not old.transition.last and old.transition.end <= latest:
-                    voice, is_new = old, False
-                sets = _NONE if old.has_ended else sets
-            courses.append(_Course(voice, starts, sets, is_new))
-        return courses
+    def _late(self, voice: Voice, olds: Sequence[Voice]) -> _Course:
+        """Return a voice that waits, from wherever one of the old that it continues is then."""
+        name = voice.layer, voice.frequency
+        continued = [old.transition for old in olds if (old.layer, old.frequency) == name]
+        points = [(0j,), *(way.points(self._since) for way in continued)]
+        return _Course(voice, [*chain(*points)], is_late=True)
+
+    def _course(self, old: Voice | None, voice: Voice) -> _Course:
+        """Return a voice once all sets play; old: as which it has played, None for a new one."""
+        starts, sets, is_new = _SILENCE, self._of_layer.get(voice.layer, _NONE), True
+        if old is not None:
+            starts = old.transition.points(self._since)
+            is_new = old.transition is not voice.transition
+            # One that falls silent by itself goes on if it is silent before a fade would end.
+            latest = voice.transition.end + self._half + SAME
+            is_fading = is_new and voice.has_ended and not voice.transition.knots
+            if is_fading and not old.transition.last and old.transition.end <= latest:
+                voice, is_new = old, False
+            sets = _NONE if old.has_ended else sets
+        return _Course(voice, starts, sets, is_new)
 
     def worst(self) -> tuple[list[float], float]:
         """Return the largest level of each channel and the largest sum of their squares.

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeAlias
 
-from drivers.counters import LinkStatistics
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -21,7 +20,7 @@ from drivers.errors import (
 from drivers.host.clock import HeldClock
 from drivers.host.failures import contradicted, disarmed, driven_by_another
 from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import Priority
+from drivers.host.jobs import LinkStatistics, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.limits import COMMIT_DELAY
 from drivers.host.line import Line
@@ -225,7 +224,14 @@ class Dialogue:
         """
         takes = len(self.line.members) * self.exchange_time("Set")
         delay = max(COMMIT_DELAY, ATTEMPTS * takes)
-        if (words := _words_of(layers)) > PART_WORDS:  # parts of all of the line, and those again
+        words = LAYER.words * len(layers)
+        for layer in layers:
+            words += COMMAND.words * len(layer.tones)
+            for tone in layer.tones:
+                for shape in (tone.onset, tone.ending):
+                    if shape is not None:
+                        words += ENVELOPE.words + KNOT.words * len(shape.knots)
+        if words > PART_WORDS:  # parts of all of the line, and those again
             delay += 2 * words / PART_WORDS * takes
         admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
@@ -369,8 +375,10 @@ class Dialogue:
             problem = self.feeding.problem(left, sent_at, now)
         plays_wrong = None if problem else ledger.problem_of(reply, sent_at, now)
         # By a clock that is not held a set may wait, whatever its commit says.
-        is_held = self._is_start_known and self.clock.error(now) < math.inf
-        if plays_wrong and (sent_at >= self._may_wait_until or is_held):
+        if plays_wrong and (
+            sent_at >= self._may_wait_until
+            or (self._is_start_known and self.clock.error(now) < math.inf)
+        ):
             problem = plays_wrong
         if problem is None:
             if tells or not self._was_unfed:
@@ -447,15 +455,3 @@ class Dialogue:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
-
-
-def _words_of(layers: Sequence[Layer]) -> int:
-    """Return how many words the stream of layers has."""
-    words = 0
-    for layer in layers:
-        words += LAYER.words + COMMAND.words * len(layer.tones)
-        for tone in layer.tones:
-            for shape in (tone.onset, tone.ending):
-                if shape is not None:
-                    words += ENVELOPE.words + KNOT.words * len(shape.knots)
-    return words

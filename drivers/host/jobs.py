@@ -7,11 +7,11 @@ operating system sends bytes. Times [s] are of the event loop's clock.
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol, TypeAlias
 
-from drivers.counters import LinkStatistics
+from drivers.counters import WireCounters
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
 from drivers.wires.wire import Event, OtherHost, Several
@@ -44,6 +44,21 @@ Make: TypeAlias = Callable[[], list[Values]]
 
 Called once, then; returns the values of its messages, or raises CommandRefused.
 """
+
+
+@dataclass
+class LinkStatistics(WireCounters):
+    """Statistics of a link at one moment.
+
+    Inherited counters restart when the link is opened, the following count since its construction.
+    retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
+    last_round_trip [s].
+    """
+
+    retries: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+    last_round_trip: float | None = None
 
 
 class Member(Protocol):
@@ -85,13 +100,13 @@ class Job:
     values: Values
     timeout: float
     queued_at: float
-    result: "asyncio.Future[Values]"
     make: Make | None = None
+    result: "asyncio.Future[Values]" = field(default_factory=asyncio.Future)
     parts: Sequence[Values] = ()
     part: int = 0
     reached: int = 0
     attempts: int = ATTEMPTS
-    not_before: float = 0.0
+    is_pausing: bool = False
     sent_at: float = 0.0
     started_at: float = 0.0
     due: float = 0.0
@@ -169,6 +184,6 @@ class JobQueue:
         """Return the job whose turn it is; None while all pause, or a stop does."""
         first: Job | None = self.jobs[0]
         if len(self.jobs) > 1:
-            ready = [job for job in self.jobs if job.not_before <= now or job.is_stop_class]
+            ready = [job for job in self.jobs if job.is_stop_class or not job.is_pausing]
             first = min(ready, key=lambda job: self._rank(job, now), default=None)
-        return None if first is None or first.not_before > now else first
+        return None if first is None or first.is_pausing else first

@@ -19,7 +19,7 @@ from drivers.host.dialogue import IsPreempted, Staged
 from drivers.host.jobs import Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
-from drivers.host.members import Members, outcomes
+from drivers.host.members import Members, need, outcomes
 from drivers.host.moments import word_passed_by_all, words_of
 from drivers.playing.contents import Layer
 from drivers.protocol.clock import moment_behind
@@ -86,8 +86,8 @@ class JointSets:
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
         Overtaken where it is preempted before that.
         """
-        lines = {self._members.amplifiers[name].line for name in layers}
-        self._members.has_joint_set = len(lines) > 1
+        amplifiers = sorted([self._members.amplifiers[name] for name in layers], key=need)
+        self._members.has_joint_set = len({each.line for each in amplifiers}) > 1
         before = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
@@ -96,14 +96,10 @@ class JointSets:
         priority = Priority.SILENCE if is_silent else Priority.SET
         is_now = is_silent or len(layers) == 1
         began = clock.now()
-        amplifiers: list[Amplifier] = []
-        staging: list[Awaitable[Staged]] = []
-        for each in self._members.by_need:
-            if each.name in layers:
-                amplifiers.append(each)
-                stage = partial(each.stage, token, layers[each.name], now=is_now)
-                staging.append(stage(priority=priority, is_preempted=is_preempted))
-        results = await outcomes(staging)
+        staging = partial(
+            Amplifier.stage, token=token, now=is_now, priority=priority, is_preempted=is_preempted
+        )
+        results = await outcomes([staging(each, layers=layers[each.name]) for each in amplifiers])
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for each, result in zip(amplifiers, results, strict=True):

@@ -158,7 +158,7 @@ class Ledger:
             self._budget.restore(before)
             return
         playback = self.playback
-        if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
+        if playback.next_due == math.inf and playback.settles_at <= sent_at - self.lag:
             self.lag = 0.0
         self.lag = playback.uncertainty = max(self.lag, now - sent_at, self._start_error)
         if playback.next_due - 2 * self.lag <= now:

@@ -6,6 +6,7 @@ the wire cannot have, or limits forbid, is refused. Envelopes come in integers o
 """
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import KNOT, QUANTITIES
+from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
 FREQUENCY_FLOOR = 10.0
@@ -97,6 +98,7 @@ _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _FREQUENCY = QUANTITIES["frequency"]
 _VALID_FOR_MAX = _VALID_FOR.high
+_NO_KNOTS = ((0, 0),)
 
 
 class Rounding:
@@ -129,7 +131,6 @@ class Rounding:
             if layer.after and not layer.tones:
                 raise CommandRefused("after must be with tones")
             commands = self._commands(layer.tones)
-            self._check_envelopes(layer.tones)
             rounded.append(
                 LayerSet(
                     number,
@@ -147,7 +148,7 @@ class Rounding:
 
     def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
         """Return the commands of tones by channel; few calls, since every set has some."""
-        limits, commands = self._limits, dict[int, Command]()
+        limits, commands, shaped = self._limits, dict[int, Command](), list[Tone]()
         for tone in tones:
             channel, level, onset = index(tone.channel), tone.level, tone.onset
             if not 0 <= channel < self._channels:
@@ -182,6 +183,10 @@ class Rounding:
                 onset,
                 tone.ending,
             )
+            if onset is not None or tone.ending is not None:
+                shaped.append(tone)
+        if shaped:
+            self._check_envelopes(shaped)
         return commands
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
@@ -192,33 +197,32 @@ class Rounding:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
         low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
         limit = self._can["knots"]
-        knots: list[tuple[int, ...]] = []
         for tone in tones:
-            for envelope in (tone.onset, tone.ending):
-                if envelope is None:
+            for shape in (tone.onset, tone.ending):
+                if shape is None:
                     continue
-                if not low <= (step := envelope.step) <= high:
+                if not low <= (step := shape.step) <= high:
                     raise refused(
                         tone.channel,
                         f"step of an envelope must be {low} to {high} (0.1 ms), got {step}",
                     )
-                if (count := len(envelope.knots)) > limit:
+                if (count := len(shape.knots)) > limit:
                     raise refused(
                         tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
                     )
-                knots += envelope.knots
-        if not knots:
-            return
-        try:
-            KNOT.check_rows(knots)
-            if (peak := max(knots)[0]) > self._limits.level:
-                raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
-        except (CommandRefused, TypeError, ValueError) as error:
-            for one in tones if len(tones) > 1 else ():
-                self._check_envelopes([one])  # which of them
-            if isinstance(error, CommandRefused):
-                raise
-            raise refused(tone.channel, f"knot of an envelope: {error}") from error
+                try:
+                    levels, phases = zip(*(shape.knots or _NO_KNOTS), strict=True)
+                    array("q", (*levels, *phases))  # which has no numbers with a fraction
+                except (TypeError, ValueError) as error:
+                    raise refused(
+                        tone.channel, f"knots of an envelope must be pairs of integers: {error}"
+                    ) from error
+                if not 0 <= min(levels) <= (peak := max(levels)) <= self._limits.level:
+                    raise self._level_refused(
+                        tone.channel, "level of a knot", peak / _LEVEL.per_unit
+                    )
+                if not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
+                    raise refused(tone.channel, "phase of a knot must be -180 to 179.99 degrees")
 
 
 def refused(channel: int, text: str) -> CommandRefused:
@@ -271,9 +275,11 @@ class Budget:
         used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
-    def sent(self, now: float, *, lasts: float) -> Vibration:
+    def sent(self, now: float, *, lasts: float) -> Vibration | None:
         """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
         self._sent.append(now)
+        if self.is_unlimited:
+            return None
         self._close(now)
         before = self._start, self._end
         if self._start is None:

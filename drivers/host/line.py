@@ -101,9 +101,9 @@ class Line:
         request came first. member: None for a broadcast, which has no reply: the future ends once
         it was sent.
         """
-        future, now = self._loop.create_future(), self.time()
         make, values = (values, Values()) if callable(values) else (None, values)
-        job = Job(member, priority, name, values, timeout, now, future, make)
+        job = Job(member, priority, name, values, timeout, self.time(), make)
+        future = job.result
         if trace.is_active():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -179,8 +179,8 @@ class Line:
                 else:
                     self.wire.counters.remark = f"part {job.part} of a set does not arrive"
                     self._give_up(job, member)
-                continue
-            job.result.set_result(arrival.values)
+            else:
+                job.result.set_result(arrival.values)
         if self._queue.jobs:
             self.pump()
         elif self.current is None and self._timer is not None:
@@ -226,9 +226,8 @@ class Line:
                 if self.ahead is not None and member is not None and not job.part:
                     ahead = self.ahead(job.name, job.priority)
                     if ahead is not None:
-                        now, result = self.time(), self._loop.create_future()
                         beat = Priority.HEARTBEAT
-                        self._start(Job(None, beat, "Commit", {}, 0.0, now, result, ahead))
+                        self._start(Job(None, beat, "Commit", {}, 0.0, self.time(), ahead))
                 if job.attempts == ATTEMPTS:
                     self.wire.counters.remark = ""
                 if job.make is not None:
@@ -318,8 +317,8 @@ class Line:
         member.counts.refusals += 1
         if arrival.code == "BUSY" and job.attempts > 0:
             self._repeat(job, member, pause=BUSY_PAUSE)
-            return
-        self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
+        else:
+            self._fail(job, refused_by_amplifier(self.name, arrival, may_play=job.had_no_reply))
 
     def _queue_again(self, job: Job) -> bool:
         """Queue a request again, unless another one of its amplifier comes before it."""
@@ -335,15 +334,13 @@ class Line:
         if self._queue_again(job):
             member.counts.retries += 1
             if pause:
-                job.not_before = self.time() + pause
-                self._loop.call_at(job.not_before, self._pump_from, job.not_before)
+                job.is_pausing = True
+                self._loop.call_later(pause, self._resume, job)
 
-    def _pump_from(self, time: float) -> None:
-        """Pump at a time [s]; a timer may come too early, by up to a tick of the clock."""
-        if self.time() < time:
-            self._loop.call_at(time, self._pump_from, time)
-        else:
-            self.pump()
+    def _resume(self, job: Job) -> None:
+        """Send a request that has paused in its turn."""
+        job.is_pausing = False
+        self.pump()
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller has gone."""

@@ -20,7 +20,7 @@ from registry import clock
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
+need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
 _silence_cause = attrgetter("silence_cause")
 
 
@@ -42,7 +42,7 @@ class Members:
     @property
     def by_need(self) -> list[Amplifier]:
         """All, first the one that was fed longest ago: replies may come late."""
-        return sorted(self.amplifiers.values(), key=_need)
+        return sorted(self.amplifiers.values(), key=need)
 
     @property
     def degraded(self) -> tuple[str, ...]:

@@ -252,7 +252,7 @@ class ExpectedOutputs:
         """Which rule a wrong level breaks."""
         if self.cause == "the watchdog":
             return "watchdog"
-        if not self.playback.is_settled(self._widened(when)[0] - self._plays.lag):
+        if self.playback.settles_at > self._widened(when)[0] - self._plays.lag:
             return "ramp"
         if not self.cause.startswith("set"):
             return "silent"

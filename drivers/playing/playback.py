@@ -55,6 +55,8 @@ class Playback:
     _layers: dict[int, _Layer] = field(default_factory=dict)
     changes_at: float = field(default=math.inf, init=False)
     """Before this time [s] advancing changes nothing."""
+    settles_at: float = field(default=-math.inf, init=False)
+    """From this time [s] on nothing changes but by the ends of layers."""
     tokens: Mapping[int, int] = field(default_factory=dict, init=False)
     """Token of each layer that plays."""
     waiting: Sequence[LayerSet] = field(default_factory=list, init=False)
@@ -74,7 +76,8 @@ class Playback:
 
     def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
         """Play a set from a time on."""
-        self.advance(time)
+        if time >= self.changes_at:  # else without a call
+            self.advance(time)
         for one in layers:
             layer = self._layers.setdefault(one.layer, _Layer())
             if one.renew:
@@ -131,7 +134,7 @@ class Playback:
 
     def _note_changes(self) -> None:
         """Note what plays, and when a voice has faded, or a layer ends or starts, next."""
-        first, waiting = math.inf, []
+        first, settles, waiting = math.inf, -math.inf, []
         for layer in self._layers.values():
             first = min(first, layer.ends)
             if layer.waiting is not None:
@@ -140,11 +143,13 @@ class Playback:
         self.next_due, self.waiting, tokens = first, waiting, {}
         for voices in self.all_voices:
             for voice in voices:
-                if not voice.transition.last and voice.transition.end < first:
-                    first = voice.transition.end
+                end = voice.transition.end
+                settles = max(settles, end)
+                if not voice.transition.last and end < first:
+                    first = end
                 if not voice.has_ended:
                     tokens[voice.layer] = self._layers[voice.layer].token
-        self.changes_at, self.tokens = first, tokens
+        self.changes_at, self.settles_at, self.tokens = first, settles, tokens
 
     def add_ends(self, layer: int, time: float) -> None:
         """Add copies of the voices of a layer that end by themselves at a time [s].
@@ -262,14 +267,6 @@ class Playback:
         ]
         return max([time, *ends])
 
-    def is_settled(self, time: float) -> bool:
-        """Whether nothing changes from a time on [s] but by the ends of layers."""
-        for voices in self.all_voices:
-            for voice in voices:
-                if voice.transition.end > time:
-                    return False
-        return True
-
     @property
     def dues(self) -> list[tuple[float, int]]:
         """When layers end by themselves or start what waits [s], the next of each, and which."""
@@ -307,13 +304,11 @@ class Playback:
         for command in one.commands:
             commands[command.channel] = command
         ramp = one.ramp / _PER_RAMP
-        for channel, voices in enumerate(self.all_voices):
-            if voices or channel in commands:
-                of_channel = commands.get(channel)
-                after = voices_after(voices, one.layer, of_channel, time, ramp, self.uncertainty)
-                if len(after) > self.voices:
-                    after = cut_to(after, time, self.voices, self.slew)
-                self.all_voices[channel] = tuple(after)
+        after = voices_after(self.all_voices, one.layer, commands, time, ramp, self.uncertainty)
+        for channel, voices in enumerate(after):
+            if len(voices) > self.voices:
+                voices = tuple(cut_to(voices, time, self.voices, self.slew))
+            self.all_voices[channel] = voices
         if not commands:
             self._layers.pop(one.layer, None)
             return

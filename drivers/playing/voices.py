@@ -9,7 +9,7 @@ Plain loops and few calls: every set is played by host and far end.
 
 import cmath
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -21,6 +21,7 @@ from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 _PER_STEP = QUANTITIES["envelope_step"].per_unit
 _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
+_SILENCE = Command(channel=0, frequency=0, level=0, phase=0)
 SAME = 1e-6
 """Ends of fades that are nearer than that are one, so that rounding decides nothing [s]."""
 
@@ -206,44 +207,42 @@ class Voice:
         frequency = command.frequency / _PER_HERTZ
         return replace(self, frequency=frequency, transition=replace(self.transition, last=last))
 
-    def is_continued_by(self, command: Command) -> bool:
-        """Whether a command of its layer continues it, unless it has ended."""
-        is_same = self.frequency == command.frequency / _PER_HERTZ
-        return command.keep_phase and is_same and command.is_driven
-
 
 def voices_after(
-    voices: Sequence[Voice],
+    channels: Sequence[Sequence[Voice]],
     layer: int,
-    command: Command | None,
+    commands: Mapping[int, Command],
     time: float,
     ramp: float,
     uncertainty: float,
-) -> list[Voice]:
-    """Return the voices of a channel once a command of a layer plays; None silences the layer."""
-    # As `Command.is_driven`, without a call.
-    is_driven = command is not None and (command.level > 0 or command.onset is not None)
-    is_fading = is_driven or (command is not None and command.skip_ending)
-    is_new = is_driven
-    last = 0j if command is None else amplitude_of(command.level, command.phase)
-    after: list[Voice] = []
-    for voice in voices:
-        if voice.layer != layer or voice.has_ended:
-            after.append(voice)
-        elif command is not None and command.keep_phase and voice.is_continued_by(command):
-            is_new = False
-            first = voice.transition.reached(time, uncertainty)
-            transition = along(command.onset, time, ramp, first, last)
-            after.append(replace(voice, transition=transition, ending=command.ending))
-        elif is_fading:
-            after.append(voice.faded(time, ramp, uncertainty))
-        else:
-            after.append(voice.ended(time, ramp, uncertainty))
-    if is_new and command is not None:
-        transition = along(command.onset, time, ramp, 0j, last)
-        frequency = command.frequency / _PER_HERTZ
-        after.append(Voice(layer, frequency, time, transition, False, command.ending))
-    return after
+) -> list[tuple[Voice, ...]]:
+    """Return the voices of all channels once a layer plays commands by channel, else is silent."""
+    all_after: list[tuple[Voice, ...]] = []
+    for channel, voices in enumerate(channels):
+        command = commands.get(channel, _SILENCE)
+        # As `Command.is_driven`, without a call.
+        is_driven = is_new = command.level > 0 or command.onset is not None
+        last, frequency = amplitude_of(command.level, command.phase), command.frequency / _PER_HERTZ
+        after: list[Voice] = []
+        for voice in voices:
+            if voice.layer != layer or voice.has_ended:
+                after.append(voice)
+            elif is_driven and command.keep_phase and voice.frequency == frequency:
+                is_new = False
+                first = voice.transition.reached(time, uncertainty)
+                transition = along(command.onset, time, ramp, first, last)
+                after.append(replace(voice, transition=transition, ending=command.ending))
+            elif is_driven or command.skip_ending:
+                after.append(voice.faded(time, ramp, uncertainty))
+            else:
+                after.append(voice.ended(time, ramp, uncertainty))
+        if is_new:
+            transition = Transition(time, ramp, 0j, last, time + ramp)
+            if command.onset is not None:  # seldom: without a call
+                transition = along(command.onset, time, ramp, 0j, last)
+            after.append(Voice(layer, frequency, time, transition, False, command.ending))
+        all_after.append(tuple(after))
+    return all_after
 
 
 def cut_to(voices: Sequence[Voice], time: float, max_voices: int, slew: float) -> list[Voice]:

@@ -8,7 +8,6 @@ and a number that `is_added` is None in the reply of an amplifier that does not 
 
 import math
 import struct
-from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -392,36 +391,6 @@ class Record:
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
         return self.append([], values)
-
-    def check_rows(self, rows: Sequence[Sequence[int]]) -> None:
-        """Raise TypeError or ValueError for a number of rows, in the order of the fields."""
-        for field, column in zip(self.fields, zip(*rows, strict=True), strict=False):
-            if isinstance(field, Number):
-                # An array has no numbers with a fraction, for which a comparison would do.
-                for number in (min(column), max(array("q", column))):
-                    if not field.quantity.minimum <= number <= field.quantity.maximum:
-                        raise ValueError(_out_of_range(field.name, field.quantity, number))
-
-    def read_rows(
-        self, words: Sequence[int], at: int, count: int
-    ) -> tuple[tuple[tuple[int, ...], ...], int]:
-        """Read so many rows of numbers, a word each, as `read` does."""
-        width = len(self.fields)
-        end = at + count * width
-        if end > len(words):
-            raise Refusal("message is too short", "BAD_LENGTH")
-        columns: list[Sequence[int]] = []
-        for first, field in enumerate(self.fields, at):
-            column = words[first:end:width]
-            if isinstance(field, Number) and count:
-                quantity = field.quantity
-                if quantity.minimum < 0:
-                    column = [word - WORD if word >= WORD // 2 else word for word in column]
-                for number in (min(column), max(column)):
-                    if not quantity.minimum <= number <= quantity.maximum:
-                        raise Refusal(_out_of_range(field.name, quantity, number))
-            columns.append(column)
-        return tuple(zip(*columns, strict=True)), end
 
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""

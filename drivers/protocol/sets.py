@@ -32,6 +32,7 @@ _ENVELOPE_FORM, _KNOT_FORM = ENVELOPE.form, KNOT.form
 _CHANNEL, _KEEP_PHASE, _SKIP_ENDING, _ONSET, _ENDING = COMMAND.shifts
 _COUNTS = 1 << _RENEW - _COUNT
 _CHANNELS, _Q = QUANTITIES["channel"].maximum + 1, QUANTITIES
+_LOW, _HIGH = _Q["phase"].minimum, _Q["phase"].maximum
 _WIDEST: Values = {
     **{"layers": _Q["layer"].maximum + 1, "channels": _CHANNELS, "knots": _Q["knots"].maximum},
     **{"ramp_max": _Q["ramp"].maximum, "envelope_step_min": _Q["envelope_step"].minimum},
@@ -222,8 +223,13 @@ def _envelope(words: Sequence[int], at: int, can: Values) -> tuple[Envelope, int
         raise Refusal(f"step must be {low} to {high}, got {head['step']}")
     if head["knots"] > can["knots"]:
         raise Refusal(f"knots must be at most {can['knots']}, got {head['knots']}")
-    knots, at = KNOT.read_rows(words, at, head["knots"])
-    return Envelope(head["step"], knots), at
+    end = at + KNOT.words * head["knots"]
+    raw = struct.pack(f"={end - at}H", *words[at:end])
+    knots = tuple(struct.iter_unpack("=" + _KNOT_FORM, raw))
+    phases = [phase for _, phase in knots]  # levels are compared with the limits of the channel
+    if phases and not _LOW <= min(phases) <= max(phases) <= _HIGH:
+        raise Refusal(f"phase must be {_LOW} to {_HIGH}, got {min(phases)} to {max(phases)}")
+    return Envelope(head["step"], knots), end
 
 
 def parts(

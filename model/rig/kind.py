@@ -166,7 +166,7 @@ def _notes(era: Era, low: float, high: float) -> list[str]:
     ]
 
 
-_ARRANGEMENT = "drivers.by_hand.arrangement:arrangement_of"
+_ARRANGEMENT = "drivers.by_hand.rig_check:arrangement_of"
 _COST = "model.study.clock_costs:clock_cost"
 _LOST_DB = 0.1  # contrast that is worth a warning
 

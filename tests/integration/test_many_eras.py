@@ -61,28 +61,28 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
 
 
 def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leaves() -> None:
-    """In its band; every finger at least the contrast promised, on the first plate that is drawn.
+    """In its band, and promised as its own; at least that on the first plate that is drawn.
 
-    The one that leaves had both others beside it, these have each other at the end, where one has
-    slid by a third of the plate.
+    The one that slides by a third of the plate feels it where it rests at last, also once another
+    has left.
     """
     file = EXAMPLES / "car_display.yaml"
     rig = load_rig(file)
-    table = build_table(rig, frequencies=np.arange(60.0, 281.0, 10.0), drive_mode="phased")
+    table = build_table(rig, frequencies=np.arange(70.0, 301.0, 10.0), drive_mode="phased")
     scene = example_scenes(rig)[-1]
     rows = run_virtual(run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None))
     slid, stayed, left = rows
-    assert [len(row.fingers) for row in rows] == [2, 2, 3]
+    assert [len(row.fingers) for row in rows] == [2, 3, 3]
     assert slid.targets_m == [pytest.approx((0.15 * 0.53, 0.65 * 0.30), abs=0.008)]
-    bands = [(60, 110), (130, 180), (220, 280)]
-    for fingers in (stayed.fingers, left.fingers):
+    bands = [(70, 110), (180, 220), (250, 300)]
+    for fingers in (slid.fingers, stayed.fingers, left.fingers):
         for finger, (low, high) in zip(fingers, bands, strict=False):
             assert finger.frequency_hz is not None
             assert low <= finger.frequency_hz <= high
-            assert finger.verdict in ("own", "mixed")
+            assert finger.verdict == "own"
             assert finger.measured_contrast_db is not None
             assert finger.promised_contrast_db is not None
-            assert finger.measured_contrast_db >= finger.promised_contrast_db > 6
+            assert finger.measured_contrast_db >= finger.promised_contrast_db >= 12
             assert finger.measured_level_db_sl == pytest.approx(20.0, abs=3)
     for row in rows:
         assert row.steady

@@ -46,7 +46,7 @@ REASON = "document.querySelector('#banner')?.dataset.reason"
 """Why the banner is shown."""
 TWO_PEOPLE = ((0.1, 0.5), (0.72, 0.74))
 """One in each strip of the demonstration's layout."""
-PLACES = ((0.82, 0.32), (0.853, 0.9125))
+PLACES = ((0.82, 0.235), (0.82, 0.825))
 """On the keypad and on the knob of the example's layout, as `on_plate` has it."""
 
 

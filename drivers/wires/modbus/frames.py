@@ -137,12 +137,11 @@ def parse_request(adu: Adu) -> Message | None:
         return None
     request = _REQUEST_KINDS[pdu[0]](dev_id=adu.unit, transaction_id=adu.transaction)
     try:
-        is_whole = request.calculateRtuFrameSize(b"\0" + pdu) == len(pdu) + 3
         request.decode(pdu[1:])
+        is_whole = pdu_of(request) == pdu
     except Exception:  # whatever a library raises for bytes that were damaged
         return None
-    fits = pdu[0] != WRITE or len(pdu) == WRITE_SIZE - 3 + 2 * request.count
-    return request if is_whole and fits and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
+    return request if is_whole and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
 
 
 def response_to(request: Message | None, adu: Adu) -> Response | None:
@@ -157,19 +156,11 @@ def response_to(request: Message | None, adu: Adu) -> Response | None:
     function, count = request.function_code, request.count
     if pdu[0] == function | EXCEPTION:
         return Response(exception=pdu[1]) if len(pdu) == 2 and pdu[1] else None
-    size = ECHO_SIZE if function == WRITE else RESPONSE_SIZE + 2 * count
-    if pdu[0] != function or len(pdu) + 3 != size:
-        return None
-    response = _RESPONSE_KINDS[function]()
-    try:
-        response.decode(pdu[1:])
-    except Exception:  # whatever a library raises for bytes that were damaged
-        return None
     if function == WRITE:
-        is_own = (response.address, response.count) == (request.address, count)
-    else:
-        is_own = len(response.registers) == count
-    return Response(response.registers) if is_own else None
+        return Response() if pdu == answer(request) else None
+    if pdu[:2] != bytes((function, 2 * count)) or len(pdu) != 2 + 2 * count:
+        return None
+    return Response(struct.unpack(f">{count}H", pdu[2:]))
 
 
 class AduReader:

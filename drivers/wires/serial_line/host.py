@@ -89,17 +89,17 @@ class SerialWire(Wire):
                 continue
             self._pending, self._replied = None, frame
             try:
-                if kind != NAK and (kind, frame.version) != (pending.kind, pending.version):
-                    expected = f"{pending.kind} in version {pending.version}"
-                    got = f"{kind} in {frame.version}"
-                    raise Refusal(f"type of the reply must be {expected}, got {got}")
-                if kind == HELLO:
-                    arrivals.append(Reply(unpack_identity(frame.payload)))
-                    continue
-                words = unpack_words(frame.payload)
                 if kind == NAK:
-                    arrivals.append(read_nak(words))
+                    arrivals.append(read_nak(unpack_words(frame.payload)))
+                elif (kind, frame.version) != (pending.kind, pending.version):
+                    raise Refusal(
+                        f"type of the reply must be {pending.kind} in version {pending.version}, "
+                        f"got {kind} in {frame.version}"
+                    )
+                elif kind == HELLO:
+                    arrivals.append(Reply(unpack_identity(frame.payload)))
                 else:  # what follows is ignored
+                    words = unpack_words(frame.payload)
                     arrivals.append(Reply(BY_NUMBER[kind].reply.read(words)[0]))
             except Refusal as refusal:
                 arrivals.append(Broken(str(refusal)))

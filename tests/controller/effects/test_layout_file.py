@@ -29,15 +29,15 @@ def test_load_layout_reads_the_example() -> None:
     keypad, slider, _, tuner, patch = layout.regions
     shape = keypad.shape
     assert isinstance(shape, Rectangle)
-    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.23, 0.14, 0.04, 0.03))
-    assert (keypad.on_press, keypad.on_release, keypad.has_level) == ("click", "soft", False)
+    assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.23, 0.16, 0.04, 0.03))
+    assert (keypad.on_press, keypad.on_release, keypad.has_level) == ("press", "soft", False)
     assert (patch.has_level, patch.level_db_sl) == (True, None)
     assert (slider.priority, slider.band) == (1, (100.0, 400.0))
     assert tuner.band == (60.0, 300.0)
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert layout.elsewhere is None
-    found = layout.region_at(0.265, 0.025)
+    found = layout.region_at(0.255, 0.045)
     assert found is not None
     assert found.name == "knob"
     assert layout.region_at(0.30, 0.01) is None

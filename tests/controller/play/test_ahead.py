@@ -14,7 +14,8 @@ from controller.sources.contacts import Contact, ContactKey
 from controller.sources.motion import AT_REST, Motion
 from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
-from several_fingers import playable, table
+from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
+from virtual_loop import in_virtual_time
 
 MOVER, OTHER = (0.10, 0.08), (0.22, 0.12)
 NOW = 5.0
@@ -116,3 +117,19 @@ def test_a_finger_that_rests_is_answered_where_it_is() -> None:
     moved = contact(1, MOVER, vx=0.2)
     contacts = [moved, replace(contact(2, OTHER), motion=Motion())]
     assert with_ways(fingers(contacts), contacts, NOW + 0.06, table().plate) == fingers(contacts)
+
+
+@pytest.mark.parametrize(("way", "count"), [(0.2, 1), (0.04, 0)])
+@in_virtual_time
+async def test_a_finger_that_sets_out_is_answered_before_it_has_gone_8_mm(
+    way: float, count: int
+) -> None:
+    """At 0.2 m/s its slope over 60 ms is 3 mm after 20 ms; at 40 mm/s it rests."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5) as fingers:
+        before = len(fingers.applied)
+
+        def move(since: float) -> None:
+            fingers.at[1] = (LEFT[0] - way * since, LEFT[1])
+
+        await fingers.hold(0.035, move)
+        assert len(fingers.applied) - before == count

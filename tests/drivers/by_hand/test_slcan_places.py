@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from drivers.by_hand import places
 from drivers.by_hand.cli import app
-from drivers.by_hand.places import SlcanAdapter, detect_slcan
+from drivers.by_hand.places import Candidate, detect_slcan
 from drivers.wires.can_bus.canopen import CanFrame
-from sim.far_ends.can_bus.adapters import SlcanAdapter as FarAdapter
+from sim.far_ends.can_bus.adapters import SlcanAdapter
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.pseudo_terminal import make_terminal
 
@@ -29,7 +29,7 @@ class Adapter:
         self.said, self.heard = b"", list[CanFrame]()
         bus = CanBus()
         self.terminal = make_terminal(self._read)
-        adapter = FarAdapter(bus, self.terminal.write)
+        adapter = SlcanAdapter(bus, self.terminal.write)
         self.receive: Callable[[bytes], None] = lambda data: adapter.receive(data, 0.0)
         bus.join(self.heard.append)
         self.terminal.listen()
@@ -46,7 +46,7 @@ class Adapter:
         self.said += data
         self.receive(data)
 
-    async def detect(self) -> SlcanAdapter | None:
+    async def detect(self) -> Candidate | None:
         """Detect it, in a thread."""
         return await asyncio.to_thread(detect_slcan, self.terminal.port)
 
@@ -83,8 +83,8 @@ async def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) 
     adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
     found = await adapter.detect()
     assert found is not None
-    assert found.nodes == ()
-    assert "listen-only" in (found.problem or "")
+    assert found.urls == ()
+    assert "listen-only" in found.description
     assert b"O" not in adapter.said
 
 

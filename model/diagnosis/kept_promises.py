@@ -13,6 +13,7 @@ from model.diagnosis.verdict import Verdict
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import PointLoad
 from model.study.exact_plates import draw_plates, felt_on
 from model.study.random_contacts import random_contacts
 from model.table.build import build_table
@@ -28,17 +29,20 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
     if verdict.match is None or verdict.changes is None:
         return verdict
     rng, margins = np.random.default_rng(0), []
+    # A finger that rests there is none of a table's plate.
+    masses = tuple(each for each in verdict.match.rig.masses if isinstance(each, PointLoad))
+    plate = replace(verdict.match.rig, masses=masses)
     try:
         table = build_table(rig, drive_mode="phased")
-        there = build_table(verdict.match.rig, frequencies=table.frequencies, drive_mode="phased")
+        there = build_table(plate, frequencies=table.frequencies, drive_mode="phased")
         for number in range(_ANSWERS):
             fingers = 2 + number % 3
             places = random_contacts(rng, fingers, rig.plate)
             placed = Placement(places[:1], places[1:])
             answer = query(table, placed)
             size = {"era_count": len(rig.eras), "contact_count": fingers}
-            plate = draw_plates(rng, Uncertainty.none(), count=1, **size)
-            felt = felt_on(there, placed, answer.layers[0].excitation, plate).contrast
+            exact = draw_plates(rng, Uncertainty.none(), count=1, **size)
+            felt = felt_on(there, placed, answer.layers[0].excitation, exact).contrast
             promised = answer.fingers[0].promised_contrast_db
             assert felt is not None  # noqa: S101  there are quiet fingers
             assert promised is not None  # noqa: S101

@@ -13,6 +13,7 @@ from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
+from model.study.verify import MIN_KEPT_SHARE
 
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
@@ -78,7 +79,8 @@ def verdict_rows(verdict: Verdict) -> list[str]:
 
 def difference_rows(verdict: Verdict) -> list[str]:
     """Line on how far the plate is from the rig and what it keeps; none if it keeps enough."""
-    if verdict.changes is None or verdict.kept_share is None or not verdict.differs:
+    kept = verdict.kept_share
+    if verdict.changes is None or kept is None or kept >= MIN_KEPT_SHARE:
         return []
     names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
     changes = ", ".join(
@@ -91,7 +93,7 @@ def difference_rows(verdict: Verdict) -> list[str]:
         within, changes = "", "by what has no name"
     return [
         f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
-        f"{percent(verdict.kept_share)} of what the rig's table promises: calibrate it with "
+        f"{percent(kept)} of what the rig's table promises: calibrate it with "
         "`era calibrate`"
     ]
 

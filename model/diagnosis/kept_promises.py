@@ -30,7 +30,8 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
         return verdict
     rng, margins = np.random.default_rng(0), []
     # A finger that rests there is none of a table's plate.
-    masses = tuple(each for each in verdict.match.rig.masses if isinstance(each, PointLoad))
+    loads: list[object] = [*verdict.match.rig.masses]
+    masses = tuple(each for each in loads if isinstance(each, PointLoad))
     plate = replace(verdict.match.rig, masses=masses)
     try:
         table = build_table(rig, drive_mode="phased")

@@ -29,6 +29,7 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.protocol.records import Refusal
+from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.wires.modbus.frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
 from registry import clock
@@ -44,6 +45,7 @@ class Unit:
 
     def __init__(self, amplifier: Amplifier, number: int) -> None:
         self.amplifier, self.number = amplifier, number
+        self.is_rtu = False  # where number 0 is a broadcast
         self.moves_to = 0  # the number that SetAddress has given it
         self._replies: dict[int, tuple[int, ...]] = {}  # tag, result and words by message
 
@@ -93,6 +95,8 @@ class Unit:
             name, values = read_request(message.number, words)
             done = self.amplifier.handle(name, values, clock.now())
         except Refusal as refusal:
+            if is_earlier_part(message.number, words):
+                return 0, []
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, []
         return 0, [*message.reply.pack(done)] if done else []
@@ -136,7 +140,7 @@ class Write(WriteMultipleRegistersRequest):
 
     async def datastore_update(self, context: ModbusServerContext, device_id: int) -> ModbusPDU:
         """Return the response."""
-        is_broadcast = self.dev_id == 0
+        is_broadcast = self.dev_id == 0 and unit.is_rtu
         if not is_broadcast:
             check_unit(device_id)
         fits = self.byte_count == 2 * self.count and len(self.registers) == self.count
@@ -159,6 +163,7 @@ async def serve(kind: str, port: str, parity: str = "E") -> None:
             device, address=place, custom_pdu=requests, ignore_missing_devices=True
         )
     else:
+        unit.is_rtu = True
         server = ModbusSerialServer(
             device,
             framer=FramerType.RTU,

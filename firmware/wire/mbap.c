@@ -4,6 +4,8 @@
 
 #include <string.h>
 
+#define PAUSE_MAX 1000000 // us; within a frame
+
 static void answer(const uint8_t *frame, uint16_t size, struct modbus *modbus, mbap_send *send,
                    int to)
 {
@@ -30,6 +32,10 @@ static uint16_t size_of(const struct mbap *mbap)
 void mbap_take(struct mbap *mbap, const uint8_t *bytes, uint16_t length, struct modbus units[],
                unsigned count, mbap_send *send, int to)
 {
+    uint64_t now = units[0].amplifier->now;
+    if (now - mbap->heard_at > PAUSE_MAX)
+        mbap->length = 0;
+    mbap->heard_at = now;
     while (length > 0) {
         mbap->received[mbap->length++] = *bytes++;
         length--;

@@ -14,12 +14,14 @@
 struct mbap {
     uint8_t received[MBAP_FRAME_MAX];
     uint16_t length;
+    uint64_t heard_at; // us; when the last bytes came
 };
 
 typedef void mbap_send(int to, const uint8_t *frame, uint16_t length);
 
 // Take bytes, and carry out the frames that they complete, for several units; send the replies `to`
-// the connection. What is no frame is discarded with all that came with it.
+// the connection. What is no frame is discarded with all that came with it, and what has
+// begun after a pause.
 void mbap_take(struct mbap *mbap, const uint8_t *bytes, uint16_t length, struct modbus units[],
                unsigned count, mbap_send *send, int to);
 

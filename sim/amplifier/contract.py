@@ -97,7 +97,6 @@ class Amplifier:
         self.capabilities = capabilities(channels, is_output=is_output)
         self.state = "SWITCH_ON_DISABLED"
         self.fault = "NONE"
-        self.session = 0
         self.latch = 0
         self.listeners: list[Callable[[Values, float], None]] = []
         self._faults: deque[FaultRecord] = deque(maxlen=_FAULTS_KEPT)
@@ -121,6 +120,7 @@ class Amplifier:
         self.playback = playback_of(can)
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(can)
+        self.session = 0
         self._waiting: tuple[float, Values, Layers] | None = None  # moment [s], Commit
         self._marked: int | None = None  # clock of a Mark that no status has shown
         # By the last status: this, and whether a sum was limited.

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from drivers.protocol.records import Refusal
+from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.wires.modbus.frames import (
     AREA,
@@ -150,6 +151,8 @@ class _Unit:
             name, values = read_request(message.number, words)
             reply = self.amplifier.handle(name, values, now)
         except Refusal as refusal:
+            if is_earlier_part(message.number, words):
+                return 0, ()
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, ()
         if message.name == "SetAddress":

@@ -223,7 +223,8 @@ class ExpectedStates:
 
     def _check_voltage(self, shown: Values, when: Interval) -> None:
         """Check high voltage, and the interlock of one that has it."""
-        must_be = self.state in (ENABLED, SWITCHED_ON)
+        is_fading = when[1] < self.silent[0] - ROUNDED - self.slack and any(shown["levels"])
+        must_be = self.state in (ENABLED, SWITCHED_ON) or (self.state == STOPPED and is_fading)
         where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
         if must_be:
             is_open = has_flag(shown, "interlock_open")

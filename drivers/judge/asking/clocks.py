@@ -16,6 +16,7 @@ _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _READINGS, _APART = 8, 0.03  # of one state; s between two at most
 _MAX_DURATION = 3.0  # s; in which a rate must show
+_LASTING, _QUICK = 1.5, 0.01  # s; of a layer, whose end shows a wrong rate; for an exchange
 _SHIFTS = 1, 0x4000, 0xC001
 
 
@@ -70,25 +71,27 @@ async def clock_rate(subject: Subject) -> None:
     duration = max(0.35, 1.5 * width / (_HIGHEST * RATE - DRIFT))
     require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
-    silence = send("Silence", ramp=0)  # which feeds, and leaves the rate as it is
+    lasting = _LASTING if subject.exchange_time <= _QUICK else duration / 2  # s; not of the clock
+    timed = subject.one(valid_for=round(1000 * lasting), ramp=subject.ramp)
 
-    async def read() -> None:
+    async def read(duration: float = duration) -> None:
         end = clock.now() + duration
-        while clock.now() < end:
-            await subject.run([silence if subject.is_hungry else send("GetStatus")])
+        while clock.now() < end:  # a Commit feeds, and leaves the rate as it is
+            again = send("Commit", token=subject.token)
+            await subject.run([again if subject.is_hungry else send("GetStatus")])
             await asyncio.sleep(_APART / 2)
         await _expect_steady(subject)
 
     fast, slow = (send("Ping", rate=each) for each in (_HIGHEST, _LOWEST))
     changing_nothing: Rows = (
-        *(send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"), subject.one()),
-        *(silence, send("Arm", watchdog=subject.can["watchdog_max"], shift=1)),
+        *(send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"), send("Silence", ramp=0)),
+        *(send("Arm", watchdog=subject.can["watchdog_max"], shift=1), timed),
     )
     falls_silent = send("Disarm", ramp=subject.ramp), slow, subject.settle
     trips = subject.starve, subject.shortest_watchdog / 1000, subject.settle, slow
     await subject.run(
         [
-            *(subject.arm, fast, *changing_nothing, read, slow, read),
+            *(subject.arm, fast, *changing_nothing, partial(read, lasting + duration), slow, read),
             *(fast, send("Stop", ramp=0), slow, read, subject.clear),
             *(subject.arm, subject.one(), fast, *falls_silent, slow, read),
             *(partial(subject.arm, 0.0), fast, *trips, read),

@@ -21,6 +21,7 @@ from drivers.judge.asking.client import (
     read_as,
     require_in_time,
 )
+from drivers.judge.asking.material import send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
@@ -180,10 +181,12 @@ class ModbusClient(Client):
 
 _PLACE = "modbus.md#registers"
 _GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response of it
-_PING, _STATUS, _CAPS, _ACHIEVED, _STOP = (
-    MESSAGES[name].number for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop")
+_PING, _STATUS, _CAPS, _ACHIEVED, _STOP, _SET, _COMMIT = (
+    MESSAGES[name].number
+    for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop", "Set", "Commit")
 )
-_TOO_LONG = REFUSALS["BAD_LENGTH"] << 8 | NO_CHANNEL
+_TOO_LONG, _BEYOND = (REFUSALS[name] << 8 | NO_CHANNEL for name in ("BAD_LENGTH", "BAD_VALUE"))
+_NO_WORDS = (0,) * (AREA - HEAD)
 
 
 def _client(subject: Subject) -> ModbusClient:
@@ -210,13 +213,17 @@ async def areas(subject: Subject) -> None:
         shown = await area(_PING)
         expect_equal(shown[:HEAD], [tag, 0], "tag, result")
         expect_equal(await area(_PING, 3, HEAD + 3), shown[HEAD + 3 : HEAD + 6], "part of an area")
-    await write(_ACHIEVED, 5, 0)
+    await write(_ACHIEVED, 5, 1)  # the number of the layer is a word that must not stay
     expect_equal((await area(_ACHIEVED, 1)), [5], "tag of GetAchieved")
     expect_equal((await area(_PING, 1)), [77], "tag of a Ping before it")
     await write(_ACHIEVED, 6, 15, 0)
     tag, result, *behind = await area(_ACHIEVED)
     seen = tag, result, any(behind)
     expect_equal(seen, (6, _TOO_LONG, False), "tag, result of a word too many, registers behind")
+    for tag, count, result in ((7, 1, _BEYOND), (8, 3, 0)):  # parts; of session 0
+        await write(_SET, tag, 0, 1, count << 1)
+        what = f"reply area after the first of {count} parts that is wrong"
+        expect_equal(await area(_SET), [tag, result, *_NO_WORDS], what)
     for number in (_CAPS, _STATUS):
         await write(number, 9, 0)
         expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a refusal")
@@ -238,6 +245,16 @@ async def present_areas(subject: Subject) -> None:
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
     again = await client.read(BOX * _PING + REPLY, AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
+    first, *_ = subject.parts(subject.one(), now=0, count=3)
+    await subject.send(send("Set", **first))
+    tag = client.number
+    shown = await client.read(BOX * _SET + REPLY, AREA)
+    expect_equal(shown, (tag, 0, *_NO_WORDS), "reply area after a part that is kept")
+    if not (client.is_rtu or client.has_gateway):
+        await subject.run([stage(subject.one())])
+        words = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
+        await client.expect_silence(client.request(_COMMIT, words, to=0), "a Commit to unit 0")
+        await subject.request("GetStatus")
     if client.is_rtu:
         subject.require_alone()
         data = client.adu(client.write_of(_PING, [subject.session, 0], tag=4242), unit=0)
@@ -263,6 +280,7 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
         ("a write to a reply area", area, [1, 1], 2),
         ("a write of 122 registers", BOX * _PING, [1] * 122, 2),
         ("a write of 0 registers", BOX * _PING, [], 3),
+        ("a write of 0 registers of no message", BOX * 63, [], 3),
     ):
         yield what, write_pdu(first, registers), code
     wrong_size = ping[:5] + bytes([ping[5] + 2]) + ping[6:] + b"\0\0"
@@ -275,6 +293,7 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
         ("a read beyond the identity", IDENTITY, IDENTITY_COUNT + 1, 2),
         ("a read of 0 registers", area, 0, 3),
         ("a read of 126 registers", area, 126, 3),
+        ("a read of 126 registers where there are none", 0, 126, 3),
     ):
         of_one = read_pdu(first, 1)  # pymodbus makes none of 0 or 126
         yield what, of_one[:3] + count.to_bytes(2), code
@@ -308,17 +327,17 @@ async def pieces(subject: Subject) -> None:
 
     whole, broken = frame(), bytearray(frame())
     broken[6] = 200  # bytes that would follow
-    cases = [(whole[:5], pause, whole[5:], 1)]
-    if client.is_rtu:
-        for first in (whole[:2], whole[:7], whole[:-1], bytes(broken)):
-            cases.append((first, 0.03, frame(), 1))
-    else:
-        cases.append((b"", 0.0, frame() + frame(), 2))
-    for first, wait, second, count in cases:
+    cases = [(whole[:5], pause, whole[5:], [whole])]
+    begun = (whole[:2], whole[:7], whole[:-1], bytes(broken)) if client.is_rtu else (whole[:7],)
+    cases += [(each, 1.2 * limit, last, [last]) for each in begun for last in [frame()]]
+    both = [frame(), frame()]
+    cases += [(b"", 0.0, b"".join(both), both)] * (not client.is_rtu)
+    for first, wait, second, frames in cases:
         began = clock.now()
         client.write(first)
         await asyncio.sleep(wait)
         require_in_time(not wait < limit < clock.now() - began, "the rest of a frame came too late")
         heard = await client.send(second)
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
-        expect_equal(len(heard), count, what)
+        numbers = [0 if client.is_rtu else int.from_bytes(each[:2]) for each in frames]
+        expect_equal([each.number for each in heard], numbers, f"transactions of the {what}")

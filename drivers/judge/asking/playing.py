@@ -249,6 +249,7 @@ def endings_amid(subject: Subject) -> Rows:
     return [
         (layer(0, replace(towards_0, ending=ending)), half, layer(0)),
         (layer(0, replace(towards_0, ending=ending)), over[0], layer(0)),
+        (layer(0, replace(towards_0, ending=ending), valid_for=round(1000 * half)),),
         *(
             (subject.one(subject.tone(ending=ending)), layer(0), at, layer(0))
             for at in (part, over[1])
@@ -354,7 +355,8 @@ def voices(subject: Subject) -> Rows:
         for left in _LEFT
     ]
     return [
-        (lasting, partial(fade, fades - 1), *cuts, *full),
+        # The oldest tone fades last: what is cut is the way to 0 that began first.
+        (lasting, partial(fade, fades - 1), layer(1, ramp=ramp), *cuts, *full),
         *((lasting, partial(fade, fades - 2), *each, silence) for each in counted),
     ]
 

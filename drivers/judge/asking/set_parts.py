@@ -193,7 +193,8 @@ def max_set(subject: Subject) -> Rows:
     room = min(subject.can["set_words"], _MAX_TRIED)
     longer = set_of(subject, room + 2)
     is_longer = len(pack_layers(longer)) > subject.can["set_words"]
-    refused = [stage(*longer, code="BAD_LENGTH")] if is_longer else []
+    flawed = replace(longer[0], renew=True)  # which is found after the length
+    refused = [stage(flawed, *longer[1:], code="BAD_LENGTH")] if is_longer else []
     return [subject.arm, stage(*set_of(subject, room)), send("Commit", token=1), *refused]
 
 

@@ -63,10 +63,13 @@ async def achieved(subject: Subject) -> None:
         await subject.request("GetAchieved", layer=number)
     for number in subject.layers:
         await subject.request("GetAchieved", layer=number)
-    # What fades is not listed, nor its layer once that is over.
-    for one in (subject.one(subject.tone(frequency=subject.other)), layer(0)):
+    # What fades is not listed, nor its layer once that is over, by an onset to level 0 too.
+    other, to_0 = subject.tone(frequency=subject.other), subject.tone(0, 0.0, onset=shape)
+    for one in (subject.one(other), layer(0), subject.one(to_0)):
         await subject.play(replace(one, ramp=subject.ramp))
         await subject.request("GetAchieved", layer=0)
+    await subject.follow()
+    await subject.request("GetAchieved", layer=0)
 
 
 @driving("protocol.md#messages")
@@ -150,7 +153,7 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         layer(0, renew=True, after=True),
         *([layer(layers, tone)] if layers < 16 else []),
     ):
-        yield _part(pack_layers([good, layer_set]))
+        yield from (_part(pack_layers(each)) for each in ([good, layer_set], [layer_set, good]))
     above = {"ramp": ramp + 1, "valid_for": QUANTITIES["valid_for"].maximum + 1}
     for headed in (layer(0, tone, tone), layer(0), layer(0, renew=True)):
         for name, number in above.items():

@@ -133,6 +133,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
     waiting = stage(subject.one(level=0.25))
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     first, *_ = subject.parts(half, token=2, now=0, count=3)
+    refused = play(layer(0, after=True), token=3, code="BAD_VALUE")
     ends: list[Rows] = [
         *([send(name, ramp=0)] for name in ("Silence", "Stop")),
         [send("Disarm", ramp=0), subject.settle, subject.arm],
@@ -142,7 +143,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [stage(subject.one(level=0.5)), send("Commit", token=2)],
         [send("Set", **first)],
         [stage(half), partial(subject.commit_in, left / 2)],
-        [stage(half), send("Commit", token=3, code=_OLD)],
+        [stage(half), send("Commit", token=3, code=_OLD), refused],
     ]
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
     later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]

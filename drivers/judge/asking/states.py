@@ -85,12 +85,14 @@ def sessions(subject: Subject) -> Rows:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
+    shortest, longest = QUANTITIES["watchdog"].minimum, QUANTITIES["watchdog"].maximum
     rows = (
         play(quarter, token=3, code="WRONG_SESSION"),
         send("Commit", token=2, code="WRONG_SESSION"),
-        send("Silence", ramp=0, code="WRONG_SESSION"),
+        # The session comes before what is beyond the capabilities.
+        send("Silence", ramp=QUANTITIES["ramp"].maximum, code="WRONG_SESSION"),
         send("Ping", code="WRONG_SESSION"),
-        send("Arm", watchdog=maximum, code="WRONG_SESSION"),
+        *(send("Arm", watchdog=each, code="WRONG_SESSION") for each in (shortest, longest)),
     )
     others = [
         partial(
@@ -131,9 +133,11 @@ def arming_ends_fades(subject: Subject) -> Rows:
 @driving(_STATES)
 def stop(subject: Subject) -> Rows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
+    first, *_ = subject.parts(subject.one(level=0.5), token=3, now=0, count=3)
     return [
-        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
-        *(*_latched(subject), send("Commit", token=2, code=_WRONG), 0.1),
+        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Set", **first)),
+        *(send("Stop", ramp=0), 0.02, *_latched(subject)),
+        *(send("Commit", token=3, code=_WRONG), 0.1),
     ]
 
 
@@ -205,9 +209,11 @@ def silence(subject: Subject) -> Rows:
         layer(1, subject.tone(0, 0.4, frequency=subject.other)),
         layer(2, subject.tone(1 % len(subject.channels), 0.1)),
     )
+    first, *_, last = subject.parts(subject.one(), token=4, now=0, count=3)
     return [
         *(subject.arm, several, stage(subject.one()), send("Silence", ramp=subject.ramp)),
         *(subject.follow, send("Commit", token=2, code="BAD_TOKEN"), subject.one()),
+        *(send("Set", **first), send("Silence", ramp=0), send("Set", **last)),
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
     ]
 
@@ -264,11 +270,11 @@ async def watchdog_unread(subject: Subject) -> None:
 @driving(_SESSIONS)
 def what_feeds(subject: Subject) -> Rows:
     """It is fed by Arm, Ping, Set, Commit and Silence of its session, and counts the time left."""
-    long, *_ = subject.parts(*long_set(subject), token=3, now=0)
+    first, *_, last = subject.parts(*long_set(subject), token=3, now=0, count=3)
     feeds = (
         *(subject.ping, subject.one(), stage(subject.one(level=0.5))),
         *(send("Commit", token=2), send("Commit", token=2), stage(subject.one(), token=2)),
-        send("Set", **long),
+        *(send("Set", **first), send("Set", **last)),  # another part is missing
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
     return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.02, feed))]

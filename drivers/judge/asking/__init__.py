@@ -12,6 +12,7 @@ from functools import partial
 from drivers.errors import LinkError
 from drivers.judge.asking import (
     can_frames,
+    can_node,
     clocks,
     modbus_frames,
     playing,
@@ -46,7 +47,7 @@ __all__ = [
 CHECKS: tuple[Check, ...] = (
     *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
     *(reading.unknown_types, reading.reading_changes_nothing, reading.hello_for_ever),
-    *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_frames.objects),
+    *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_node.objects),
     *(reading.lengths, states.stop, states.stop_ramps, states.silence_never_later),
     *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
     *(states.silence, states.plays_nothing_disarmed, states.arming, states.watchdog_ranges),
@@ -70,7 +71,7 @@ CHECKS: tuple[Check, ...] = (
     *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
     serial_frames.discarded_frames,
     *(modbus_frames.present_areas, modbus_frames.exceptions),
-    *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
+    *(can_frames.numbers, can_node.network_management, can_node.heartbeats),
     *(reading.events, reading.broadcasts, reading.mark, reading.addresses),
     *(sensors.measured, sensors.readings),
 )

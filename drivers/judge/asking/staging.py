@@ -14,7 +14,8 @@ from registry import clock
 _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
 _AROUND, _NEAR = 0.015, 0.0005  # s; of a moment, in which statuses are dense; that may be either
-_FASTEST, _LONG = QUANTITIES["rate"].maximum, 0.2  # of the clock; s in which it shows
+_SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
+_LONG = 0.2  # s; in which a rate of the clock shows
 
 
 @driving(_PLACE)
@@ -112,6 +113,7 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     one = subject.one()
     await subject.run([stage(one)])
     at, began = await subject.commit_in(duration), clock.now()
+    await subject.request("Ping", rate=_SLOWEST if duration > _LONG else 0)
     await subject.run([play(one, token=1), send("Commit", token=1)])
     is_ahead = 0 < duration <= MAX_AHEAD
     await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))

@@ -19,6 +19,7 @@ what they state. One is held to the host's, and the others to it.
 """
 
 import math
+from statistics import median_low
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
@@ -30,6 +31,7 @@ WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
 _PARTS, _MIN_PART = 32, 2.0**-8  # of what was read, lowest ones are kept; s of each, or twice that
 _MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal bends
+_AGREEING = 3  # Marks at least: of two none tells which is false
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
@@ -38,7 +40,8 @@ _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it w
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
+_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot
+_MAX_RATE = _FAST[1] + MAX_CLOCK_RATE  # of all together; a Ping can say 3.28e-3
 _TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _SURELY = 4.0  # standard errors
@@ -180,7 +183,7 @@ class HeldClock:
         rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
         for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
             rate += min(max(-off / within, -highest), highest)
-        return round(rate * _PER_RATE)
+        return round(min(max(rate, -_MAX_RATE), _MAX_RATE) * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
@@ -272,13 +275,22 @@ class HeldClock:
     def _compare(self, time: float, lead: float) -> None:
         """Note a Mark, and lay a line through what it differs by from the other clock.
 
-        What is likely of two crystals counts as if it were measured, too.
+        What is likely of two crystals counts as if it were measured, too. Marks that most others
+        contradict do not count.
         """
         self._marked = {at: each for at, each in self._marked.items() if time - at <= _MARKED}
         self._marked[time] = lead
         others = {} if self._other is None else self._other._marked
         both = [(at, each - others[at]) for at, each in self._marked.items() if at in others]
-        if not both:
+        # Where a Mark or the reply that showed it was lost the present clock is shown: by median.
+        rate, near = self._beside.rate, _NEAR + 2 * self.stated / _PER_ERROR
+        level, middle = median_low([(each - rate * at, at) for at, each in both] or [(0.0, time)])
+        both = [
+            (at, each)
+            for at, each in both
+            if abs(each - rate * at - level) <= near + MAX_CLOCK_RATE * abs(at - middle)
+        ]
+        if len(both) < _AGREEING:
             return
         newest, count = both[-1][0], len(both)
         middle = sum([newest - at for at, _ in both]) / count

@@ -118,13 +118,17 @@ class Clocks:
                 await asyncio.sleep(self.later())
 
     def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
-        """Hold clocks of a line to one as long as it can be trusted, else to the best known."""
+        """Hold clocks of a line to one as long as nothing ails it, else to the best known."""
         line = of_line[0].line
-        first = self._firsts.get(line)
-        if first is None or first.error(now) == math.inf:
+        before = self._firsts.get(line)
+
+        def rank(one: HeldClock) -> tuple[bool, bool, bool, float]:
             # One that has jumped is led back by itself: no other follows it.
-            best = min([each.clock for each in of_line], key=lambda each: each.error(now))
-            first = self._firsts[line] = best if best.error(now) < math.inf else None
+            error = one.error(now)
+            return error == math.inf, one.problem(now) is not None, one is not before, error
+
+        best = min([each.clock for each in of_line], key=rank)
+        first = self._firsts[line] = best if best.error(now) < math.inf else None
         for each in of_line:
             each.clock.compare(None if each.clock is first else first)
 

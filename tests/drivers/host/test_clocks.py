@@ -235,6 +235,21 @@ def test_no_clock_of_a_line_follows_one_that_jumped(plays: bool) -> None:
     run_virtual(run())
 
 
+def test_no_clock_of_a_line_follows_one_that_is_not_steered() -> None:
+    """The first ignores its rate and drifts 40 us a second: it alone is reported, and leaves."""
+
+    async def run() -> None:
+        group, clocks = await held("usb-high-speed", 0, "abc")
+        clocks[0].steer = lambda rate, time: None  # type: ignore[method-assign]
+        await skew(group, clocks, 12.0)
+        first, *others = leads(clocks)
+        assert abs(first) > 400e-6
+        assert max(map(abs, others)) < 125e-6
+        assert [each for each in "abc" if group.amplifiers[each].reported_at] == ["a"]
+
+    run_virtual(run())
+
+
 @pytest.mark.parametrize("baud", [38_400, 921_600])
 @pytest.mark.parametrize("is_stopped", [False, True], ids=["armed", "stopped"])
 def test_readings_before_arming_end_in_time(is_stopped: bool, baud: int) -> None:

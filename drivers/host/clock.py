@@ -36,6 +36,7 @@ _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
 _EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
+_MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or runs backwards
 _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
@@ -159,8 +160,11 @@ class HeldClock:
             return "clock_jumped"
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
-        is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off and len(self._lowest) > _PARTS // 2 else None
+        rate = abs(self._line.rate)
+        is_off = rate - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
+        if not is_off or len(self._lowest) <= _PARTS // 2:
+            return None
+        return "clock_rate" if rate < _MAX_CRYSTAL else "clock_jumped"
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""

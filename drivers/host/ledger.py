@@ -228,6 +228,9 @@ class Ledger:
                     highest += abs(transition.last)
                 else:
                     is_settled, highest = False, highest + transition.peak(late)
+            for one in playback.waiting if unsure else ():
+                tones = [each for each in one.commands if each.channel == channel]
+                highest += sum([each.peak for each in tones]) / _LEVEL.per_unit
             high = round(min(highest, 1.0) * _LEVEL.per_unit)
             if is_settled and high - tolerance <= level <= high + tolerance:  # nearly always
                 continue

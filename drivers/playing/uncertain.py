@@ -10,11 +10,12 @@ from itertools import chain
 from typing import TypeAlias
 
 from drivers.playing.playback import LAYERS_MAX, Playback
-from drivers.playing.voices import Transition, Voice, amplitude_of, peak_of
+from drivers.playing.voices import Transition, Voice
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
 
 Interval: TypeAlias = tuple[float, float]
+_PER_LEVEL = QUANTITIES["level"].per_unit
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 
 
@@ -142,8 +143,7 @@ class UncertainPlayback:
         for one in self.playback.waiting:
             tones = [each for each in one.commands if each.channel == channel]
             for tone in tones if one.layer in unsure else ():
-                peak = max(peak_of(tone.onset), peak_of(tone.ending))
-                extra += max(abs(amplitude_of(tone.level, 0)), peak)
+                extra += tone.peak / _PER_LEVEL
         groups: dict[float, list[Transition]] = {}
         for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:

@@ -316,7 +316,8 @@ class Dialogue:
         elif name in _SILENCING:
             self._admitted = None
             if name == "Silence" and self._ledger is not None:
-                self.played_at, self._ledger.may_be_silent = now, True
+                self.played_at = now
+                self._ledger.may_be_silent.update(range(self.capabilities["layers"]))
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:

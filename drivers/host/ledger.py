@@ -8,7 +8,7 @@ only silence is admitted. Times [s] are of any one clock.
 import logging
 import math
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -73,8 +73,8 @@ class Ledger:
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
         self._advanced_to = -math.inf  # s; what was due by then was carried out
-        self.may_be_silent = False
-        """Whether a silence was sent that is not confirmed."""
+        self.may_be_silent = set[int]()
+        """Layers that may be silent: by a silence without a reply, or a renewal that was late."""
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""
         self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
@@ -167,8 +167,11 @@ class Ledger:
         if playback.next_due - 2 * self.lag <= now:
             for one in layers:
                 ends = playback.end_of(one.layer)
-                if not one.renew and sent_at < ends and ends - 2 * self.lag <= now:
-                    playback.add_ends(one.layer, sent_at)
+                if sent_at < ends and ends - 2 * self.lag <= now:
+                    if one.renew:
+                        self.may_be_silent.add(one.layer)
+                    else:
+                        playback.add_ends(one.layer, sent_at)
         playback.commit(layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
@@ -186,7 +189,7 @@ class Ledger:
 
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
-        self.doubt, self.may_be_silent = None, False
+        self.doubt, self.may_be_silent = None, set()
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
         if not self._budget.is_unlimited:
@@ -207,10 +210,9 @@ class Ledger:
             return f"levels must be {playback.channels}, got {len(status['levels'])}"
         if len(status["tokens"]) != self.capabilities["layers"]:
             return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
-        unsure: Collection[int] = range(len(status["tokens"]))
-        if not self.may_be_silent:  # a layer may have ended, or started what waits, or not yet
-            by = now + 2 * self.lag
-            unsure = playback.unsure(by) if playback.changes_at <= by else ()
+        unsure, by = {*self.may_be_silent}, now + 2 * self.lag
+        if playback.changes_at <= by:  # a layer may have ended, or started what waits, or not yet
+            unsure |= playback.unsure(by)
         expected = playback.tokens
         for layer, token in enumerate(status["tokens"]):
             if token != expected.get(layer, 0) and not (

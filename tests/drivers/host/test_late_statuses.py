@@ -47,6 +47,26 @@ async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> N
     assert shown == {False, True}
 
 
+@in_virtual_time
+async def test_renewal_that_comes_as_its_layer_ends_may_be_too_late() -> None:
+    """A layer of 40 ms is renewed about then, up to 14 ms late: it plays on, or it does not."""
+    rng, end = random.Random(7), MemoryLine("serial", "a")
+    group = await group_of(end, watchdog=2.0)
+    host, shown = group.amplifiers["a"], set[int]()
+    for _ in range(40):
+        await group.apply({"a": [layer(0, tone(), valid_for=0.04)]})
+        delayed(end, rng)
+        await asyncio.sleep(rng.uniform(0.02, 0.045))
+        await group.apply({"a": [layer(0, renew=True, valid_for=1.0)]})
+        for _ in range(3):
+            await asyncio.sleep(0.015)
+            shown.add((await host.read_status())["tokens"][0] > 0)
+            assert host._contradictions == 0
+        end.inward = end.outward = unaltered
+        await group.silence(0.0)
+    assert shown == {False, True}
+
+
 @grouped(("a",), wire="serial")
 async def test_silence_without_a_reply_may_have_been_heard(
     group: Group, ends: list[MemoryLine]

@@ -20,6 +20,7 @@ from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.calibration.responses import Responses
+from model.diagnosis.kept_promises import judged_by_promises
 from model.diagnosis.verdict import Verdict, diagnose
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -121,7 +122,7 @@ def measured(fault: Fault, seed: int) -> Responses:
 
 def verdict_on(rig: Rig, name: str, seed: int) -> Verdict:
     """The check's verdict on a hidden plate with a fault by name."""
-    return diagnose(rig, measured(FAULTS[name], seed), has_form=True)
+    return judged_by_promises(diagnose(rig, measured(FAULTS[name], seed), has_form=True), rig)
 
 
 def main() -> None:

@@ -76,6 +76,7 @@ def check(
     from dataclasses import replace
 
     from model.diagnosis import diagnosis_report
+    from model.diagnosis.kept_promises import judged_by_promises
     from model.diagnosis.verdict import diagnose
 
     if (measured is None) == (url is None):
@@ -97,7 +98,7 @@ def check(
         observation = replace(observation, has_phases=False)
     started = time.perf_counter()
     # Sensors of amplifiers are of unknown scale.
-    verdict = diagnose(rig, observation, has_form=url is None)
+    verdict = judged_by_promises(diagnose(rig, observation, has_form=url is None), rig)
     elapsed = time.perf_counter() - started
     low, high = verdict.frequencies.min(), verdict.frequencies.max()
     rows += [

@@ -20,6 +20,7 @@ DRIFT = 1e-3
 _TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
 _MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
+_PERIOD = 0.1  # s; in which a sum of tones has its peak
 _LASTING = 3.0  # s; what ends after it is not awaited
 _AMBIGUOUS = "a request came as a layer ended by itself, or its onset"
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
@@ -78,6 +79,7 @@ class ExpectedOutputs:
         self.lasting: dict[int, set[int]] = {}
         self._before: Sequence[float] = ()  # levels of channels before the last set
         self._highest = 0.0  # of the sums of a channel since the last status, at most
+        self._unlimited_since = math.inf  # a sum is surely beyond full level, and not said to be
 
     def forget(self) -> None:
         """Treat what plays as unknown."""
@@ -206,7 +208,10 @@ class ExpectedOutputs:
                     self._report("token", when[1], what, must=one_of(possible), seen=token)
             is_limited = has_flag(shown, "limited")
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
-            must_be = is_beyond and self.is_exact and not self.may_derate
+            is_excused = is_limited or not is_beyond or not self.is_exact or self.may_derate
+            since = math.inf if is_excused else min(self._unlimited_since, when[1])
+            self._unlimited_since = since
+            must_be = start - since > _PERIOD
             if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):

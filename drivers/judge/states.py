@@ -8,7 +8,15 @@ from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_o
 from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Values
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import ENABLED, FAULTS, LATCHED, STATES, has_flag, name_of
+from drivers.protocol.table import (
+    ENABLED,
+    FAULTS,
+    LATCHED,
+    NO_CHANNEL,
+    STATES,
+    has_flag,
+    name_of,
+)
 
 ROUNDED = 0.002  # s; of times in milliseconds
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
@@ -228,6 +236,8 @@ class ExpectedStates:
         """Check a list of faults: the newest first, those that were seen, of their ages."""
         ages = [each["age"] for each in listed]
         self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
+        unfed = {each["channel"] for each in listed if each["fault"] == FAULTS["WATCHDOG"]}
+        self._expect("faults", when[1], "channels of watchdog faults", set(), unfed - {NO_CHANNEL})
         faults = [(each["fault"], each["age"] / 1000) for each in listed]
         left = iter(faults)
         for fault, since in self._faults:

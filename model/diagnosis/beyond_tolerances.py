@@ -1,12 +1,14 @@
-"""What of a plate is beyond tolerances: a mass, a finger, its thickness, or something unnamed.
+"""What of a plate is beyond tolerances: masses, a finger, its thickness, or something unnamed.
 
 A plate is matched once more with form errors, each held by its tolerance (`KINDS` in
 `model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
-sides, Poisson's ratio, single modes. They explain what builders and rulers do. What lies on the
-plate is sought where it would explain most beside all of them, and named if it then explains it; of
-the rest each kind of form error is judged by its sum of squares, at equal shares of a stated false
-alarm, and a thickness at one of its own. A plate that is thinner at one end
-moves more there, by as much as it is thinner: scales of sensors rise along it.
+sides, Poisson's ratio, single modes. They explain what builders and rulers do, but for foreign mass
+in one place, above all near an edge: mass in the middles of cells does not have its field. What
+lies on the plate is therefore sought where it would explain most beside all of them, one after
+another, and named if it is beyond a tolerance. Of the rest each kind of form error is judged by its
+sum of squares, at equal shares of a stated false alarm, and a thickness at as much by itself. A
+plate that is thinner at one end moves more there, by as much as it is thinner: scales of sensors
+rise along it.
 """
 
 from collections.abc import Sequence
@@ -31,15 +33,16 @@ from model.diagnosis.plate_match import FALSE_ALARM, Match, match_plate
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.least_squares import Linearization
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
 
 MAX_ERROR = 0.05
 """Share of a response that form errors leave unexplained at most, if they explain the plate."""
 
 _NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit is weighted by
 _FIRST_NOISE = 0.02
-_SCANNED = Grid(16, 12)
-_HEAVY = 0.02  # of the plate's mass: twice the tolerance of foreign mass
+_SCANNED = Grid(32, 24)
+_MAX_LOADS = 2
+_HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
 _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _LEAST_SHOWN = 1e-6  # of a variance
 _CLEAR = 40.0  # of half the sum of squares
@@ -60,14 +63,14 @@ _WORDS = {
 class BeyondTolerances:
     """What is not as written.
 
-    load: what lies on the plate, None for nothing; farthest: the form error that is least likely,
-    in words; deviation: its rms in standard deviations, 0 where none is too large; chance: in how
-    many of all plates as written one is as unlikely, at most; error: of the response, unexplained;
-    taper: how much thicker the plate is at the ends of x and of y than in the middle, relative,
-    None where that is not what is farthest.
+    loads: what lies on the plate, masses or a finger; farthest: the form error that is least
+    likely, in words; deviation: its rms in standard deviations, 0 where none is too large; chance:
+    in how many of all plates as written one is as unlikely, at most; error: of the response,
+    unexplained; taper: how much thicker the plate is at the ends of x and of y than in the middle,
+    relative, None where that is not what is farthest.
     """
 
-    load: PointLoad | FingertipLoad | None
+    loads: tuple[PointLoad | FingertipLoad, ...]
     farthest: str
     deviation: float
     chance: float
@@ -77,9 +80,9 @@ class BeyondTolerances:
     @property
     def kind(self) -> str:
         """Its name in reports."""
-        if self.load is None:
+        if not self.loads:
             return "unnamed" if self.taper is None else "thickness"
-        return "mass" if isinstance(self.load, PointLoad) else "finger"
+        return "mass" if isinstance(self.loads[0], PointLoad) else "finger"
 
 
 def match_with_form(
@@ -90,28 +93,34 @@ def match_with_form(
     Return also what of the plate is beyond tolerances, None for nothing.
     """
 
-    def matched(load: Support | None, noise: float) -> Match:
-        rig = plate.rig
-        if load is not None:
-            rig = replace(rig, masses=(*rig.masses, load))  # type: ignore[arg-type]
+    def matched(loads: Sequence[PointLoad | FingertipLoad], noise: float) -> Match:
+        rig = replace(plate.rig, masses=(*plate.rig.masses, *loads))  # type: ignore[arg-type]
         sensed = sensed_plate(rig, observation.points, observation.frequencies, has_form=True)
         return match_plate(sensed, values, drives=drives, model_error=noise)
 
-    noise = float(np.clip(matched(None, _FIRST_NOISE).error, *_NOISE))
-    best, load = matched(None, noise), None
-    loads, fitted = _loads(best, values, drives, noise)
-    for each in loads:
-        found = matched(each, noise)
-        if found.cost < best.cost - _CLEAR:
-            best, load = found, each
-    if load is not None:
-        return best, BeyondTolerances(load, "", 0.0, 1.0, best.error)
+    noise = float(np.clip(matched((), _FIRST_NOISE).error, *_NOISE))
+    best = matched((), noise)
+    loads: list[PointLoad | FingertipLoad] = []
+    further, fitted = _loads(best, values, drives, noise)
+    while further and len(loads) < _MAX_LOADS:
+        tried = [(each, matched((*loads, each), noise)) for each in further]
+        load, found = best_by(tried, lambda each: -each[1].cost)
+        if found.cost > best.cost - _CLEAR:
+            break
+        best, loads = found, [*loads, load]
+        further, fitted = _loads(best, values, drives, noise)
+    mass = sum(each.mass for each in loads if isinstance(each, PointLoad))
+    is_heavy = mass >= _HEAVY * plate.rig.plate.mass
+    # A mass within tolerance is no fault, nor are form errors that would stand in for it.
+    named = tuple(each for each in loads if is_heavy or not isinstance(each, PointLoad))
+    if named:
+        return best, BeyondTolerances(named, "", 0.0, 1.0, best.error)
     rises, slopes = _along_plate(best, observation.points, fitted)
     farthest, deviation, chance = _farthest(best, rises)
     if best.error <= MAX_ERROR and not deviation:
         return best, None
     taper = slopes if farthest == _THICKNESS else None
-    return best, BeyondTolerances(None, farthest, deviation, chance, best.error, taper)
+    return best, BeyondTolerances((), farthest, deviation, chance, best.error, taper)
 
 
 def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
@@ -159,7 +168,7 @@ def _searched(match: Match) -> NDArray[np.bool_]:
 def _loads(
     match: Match, values: ComplexArray, drives: Sequence[int], noise: float
 ) -> tuple[list[PointLoad | FingertipLoad], Linearization]:
-    """A mass and a finger where each would explain most, if it is of a size that counts.
+    """A mass and a finger where each would explain most, the latter if it is of a size that counts.
 
     And the match beside which they were sought.
     """
@@ -185,9 +194,8 @@ def _loads(
     of_finger = -tip.dynamic_stiffness(model.omega) / model.omega**2
     heaviest: list[PointLoad | FingertipLoad] = []
     for number, size in fitted.further(real(mass * by_mass))[:1]:
-        if size >= _HEAVY:
-            x, y = points[number].tolist()
-            heaviest.append(PointLoad(x, y, mass=size * mass))
+        x, y = points[number].tolist()
+        heaviest.append(PointLoad(x, y, mass=size * mass))
     for number, size in fitted.further(real(of_finger[:, None, None] * by_mass))[:1]:
         if size >= _LIGHT:
             x, y = points[number].tolist()

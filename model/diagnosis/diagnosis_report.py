@@ -2,15 +2,18 @@
 
 from typing import Any
 
+import numpy as np
+
 from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
-from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR, NOTICEABLE_DB
+from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
 from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
-from model.structure.attachments import PointLoad
+from model.structure.attachments import FingertipLoad, PointLoad
+from model.study.verify import MIN_KEPT_SHARE
 
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
@@ -61,7 +64,12 @@ def verdict_rows(verdict: Verdict) -> list[str]:
             f"them of sensor {verdict.sensors[worst]}: check for loose contacts if they are many"
         )
     if verdict.beyond is not None:
-        rows.append(_beyond_row(verdict.beyond))
+        rows += _beyond_rows(verdict.beyond)
+    if verdict.misses_promises:
+        rows.append(
+            "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
+            f"by {-np.median(verdict.promise_margins):.1f} dB or more"
+        )
     if rows:
         return rows
     if difference_rows(verdict):
@@ -70,47 +78,50 @@ def verdict_rows(verdict: Verdict) -> list[str]:
 
 
 def difference_rows(verdict: Verdict) -> list[str]:
-    """Line on how far the plate is from the rig and what it costs; none if hardly anything."""
-    difference = verdict.difference
-    if difference is None or difference.loss_db < NOTICEABLE_DB:
+    """Line on how far the plate is from the rig and what it keeps; none if it keeps enough."""
+    kept = verdict.kept_share
+    if verdict.changes is None or kept is None or kept >= MIN_KEPT_SHARE:
         return []
     names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
     changes = ", ".join(
         f"{names.get(kind, kind)} {100 * change:+.0f} %"
-        for kind, change in difference.changes.items()
+        for kind, change in verdict.changes.items()
         if abs(change) >= _MIN_CHANGE
     )
     within = "within tolerances, but not as written: " if verdict.plate_matches else ""
-    if verdict.beyond is not None and verdict.beyond.load is None:
+    if verdict.beyond is not None and not verdict.beyond.loads:
         within, changes = "", "by what has no name"
     return [
-        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; patterns for the rig reach "
-        f"{difference.contrast_db:.0f} dB instead of {difference.contrast_known_db:.0f} dB, "
-        f"{difference.loss_db:.1f} dB less: calibrate it with `era calibrate`"
+        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
+        f"{percent(kept)} of what the rig's table promises: calibrate it with "
+        "`era calibrate`"
     ]
 
 
-def _beyond_row(beyond: BeyondTolerances) -> str:
-    """Line on what lies on a plate, or is beyond tolerances without a name."""
-    load = beyond.load
+def _beyond_rows(beyond: BeyondTolerances) -> list[str]:
+    """Lines on what lies on a plate, or one on what is beyond tolerances without a name."""
+    if beyond.loads:
+        return [_load_row(load) for load in beyond.loads]
     if beyond.taper is not None:
         x, y = (f"{100 * each:+.1f} %" for each in beyond.taper)
-        return (
+        return [
             f"THICKNESS: the plate is {x} thicker at the end of x and {y} at that of y than in its "
             "middle, by what its sensors read: check it, or the sensors' scales"
-        )
-    if load is None:
-        what = (
-            f"{beyond.farthest} are off by {beyond.deviation:.1f} standard deviations of their "
-            "tolerance"
-            if beyond.deviation
-            else f"{percent(beyond.error)} of the response is unexplained"
-        )
-        return (
-            f"UNNAMED: the plate is as written, but for something that has no name here: {what}; "
-            "check its thickness, what is bonded to it and the sensors' scales, and measure for "
-            "`era calibrate`"
-        )
+        ]
+    what = (
+        f"{beyond.farthest} are off by {beyond.deviation:.1f} standard deviations of their "
+        "tolerance"
+        if beyond.deviation
+        else f"{percent(beyond.error)} of the response is unexplained"
+    )
+    return [
+        f"UNNAMED: the plate is as written, but for something that has no name here: {what}; "
+        "check its thickness, what is bonded to it and the sensors' scales, and measure for "
+        "`era calibrate`"
+    ]
+
+
+def _load_row(load: PointLoad | FingertipLoad) -> str:
     place = f"at ({load.x:.2f}, {load.y:.2f}) m"
     if isinstance(load, PointLoad):
         grams = in_display_unit(load.mass, "kg")
@@ -173,7 +184,7 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Verdict as JSON; units are in the keys."""
-    match, difference = verdict.match, verdict.difference
+    match = verdict.match
     return {
         "all_well": verdict.is_well,
         "channels": [
@@ -196,10 +207,9 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "plate": {
             "matches": verdict.plate_matches,
             "beyond": None if verdict.beyond is None else _beyond_as_json(verdict.beyond),
-            "changes": {} if difference is None else difference.changes,
-            "contrast_db": None if difference is None else difference.contrast_db,
-            "contrast_known_db": None if difference is None else difference.contrast_known_db,
-            "contrast_loss_db": None if difference is None else difference.loss_db,
+            "changes": verdict.changes or {},
+            "kept_share": verdict.kept_share,
+            "promise_margins_db": [*verdict.promise_margins],
             "unexplained": None if match is None else match.error,
             "farthest_standard_deviations": None if match is None else match.worst,
             "parameters": []
@@ -235,13 +245,13 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
-    load = beyond.load
     x, y = beyond.taper or (None, None)
     return {
         "kind": beyond.kind,
-        "x_m": None if load is None else load.x,
-        "y_m": None if load is None else load.y,
-        "mass_kg": load.mass if isinstance(load, PointLoad) else None,
+        "loads": [
+            {"x_m": each.x, "y_m": each.y, "mass_kg": getattr(each, "mass", None)}
+            for each in beyond.loads
+        ],
         "thicker_at_end_of_x": x,
         "thicker_at_end_of_y": y,
         "farthest": beyond.farthest or None,

@@ -31,12 +31,14 @@ from model.diagnosis.plate_match import (
     MAX_FIT_ERROR,
     MODEL_ERROR,
     Match,
-    PlateDifference,
     match_plate,
-    plate_difference,
+    plate_changes,
 )
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
+
+MISSED_DB = 1.0
+"""By which half of a table's answers may miss their promises [dB]."""
 
 WEAK, STRONG = 0.8, 1.25  # gain of a channel: 2 dB either way, four times what a drive varies
 _LEAST_FREQUENCIES = 4
@@ -79,9 +81,11 @@ class Verdict:
 
     plate_matches: whether the rig's plate within its priors explains the measurement; match: that
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
-    out; swapped: cycles of channels by their ERAs; difference: of that plate from the rig's, None
-    without a plate that fits; sensors: names of those that were not left out; beyond: what of a
-    plate that matches is beyond tolerances, None for nothing or where it was not sought.
+    out; swapped: cycles of channels by their ERAs; changes: see `plate_changes`, None without a
+    plate that fits; sensors: names of those that were not left out; beyond: what of a plate that
+    matches is beyond tolerances, None for nothing or where it was not sought; promise_margins: by
+    what that plate exceeds the contrasts that the rig's table promises [dB], none where they were
+    not compared.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -90,10 +94,11 @@ class Verdict:
     explanations: tuple[Explanation, ...]
     bad_sensors: tuple[BadSensor, ...]
     swapped: tuple[tuple[str, ...], ...]
-    difference: PlateDifference | None
+    changes: dict[str, float] | None
     sensors: tuple[str, ...]
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
+    promise_margins: tuple[float, ...] = ()
 
     @property
     def wiring_matches(self) -> bool:
@@ -103,7 +108,23 @@ class Verdict:
     @property
     def is_well(self) -> bool:
         """Whether no fault was found."""
-        return self.plate_matches and self.wiring_matches and self.beyond is None
+        return (
+            self.plate_matches
+            and self.wiring_matches
+            and self.beyond is None
+            and not self.misses_promises
+        )
+
+    @property
+    def kept_share(self) -> float | None:
+        """Share of the table's promises that the plate keeps, None where they were not compared."""
+        return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
+
+    @property
+    def misses_promises(self) -> bool:
+        """Whether half of all answers give clearly less contrast than the table promises."""
+        median = np.median(self.promise_margins) if self.promise_margins else 0.0
+        return bool(median < -MISSED_DB)
 
 
 def diagnose(
@@ -205,7 +226,7 @@ def diagnose(
         tuple(explanations),
         removed,
         _cycles(rig, drives, dead),
-        plate_difference(rig, plate.responses(), match) if match.error <= MAX_FIT_ERROR else None,
+        plate_changes(rig, match) if match.error <= MAX_FIT_ERROR else None,
         observation.sensors,
         observation.frequencies,
         beyond if matches else None,

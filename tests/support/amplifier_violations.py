@@ -297,6 +297,8 @@ BROKEN: Broken = {
             .exchange(hand.COMMIT, (9, 6, 0), hand.status(levels=(7000, 0), **ABOVE))
             .rest(0.03)
             .says(levels=(10000, 0), **ABOVE)
+            .rest(0.11)
+            .says(levels=(10000, 0), **ABOVE)
         ),
     ),
     "plays_on_after_silence": (

@@ -296,7 +296,7 @@ async def _carry_out(check: Check, subject: Subject, level: float) -> None:
 
 async def _left(
     check: Check, client: Client, subject: Subject | None, level: float
-) -> Violation | None:
+) -> Finding | None:
     """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
     due = clock.now() + _RETRIED
     while subject is None or check.drives:
@@ -307,7 +307,7 @@ async def _left(
                 else:
                     await (greeted(client) if check.greets else identified(client, level))
             break
-        except Violation as found:
+        except (Violation, Late) as found:
             if clock.now() > due:
                 return found
     return None

@@ -106,10 +106,13 @@ _MAX_ATTEMPTS = 20  # of a check with all its cases, for which this machine was 
 _FEW = 3  # replies, which this machine does not make late by chance
 _MAX_WASTED = 20.0  # s; of a run, for attempts that came too late
 _LOOK = 0.005  # s; between looks whether this machine is late
-_STALLED = 0.1  # s; by which it is late where an amplifier on it is not judged by its silence
+# s; by which it is late where an amplifier on it is not judged by its silence, a few times, or ever
+_BUSY, _STALLED = 0.02, 0.1
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
+_AT_ONCE = 16  # addresses
+_SILENCE = 0.002  # s; between frames
 QUIET = 0.02  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 
@@ -166,8 +169,9 @@ class Client(ABC):
 
     neighbours, free: other addresses that reply, and the highest at which nothing does, once it has
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
-    times until a reply began. attempts: of this check that came too late; wasted: the time
-    [s] of all of the run. lag: by how much this machine was late since the check began, at most.
+    times until a reply began. attempts: of this check that came too late; mute: its requests
+    without a reply; wasted: the time [s] of all of the run. lag: by how much this machine was late
+    since the check began, at most.
     """
 
     kind: ClassVar[str]
@@ -197,7 +201,7 @@ class Client(ABC):
         self.timeout = REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()
-        self.free = self.attempts = 0
+        self.free = self.attempts = self.mute = 0
         self.fastest: dict[str, float] = {}
         self.reactions: dict[str, list[float]] = defaultdict(list)
         self.wasted = self.lag = 0.0
@@ -248,24 +252,39 @@ class Client(ABC):
     async def look_around(self) -> None:
         """Learn who else is on the line, by what only reads; once.
 
-        Every address is asked where a broadcast would reach it, else until one is free.
+        Every address is asked where a broadcast would reach it, else until one is free. Many are
+        asked at once, and each of them alone where anything is heard.
         """
         if self.free:
             return
-        wait = REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT
         addresses = [each for each in range(self.addresses, 0, -1) if each != self.address]
-        for address in addresses:
-            self.write(self.question(address))
-            found = await self.next(lambda each: True, wait)
-            if found is None and self.came and self.kind in ("serial", "rtu"):  # several at once
-                self._others.add(address)
-            if not (self.has_broadcasts or address in self._others):
+        for batch in in_batches(addresses, _AT_ONCE if self.has_broadcasts else 1):
+            is_heard = await self._is_heard(batch)
+            for each in batch if is_heard and self.is_shared else ():
+                if await self._is_heard([each]) and not self.heard:  # several at this address
+                    self._others.add(each)
+            if not (self.has_broadcasts or is_heard):
                 break
         await asyncio.sleep(self.quiet)  # in which a late one is heard
         self.heard.clear()
         self.free = next((each for each in addresses if each not in self._others), 0)
         expect(self.free > 0, "addresses without a reply", expected="one at least", seen="none")
         self.neighbours = self.neighbours or frozenset(self._others)
+
+    async def _is_heard(self, addresses: Sequence[int]) -> bool:
+        """Whether anything is heard once addresses were asked, one after the other."""
+        self.heard.clear()
+        self.came = b""
+        for each in addresses:
+            self.write(self.question(each))
+            await asyncio.sleep(_SILENCE + self.wire_time(0, 0))
+        await asyncio.sleep(REACTION + self.transit if self.has_broadcasts else GATEWAY_TIMEOUT)
+        return bool(self.heard or (self.came and self.is_shared))
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether replies of several amplifiers may collide."""
+        return self.kind in ("serial", "rtu")
 
     @property
     def slow_reply(self) -> str:
@@ -293,7 +312,7 @@ class Client(ABC):
                 await asyncio.sleep(_LOOK)
                 self.lag = max(self.lag, clock.now() - due)
 
-        self.attempts, self.lag = 0, 0.0
+        self.attempts, self.mute, self.lag = 0, 0, 0.0
         looking = asyncio.create_task(look(), name="how late this machine is")
         try:
             yield
@@ -304,15 +323,18 @@ class Client(ABC):
         """Note why the line was lost."""
         self.loss = cause
 
-    async def expect_silence(self, data: bytes, what: str) -> None:
-        """Send bytes, to which nothing must be heard."""
-        heard = await self.send(data)
-        expect(not heard, f"replies to {what}", expected="none", seen=len(heard))
+    async def expect_silence(self, data: bytes, what: str, *before: bytes) -> None:
+        """Send frames, data the last of them, to which nothing must be heard."""
+        heard = await self.send(data, *before)
+        expect(not heard, f"replies to {what}", expected="none", seen=heard)
 
-    async def send(self, data: bytes) -> list[Heard]:
-        """Send bytes; return what is heard until a reply must have come."""
+    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+        """Send frames, data the last; return what is heard until a reply must have come."""
         self.heard.clear()
         self.came = b""
+        for each in before:
+            self.write(each)
+            await asyncio.sleep(self.quiet / 4)  # also what ends a frame of Modbus RTU
         self.write(data)
         await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []
@@ -349,8 +371,10 @@ class Client(ABC):
         """Return the reply to what was sent; Violation where none comes."""
         before, self.lag = self.lag, 0.0
         found = await self.next(is_meant, self.timeout)
-        is_in_time, self.lag = self.lag <= _STALLED, max(self.lag, before)
+        is_in_time = self.lag <= (_BUSY if self.mute < _FEW else _STALLED)
+        self.lag = max(self.lag, before)
         if found is None:
+            self.mute += 1
             require_in_time(is_in_time, f"no reply came to {what}")
             others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
             raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
@@ -365,6 +389,11 @@ class Client(ABC):
         nak = read_as("Nak", read_nak, words, is_strict=True)
         expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")
         return Answer(nak.code, nak.channel, (), When(sent, came))
+
+
+def in_batches(rows: Sequence[_T], size: int) -> list[Sequence[_T]]:
+    """Cut rows into batches of a size, the last of which may be smaller."""
+    return [rows[at : at + size] for at in range(0, len(rows), size)]
 
 
 def altered(data: bytes, at: int) -> bytes:

@@ -14,7 +14,7 @@ from registry import clock
 
 _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_READINGS, _APART = 12, 0.03  # of one state; s between two at most
+_READINGS, _APART = 8, 0.03  # of one state; s between two at most
 _MAX_DURATION = 3.0  # s; in which a rate must show
 _SHIFTS = 1, 0x4000, 0xC001
 

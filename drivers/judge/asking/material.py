@@ -221,21 +221,22 @@ class Material:
         """Make the usual tone on all channels."""
         return layer(0, *map(self.tone, self.channels))
 
-    def transitions(self, ramp: int) -> list[list[LayerSet]]:
-        """Make layers that play one after the other, the last of which changes what plays."""
-        slow = self.envelope(0.1, 1, 1, 1)
-        begins, ends = self.one(self.tone(onset=slow)), self.one(self.tone(ending=slow))
-        other = self.tone(frequency=self.other)
+    def transitions(self, ramp: int) -> list[list[Send]]:
+        """Make sets one after the other, amid which layers rise, fade, begin, end and wait."""
+        slow = self.envelope(0.1, 0.25, 0.25, 0.25)
+        tones = [self.beside(number, 0.25) for number in range(4)]
+        begins = [replace(each, onset=slow) for each in tones]
+        ends = [replace(each, ending=slow) for each in tones]
+        other = self.beside(len(self.layers), 0.25)
+        others = [layer(number, self.beside(number, 0.05)) for number in self.layers[4:]]
+        changes = [
+            layer(0, tones[0], ramp=ramp, valid_for=60_000),
+            *(layer(1, ramp=ramp), layer(2, other, ramp=ramp), layer(3, tones[3], ramp=ramp)),
+        ]
+        shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
         return [
-            [self.one(ramp=ramp)],
-            [self.one(), layer(0, ramp=ramp)],
-            [self.one(), layer(0, other, ramp=ramp)],
-            [self.one(valid_for=60_000)],
-            [begins],
-            [ends],
-            [ends, layer(0)],
-            [begins, layer(0, other, after=True)],
-            [layer(number, self.tone(0, 0.2)) for number in self.layers],
+            [play(layer(1, tones[1]), layer(2, tones[2]), *others), play(*changes)],
+            [play(*shaped), play(layer(2), layer(3, other, after=True))],
         ]
 
     def envelope(self, step: float, *amplitudes: complex) -> Envelope:

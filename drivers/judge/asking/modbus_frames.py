@@ -169,10 +169,10 @@ class ModbusClient(Client):
             for at in (-2, -1, -4):
                 yield f"a wrong byte {at}", altered(frame, at)
 
-    async def send(self, data: bytes) -> list[Heard]:
-        """Send bytes; return what is heard until a reply must have come."""
+    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+        """Send frames, data the last; return what is heard until a reply must have come."""
         self._reader.end()
-        heard = await super().send(data)
+        heard = await super().send(data, *before)
         if self.is_rtu:
             await asyncio.sleep(QUIET)  # ends a frame that is not whole
         return heard
@@ -291,7 +291,7 @@ async def exceptions(subject: Subject) -> None:
         # On RTU the length of a frame follows from its function: of others it ends with a pause.
         if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
             continue
-        await subject.run([subject.ping, 0.02])
+        await subject.unfed()
         response, _ = await client.transact(pdu)
         expect_equal(response, bytes([pdu[0] | EXCEPTION, code]), f"response to {what}")
         await subject.request("GetStatus")

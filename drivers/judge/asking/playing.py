@@ -6,19 +6,21 @@ from dataclasses import replace
 from functools import partial
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import require, require_in_time
+from drivers.judge.asking.client import expect_equal, require, require_in_time
 from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.sets import Command, Envelope
+from drivers.protocol.table import has_flag
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
-_SHARES = 0.2, 0.25, 0.12  # of the test level, of the voices that are cut
+_SHARES = 0.41, 0.1, 0.06  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
+_AMID = 0.15  # s; in which a sum comes to its peak
 
 
 @driving(_SETS)
@@ -42,7 +44,7 @@ def layers_play_on(subject: Subject) -> Rows:
 def valid_for(subject: Subject) -> Rows:
     """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
     ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
-    half, pause = subject.one(level=0.5, valid_for=short), 0.15 * subject.slowness
+    half, pause = subject.one(level=0.5, valid_for=short), 0.12 * subject.slowness
     lasting = layer(1, subject.beside(1, 0.25), valid_for=60_000)
     several = play(half, lasting, layer(2, subject.beside(2, 0.25)))
     return [
@@ -64,7 +66,7 @@ def renew(subject: Subject) -> Rows:
     sooner = layer(0, renew=True, valid_for=subject.lasting(100))
     third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(120))
     return [
-        (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
+        (first, second, 0.05, layer(0, renew=True, valid_for=subject.lasting(200))),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
         (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.15 * subject.slowness),
         *((subject.one(valid_for=subject.lasting(before)), sooner) for before in (0, 400)),
@@ -122,7 +124,7 @@ def after_the_last_onset(subject: Subject) -> Rows:
 @driving(_SETS)
 def what_waits_for_an_onset(subject: Subject) -> Rows:
     """It plays what waited from its start: its own time, kept amplitudes, of several layers."""
-    long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(120)
+    long, short, lasts = subject.long_onset, subject.envelope(0.04, 1.0), subject.lasting(70)
     half = subject.one(subject.tone(0, 0.5, onset=long))
     other = layer(1, replace(subject.beside(1, 0.5), onset=subject.long_onset))
     kept = layer(0, subject.tone(0, 0.25, keep=True, onset=short), after=True)
@@ -149,9 +151,13 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
 @driving(_PLACE)
 def ramps(subject: Subject) -> Rows:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
-    whole, times = subject.whole(), {subject.ramp, 20, subject.can["ramp_max"]}
-    rises = [[replace(whole, ramp=time)] for time in times]
-    return [*rises, *([whole, layer(0, ramp=time)] for time in (subject.ramp, 20))]
+    whole, ramp_max = subject.whole(), subject.can["ramp_max"]
+    part = partial(subject.follow, 0.4 * ramp_max / 1000)
+    return [
+        *([replace(whole, ramp=time)] for time in {subject.ramp, 20}),
+        *([whole, layer(0, ramp=time)] for time in (subject.ramp, 20)),
+        [replace(whole, ramp=ramp_max), part, send("Silence", ramp=0)],
+    ]
 
 
 @driving(_PLACE)
@@ -197,7 +203,7 @@ def onsets(subject: Subject) -> Rows:
     """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
     subject.require_knots()
     shapes = [
-        subject.envelope(0.05, *fractions)
+        subject.envelope(0.04, *fractions)
         for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
     ]
     alone = [[subject.one(subject.tone(0, 0.5, 90.0, onset=shape))] for shape in shapes]
@@ -212,8 +218,8 @@ def endings(subject: Subject) -> Rows:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     subject.require_knots()
     last, ramp = len(subject.channels) - 1, subject.ramp
-    tone = subject.tone(last, ending=subject.envelope(0.04, 0.25, 0.75j, 0.5))
-    unshaped = replace(tone, ending=subject.envelope(0.1))
+    tone = subject.tone(last, ending=subject.envelope(0.03, 0.25, 0.75j, 0.5))
+    unshaped = replace(tone, ending=subject.envelope(0.07))
     first, quiet = layer(0, tone), subject.tone(last, 0.0)
     replaced = replace(quiet, onset=subject.envelope(0.1))
     return [
@@ -233,7 +239,8 @@ def endings(subject: Subject) -> Rows:
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     subject.require_knots()
-    knots = math.ceil(min(subject.exchange_time, 0.1) / 0.01)
+    slowest = min(subject.exchange_time, 0.1)
+    knots = 1 if subject.slowness == 1 else math.ceil(slowest / 0.01)
     onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
     half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
     over = [(knots + 1) * each.step / 10_000 + 0.02 for each in (onset, ending)]
@@ -269,13 +276,13 @@ async def phases(subject: Subject) -> None:
     """It counts phases on its clock: tones of one frequency interfere alike whenever they began."""
     await subject.arm()
     await subject.require_interference()
-    silent = play(layer(0), *map(layer, subject.layers[1:]))
     for channel in subject.channels:
         first = layer(0, subject.tone(channel, 0.5, 30.0))
         for number in subject.layers[1:]:
             other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
-            await subject.run([play(first, other), silent])
-    for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 1.75), (180.0, 0.5)):
+            silent = [layer(each) for each in subject.layers[1:] if each != number]
+            await subject.run([play(first, other, *silent)])
+    for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 0.75), (180.0, 0.5)):
         time = periods * 20 / max(subject.lowest, _SLOW)
         await subject.in_time(partial(_expect_alike, subject, phase, time))
     await subject.in_time(partial(_expect_cancelled, subject))
@@ -360,7 +367,13 @@ async def limited(subject: Subject) -> None:
         abs(subject.other - subject.frequency) >= subject.can["frequency_step"],
         "it has one frequency, whose tones interfere",
     )
+    last = subject.channels[-1]
     over = layer(1, subject.tone(frequency=subject.other))
-    near = layer(1, subject.tone(0, 1.0 / subject.level - 1.0, frequency=subject.other))
-    rows = near, over, layer(1), near, layer(1), over, layer(1)
-    await subject.run([subject.arm, subject.one(), *rows])
+    near, just = (layer(1, subject.tone(last, each / subject.level - 1.0)) for each in (1.0, 1.01))
+    shown = _AMID, over, _AMID, layer(1), near, _AMID
+    await subject.run([subject.arm, subject.whole(), near, *shown, just, _AMID, *shown])
+    for row in (over, layer(1)):  # unseen
+        await subject.play(row)
+        await asyncio.sleep(_AMID)
+    flags = await subject.request("GetStatus")
+    expect_equal(has_flag(flags.values, "limited"), True, "limited, by a sum that is over")

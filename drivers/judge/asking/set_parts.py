@@ -1,6 +1,5 @@
 """Checks of sets in parts: which are kept, what the last is told, and what a refused set drops."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -87,15 +86,10 @@ def parts_of_sets(subject: Subject) -> Rows:
     return [
         *(subject.arm, subject.one(), *in_turn(2, now=0), others, 0.05, *in_turn(4, now=1)),
         # Back to back, and what says `now` is the last part alone.
-        *(play(subject.one(), token=5), partial(_in_one_go, subject, at_once), back),
+        *(play(subject.one(), token=5), partial(subject.send_all, at_once), back),
         *(_with(each, token=7, now=1) for each in at_once[:-1]),
         *(_with(at_once[-1], token=7), _with(at_once[-1], token=7, now=1)),
     ]
-
-
-async def _in_one_go(subject: Subject, rows: Sequence[Send]) -> None:
-    for row in rows:
-        await subject.send(row)
 
 
 @driving(_PLACE)
@@ -189,7 +183,7 @@ def empty_sets(subject: Subject) -> Rows:
         *(subject.arm, one, empty_set, send("Commit", token=2)),
         *(_with(empty_set, token=3, now=1), 0.1),
         *(empty[0], _with(first, index=1, parts=4, stream=pack_layers([half])), empty[1]),
-        *(_with(last, index=3, parts=4, stream=[], now=1), partial(_in_one_go, subject, many)),
+        *(_with(last, index=3, parts=4, stream=[], now=1), partial(subject.send_all, many)),
     ]
 
 
@@ -208,14 +202,13 @@ def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=3)
-    shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)
+    part = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1)
     return [
-        # One that is confirmed once more lives no longer.
-        *(subject.arm, subject.one(), stage(subject.one()), shorter, stage(subject.one(), token=2)),
-        *(1.03 * STAGED_LIFE - shorter, send("Commit", token=2, code=_OLD)),
-        *(first, 0.55 * STAGED_LIFE),
+        *(subject.arm, subject.one(), first, part),
         *others,
-        *(last, 0.48 * STAGED_LIFE, send("Commit", token=3, code=_OLD), last),
+        # One that is confirmed once more lives no longer.
+        *(last, part, last, 1.03 * STAGED_LIFE - 2 * part),
+        *(send("Commit", token=3, code=_OLD), last),
         *others,
         *(0.55 * STAGED_LIFE, first, 0.48 * STAGED_LIFE, last),
     ]

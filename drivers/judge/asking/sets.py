@@ -6,7 +6,7 @@ from functools import partial
 from itertools import product
 
 from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_within, require
+from drivers.judge.asking.client import expect_within, in_batches, require
 from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.records import Values
@@ -15,6 +15,7 @@ from drivers.protocol.table import COMMAND, ENVELOPE, LAYER, QUANTITIES
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8
+_AT_ONCE = 6  # sets that are refused, before a look at the status
 _LEVEL, _PHASE = QUANTITIES["level"].maximum, QUANTITIES["phase"]
 _TONE = "frequency", "level", "phase"
 
@@ -195,14 +196,14 @@ def all_or_nothing(subject: Subject) -> Rows:
         for token, each in enumerate(_flawed_sets(subject), 2)
         for row in (
             replace(each, values={**each.values, "token": token, "now": token % 2}),
-            *([] if token % 2 else [send("Commit", token=token, code="BAD_TOKEN")]),
+            *([] if token % _AT_ONCE else [send("Commit", token=token, code="BAD_TOKEN")]),
         )
     ]
     last, silent = len(flawed) + 2, pack_layers([layer(0)])
     return [
         subject.arm,
         subject.one(),
-        *flawed,
+        *(partial(subject.send_all, each) for each in in_batches(flawed, _AT_ONCE)),
         play(subject.one(level=0.5), token=last),
         stage(subject.one(level=0.25)),
         _part(silent, "BAD_TOKEN", token=last - 1, now=1),

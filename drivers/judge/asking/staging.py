@@ -130,7 +130,7 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
     """It starts what waits before a newer Commit or *now*, and drops it with all that silences."""
     half = layer(1, subject.beside(1, 0.5))
     left = min(0.1 * subject.slowness, 0.4)
-    waits: Rows = [stage(subject.one(level=0.25)), partial(subject.commit_in, left)]
+    waiting = stage(subject.one(level=0.25))
     arm = send("Arm", watchdog=subject.can["watchdog_max"])
     first, *_ = subject.parts(half, token=2, now=0, count=3)
     ends: list[Rows] = [
@@ -145,7 +145,12 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [stage(half), send("Commit", token=3, code=_OLD)],
     ]
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
-    later = [waits[0], partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
+    later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
     # No status is read as it starts.
     unseen = stage(subject.one(ramp=subject.ramp)), partial(subject.commit_in, left)
-    return [*([*waits, *each, 1.25 * left] for each in ends), later, [*unseen, 1.25 * left]]
+    lefts = [left if len(each) > 1 else 0.6 * left for each in ends]
+    courses = [
+        [waiting, partial(subject.commit_in, each), *rows, 1.25 * each]
+        for rows, each in zip(ends, lefts, strict=True)
+    ]
+    return [*courses, later, [*unseen, 1.25 * left]]

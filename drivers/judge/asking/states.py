@@ -1,15 +1,17 @@
 """Checks of states (arming, sessions, Stop, Disarm, Silence, Clear) and of the watchdog."""
 
 import asyncio
+from dataclasses import replace
 from functools import partial
-from itertools import chain, cycle
+from itertools import cycle
 
 from drivers.judge.asking.check import driving
+from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import FAULTS, NO_CHANNEL, QUANTITIES
 from registry import clock
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
@@ -21,13 +23,23 @@ _ROUGH = 20  # steps of level
 @driving(_STATES)
 def plays_nothing_disarmed(subject: Subject) -> Rows:
     """It plays nothing before it is armed."""
-    return [
-        play(subject.one(), code=_WRONG),
-        stage(subject.one(), code=_WRONG),
-        send("Commit", token=1, code=_WRONG),
-        send("Silence", ramp=0, code=_WRONG),
-        subject.ping,
-    ]
+    return _unarmed(subject)
+
+
+def _unarmed(subject: Subject, ramp: int = 0) -> list[Row]:
+    """Make what is refused, or changes no state, unless it is armed; ramp: of a Disarm [ms]."""
+    one = subject.one(level=0.75)
+    others: list[Row] = [each(one, token=9, code=_WRONG) for each in (play, stage)]
+    refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=0, code=_WRONG)
+    return [*others, *refused, send("Ping", session=77), send("Disarm", ramp=ramp)]
+
+
+def _latched(subject: Subject) -> list[Row]:
+    """Make the same for an amplifier that is stopped or in a fault, which does not arm either."""
+    serial = subject.identity["serial_number"]
+    moves = [send("SetAddress", address=9, serial_number=serial, code=_WRONG)]
+    arm = send("Arm", watchdog=subject.can["watchdog_max"], session=77, code=_WRONG)
+    return [arm, *moves * subject.has("address"), *_unarmed(subject)]
 
 
 @driving(_STATES)
@@ -73,16 +85,19 @@ def sessions(subject: Subject) -> Rows:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
+    rows = (
+        play(quarter, token=3, code="WRONG_SESSION"),
+        send("Commit", token=2, code="WRONG_SESSION"),
+        send("Silence", ramp=0, code="WRONG_SESSION"),
+        send("Ping", code="WRONG_SESSION"),
+        send("Arm", watchdog=maximum, code="WRONG_SESSION"),
+    )
     others = [
-        request
-        for other in (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
-        for request in (
-            play(quarter, token=3, session=other, code="WRONG_SESSION"),
-            send("Commit", token=2, session=other, code="WRONG_SESSION"),
-            send("Silence", ramp=0, session=other, code="WRONG_SESSION"),
-            send("Ping", session=other, code="WRONG_SESSION"),
-            send("Arm", watchdog=maximum, session=other, code="WRONG_SESSION"),
+        partial(
+            subject.send_all,
+            [replace(each, values={**each.values, "session": other}) for each in rows],
         )
+        for other in (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
     ]
     return [
         subject.arm,
@@ -118,23 +133,21 @@ def stop(subject: Subject) -> Rows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
     return [
         *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
-        send("Arm", watchdog=subject.can["watchdog_max"], code=_WRONG),
-        *(send("Commit", token=2, code=_WRONG), play(subject.one(), code=_WRONG)),
-        *(send("Silence", ramp=0, code=_WRONG), send("Disarm", ramp=0), 0.1),
+        *(*_latched(subject), send("Commit", token=2, code=_WRONG), 0.1),
     ]
 
 
 @driving(_STATES)
 def stop_ramps(subject: Subject) -> Rows:
     """It falls silent along the ramp of Stop or Disarm, a raised cosine; the sooner of both."""
-    whole, refused = subject.whole(), play(subject.one(), code=_WRONG)
-    amid = partial(subject.follow, 0.35 * subject.slowness)
+    whole, fading = subject.whole(), _unarmed(subject, 0xFFFF)
+    amid = partial(subject.follow, 0.2 * subject.slowness)
     (stop, slowest_stop), (disarm, slowest_disarm) = (
         [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
     )
     return [
-        *((whole, stop), (whole, disarm, refused), (whole, slowest_stop, amid, disarm)),
-        (whole, slowest_disarm, refused, amid, stop),
+        *((whole, stop), (whole, disarm), (whole, slowest_stop, amid, disarm)),
+        (whole, slowest_disarm, *fading, subject.clear, amid, stop),
     ]
 
 
@@ -216,14 +229,11 @@ async def _trips(subject: Subject, time: float, *sets: Row) -> None:
 async def _trips_for_good(subject: Subject, time: int) -> None:
     """Have it trip after a time [ms]: it plays and arms no more until it is cleared."""
     await _trips(subject, time / 1000, subject.whole(), stage(subject.one(level=0.5)))
-    arm = partial(send, "Arm", watchdog=time)
     await subject.run(
         [
-            play(subject.one(), code=_WRONG),
-            *(0.05, send("Stop", ramp=0)),
-            arm(session=77, code=_WRONG),
+            *(*_latched(subject), 0.05, send("Stop", ramp=0)),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
-            *(send("Disarm", ramp=0), subject.clear, arm(code="WRONG_SESSION")),
+            *(subject.clear, send("Arm", watchdog=time, code="WRONG_SESSION")),
         ]
     )
 
@@ -247,7 +257,7 @@ async def trips_amid_fades(subject: Subject) -> None:
 async def watchdog_unread(subject: Subject) -> None:
     """It trips at its time though nothing is asked of it, and lists the fault with its age."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
-    await asyncio.sleep(subject.shown.watchdog + 0.1)
+    await asyncio.sleep(subject.shown.watchdog + 0.03)
     await subject.run([send("GetFaults")])
 
 
@@ -261,11 +271,11 @@ def what_feeds(subject: Subject) -> Rows:
         send("Set", **long),
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
-    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.05, feed))]
+    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.02, feed))]
 
 
 @driving(_SESSIONS)
-def what_does_not_feed(subject: Subject) -> Rows:
+async def what_does_not_feed(subject: Subject) -> None:
     """It is fed by nothing else: no reading, nothing that it refuses, no other session."""
     (part,) = subject.parts(subject.one(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
@@ -292,10 +302,13 @@ def what_does_not_feed(subject: Subject) -> Rows:
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
     collected: Rows = (send("Set", **first), 0.02, send("Commit", token=7, code="INCOMPLETE"))
-    rows: list[Rows] = [(subject.ping, 0.02, each) for each in idle]
     whole = [send("Set", **each) for each in subject.parts(*made, token=8, now=0, count=3)]
     staged: Rows = (*whole, 0.02, whole[0])  # which is dropped
-    return [partial(subject.arm, 0.5), subject.one(), *chain(*rows), *collected, *staged]
+    await subject.run([subject.arm, subject.one()])
+    for each in idle:
+        await subject.unfed()
+        await subject.run([each])
+    await subject.run([*collected, *staged])
 
 
 @driving(_SESSIONS)
@@ -315,8 +328,16 @@ async def trips_amid_other_requests(subject: Subject) -> None:
 
 
 @driving("protocol.md#messages")
-def fault_list(subject: Subject) -> Rows:
+async def fault_list(subject: Subject) -> None:
     """It lists faults, the newest first, by their ages, also after they were cleared."""
+
+    async def listed() -> list[tuple[int, int]]:
+        rows = (await subject.request("GetFaults"))["faults"]
+        return [(each["fault"], each["channel"]) for each in rows]
+
     trip = partial(_trips, subject, subject.shortest_watchdog / 1000, layer(0, subject.tone()))
-    listed = send("GetFaults")
-    return [trip, subject.clear, trip, subject.clear, listed, 0.1, listed]
+    before = [(FAULTS["WATCHDOG"], NO_CHANNEL)] * 2 + await listed()
+    stopped = send("Stop", ramp=0), subject.clear
+    await subject.run([trip, subject.clear, trip, subject.clear, *stopped, listed, 0.1])
+    found = await listed()
+    expect_equal(found, before[: max(len(found), 2)], "faults and channels that are listed")

@@ -35,6 +35,7 @@ from drivers.judge.asking.material import (
     send,
     stage,
 )
+from drivers.judge.outputs import SAMPLE
 from drivers.judge.states import OFF
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
 from drivers.protocol.records import Values
@@ -51,6 +52,7 @@ _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
+_MAX_UNFED, _UNFED = 0.1, 0.02  # of the watchdog; s before what must not feed
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
@@ -215,6 +217,7 @@ class Subject(Material):
         if "levels" in shown:
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
+        is_dated = self._is_dated(name, shown)
         answer = replace(answer, when=self._dated(name, values, shown, answer.when))
         if self.expected is not None:
             if name == "Set":
@@ -225,8 +228,16 @@ class Subject(Material):
                 is_exact = shown.get("exact", self.expected.sets.is_exact)
                 await self._learn_achieved(values["token"], is_exact=bool(is_exact))
             self.expected.granted(name, values, shown, answer.when)
+            if is_dated:  # what starts with the next sample may be shown by now
+                read = answer.when.latest - SAMPLE, answer.when.latest
+                self.expected.clock.check(shown["clock"], read)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(answer, values=shown)
+
+    def _is_dated(self, name: str, shown: Values) -> bool:
+        """Whether a reply shows the clock as it is."""
+        is_marked = name == "Mark" or (self.expected and self.expected.clock.is_marked)
+        return "clock" in shown and not is_marked
 
     def _dated(self, name: str, values: Values, shown: Values, when: When) -> When:
         """Return between which times a status was true, and its request carried out, by its clock.
@@ -235,7 +246,7 @@ class Subject(Material):
         """
         dating, judge = self.dating, self.expected
         between = dating.interval(when)
-        if "clock" not in shown or name == "Mark" or (judge and judge.clock.is_marked):
+        if not self._is_dated(name, shown):
             return between
         if name == "Arm" and not (
             judge and judge.is_enabled and judge.session == values["session"]
@@ -314,17 +325,25 @@ class Subject(Material):
         """Whether its watchdog is to be fed."""
         return self._since_fed > 0.25
 
+    async def unfed(self) -> None:
+        """Feed it where that is due, so that it was fed a while ago, and is not due soon."""
+        if self._since_fed > _MAX_UNFED:
+            await self.ping()
+        await asyncio.sleep(max(self.shown.fed[1] + _UNFED - clock.now(), 0.0))
+
     async def starve(self) -> None:
         """From now on the watchdog may expire."""
         self.is_starving = True
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""
+        is_armed = self.expected is not None and self.expected.is_enabled
         self.expected, self.dating, self._parts = None, Dating(), []
-        stopped = await self.settle(await self.request("Stop", ramp=0))
-        cleared = await self.request("Clear", latch=stopped["latch"])
-        expect_equal(cleared["state"], OFF, "state after Clear")
-        self.expected, self.is_at_rest = Judge(self.can, cleared.values, cleared.when), True
+        reply = await self.settle(await self.request("Disarm" if is_armed else "Stop", ramp=0))
+        if reply["state"] != OFF:
+            reply = await self.request("Clear", latch=reply["latch"])
+            expect_equal(reply["state"], OFF, "state after Clear")
+        self.expected, self.is_at_rest = Judge(self.can, reply.values, reply.when), True
 
     def require_alone(self) -> None:
         """Raise Optional where what is for all would reach other amplifiers."""
@@ -369,6 +388,11 @@ class Subject(Material):
         """Play a set at once."""
         return await self.send(play(*layers))
 
+    async def send_all(self, rows: Sequence[Send]) -> None:
+        """Send requests in one go, without a look at the status between."""
+        for row in rows:
+            await self.send(row)
+
     async def commit_in(self, duration: float) -> int:
         """Commit the staged set for a moment a time [s] ahead of the last status; return that."""
         at = self.moment(duration)
@@ -401,10 +425,15 @@ class Subject(Material):
         Lest an amplifier that is late has longer times. A line may delay more than is known of it,
         which a reading shows.
         """
-        count, fastest = self.client.transactions, self.client.fastest
-        read = min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
+        count, fastest, read = self.client.transactions, self.client.fastest, self._read_time
         slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
         return min(slowest, count * REACTION + max(self.client.transit, count * read))
+
+    @property
+    def _read_time(self) -> float:
+        """The shortest exchange [s] so far of a message that only reads."""
+        fastest = self.client.fastest
+        return min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
 
     @property
     def slowness(self) -> float:
@@ -418,13 +447,13 @@ class Subject(Material):
     @property
     def shortest_watchdog(self) -> int:
         """The shortest watchdog time [ms], or that in which it can be fed on a slow line."""
-        fed = math.ceil(10_000 * min(self.exchange_time, _SLOWEST))
+        fed = math.ceil(8_000 * min(self.exchange_time, _SLOWEST))
         return int(min(max(self.can["watchdog_min"], fed), self.can["watchdog_max"]))
 
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        required = max(100, math.ceil(8_000 * min(self.exchange_time, 0.1)))
+        required = max(100, math.ceil(6_000 * min(self.exchange_time, 0.1)))
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
@@ -478,10 +507,11 @@ class Subject(Material):
         began = self.shown.outputs.began
         end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
         end = end if duration is None else began[0] + duration
-        end = max(end, clock.now() + 2 * min(self.exchange_time, 1.0))  # of a slow line: a few
+        few = min(2 * self.exchange_time, 2.0)  # of a slow line
+        end = max(end, clock.now() + min(few, 3 * self._read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
-        while clock.now() < end:
+        while clock.now() < end + few * (seen < 2):
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)

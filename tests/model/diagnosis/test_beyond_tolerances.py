@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.causes import FAULTS, verdict_on
+from benchmarks.identification.hidden import draw
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
@@ -16,10 +17,19 @@ def rig() -> Rig:
 
 
 @pytest.mark.parametrize(
-    ("name", "seed"), [("none", 112), ("none", 113), ("none, with form errors and 3 g", 119)]
+    ("name", "seed"),
+    [
+        ("none", 112),
+        ("none", 113),
+        ("none, with form errors and 3 g", 119),
+        ("none, with form errors and 3 g", 404),
+    ],
 )
 def test_diagnose_passes_plates_within_tolerances(rig, name, seed):
-    """Dampers at 2.3 to 3.8 times what is written, of a spread by 1.5, and 3 g in one place."""
+    """Dampers at 2.3 to 3.8 times what is written, of a spread by 1.5, and 3 g in one place.
+
+    At last 10 mm from an edge.
+    """
     assert verdict_on(rig, name, seed).is_well
 
 
@@ -50,5 +60,15 @@ def test_diagnose_places_and_weighs_a_mass(rig):
     verdict = verdict_on(rig, "10 g", 2)
     beyond = as_json(verdict)["plate"]["beyond"]
     at = np.random.default_rng([2, 93]).uniform(0.1, 0.9, 2) * [0.3048, 0.2286]
-    assert beyond["mass_kg"] == pytest.approx(0.010, abs=1e-3)
-    assert np.hypot(beyond["x_m"] - at[0], beyond["y_m"] - at[1]) < 0.015
+    (load,) = beyond["loads"]
+    assert load["mass_kg"] == pytest.approx(0.010, abs=1e-3)
+    assert np.hypot(load["x_m"] - at[0], load["y_m"] - at[1]) < 0.015
+
+
+def test_diagnose_places_and_weighs_two_masses(rig):
+    """Twice 5 g, each within 1.5 g, and within a centimetre of where it lies."""
+    beyond = verdict_on(rig, "twice 5 g, with form errors", 401).beyond
+    assert beyond.kind == "mass"
+    for x, y, mass in draw("two", 401).mounted.masses.tolist():
+        (near,) = (each for each in beyond.loads if np.hypot(each.x - x, each.y - y) < 0.01)
+        assert near.mass == pytest.approx(mass, abs=1.5e-3)

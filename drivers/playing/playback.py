@@ -17,11 +17,12 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES
 
-__all__ = ["Playback", "Voice", "playback_of"]
+__all__ = ["LAYERS_MAX", "Playback", "Voice", "playback_of"]
 
+LAYERS_MAX = QUANTITIES["layer_count"].maximum
+"""Layers of an amplifier, at the most."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
-LAYERS_MAX = QUANTITIES["layer_count"].maximum
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 
 

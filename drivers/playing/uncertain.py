@@ -45,7 +45,7 @@ class UncertainPlayback:
         layers: of a set; None: all fall silent along a ramp [s].
         """
         changed = dict.fromkeys(range(LAYERS_MAX), False)
-        sooner = dict.fromkeys(range(LAYERS_MAX), ramp)  # of what falls silent: its end, from now on
+        sooner = dict.fromkeys(changed, ramp)  # of what falls silent: its end, from now on
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
             sooner = {one.layer: self._ends_after(one) for one in layers}

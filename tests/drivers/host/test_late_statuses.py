@@ -20,6 +20,13 @@ def delayed(end: MemoryLine, rng: random.Random) -> None:
     end.inward = end.outward = lambda name, data: [(rng.uniform(0.0, LATEST), data)]
 
 
+async def read(group: Group) -> None:
+    """Read two statuses of the amplifier, which show a contradiction each."""
+    for _ in range(2):
+        await asyncio.sleep(0.02)
+        await group.amplifiers["a"].read_status()
+
+
 @pytest.mark.parametrize("ends_by", ["a pulse", "its time", "what waited"])
 @in_virtual_time
 async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> None:
@@ -90,9 +97,7 @@ async def test_silence_without_a_reply_may_have_been_heard(
     await asyncio.sleep(0.02)
     end.far["a"].playback.silence(end.loop.time(), 0.0)
     with pytest.raises(CommandRefused, match="token of layer 0"):
-        for _ in range(3):
-            await host.read_status()
-            await asyncio.sleep(0.02)
+        await read(group)
 
 
 @pytest.mark.parametrize("what", ["token", "level"])
@@ -110,6 +115,4 @@ async def test_layer_that_is_dropped_is_found_where_statuses_are_late(what: str)
     else:
         playback.scale(now, 0.5, 0.0)
     with pytest.raises(CommandRefused, match=f"{what} of"):
-        for _ in range(2):
-            await asyncio.sleep(0.02)
-            await group.amplifiers["a"].read_status()
+        await read(group)

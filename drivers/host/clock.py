@@ -41,8 +41,7 @@ _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it w
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
-_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot
-_MAX_RATE = _FAST[1] + MAX_CLOCK_RATE  # of all together; a Ping can say 3.28e-3
+_FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
 _TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
 _NEAR = 20e-6  # s; or its error: what is led to zero
 _SURELY = 4.0  # standard errors
@@ -184,10 +183,12 @@ class HeldClock:
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
-        rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
+        led = 0.0
         for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
-            rate += min(max(-off / within, -highest), highest)
-        return round(min(max(rate, -_MAX_RATE), _MAX_RATE) * _PER_RATE)
+            led -= min(max(off / within, -highest), highest)
+        led = min(max(led, -_FAST[1]), _FAST[1])
+        crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
+        return round((led - crystal) * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""

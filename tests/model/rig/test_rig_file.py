@@ -132,7 +132,7 @@ def check_refusal(
         (23, "  level: 0.5\n" + MASS.replace("cam", "2nd"), "25 masses.2nd"),
         (23, "  level: 0.5\nplates: 2", "24 plates, plate"),
         (23, "  level: 0.5\nfingertip: 5", "24 fingertip"),
-        (23, "  level: 0.5\nfingertip: {mass: 1 g}", "24 fingertip.mass, contact_mass or phalanx_mass"),
+        (23, "  level: 0.5\nfingertip: {phalanx: 1 g}", "24 fingertip.phalanx, phalanx_mass"),
     ],
 )
 def test_load_rig_refuses_an_invalid_value_with_line_and_key(

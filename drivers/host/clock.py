@@ -177,10 +177,12 @@ class HeldClock:
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
-        rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
+        led = 0.0
         for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
-            rate += min(max(-off / within, -highest), highest)
-        return round(rate * _PER_RATE)
+            led -= min(max(off / within, -highest), highest)
+        led = min(max(led, -_FAST[1]), _FAST[1])
+        crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
+        return round((led - crystal) * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""

@@ -218,8 +218,8 @@ def _felt(
 ) -> tuple[float, list[tuple[float, str]]]:
     """Return the contrast of the worst finger, and of each finger its contrast and verdict.
 
-    What is short plays beside what lasts, one at a time, all other fingers quiet; the worst counts
-    what others have meanwhile. protected: None to play all contents, whatever they reach.
+    What is short plays beside what lasts, one at a time, all other fingers quiet. protected: None
+    to play all contents, whatever they reach.
     """
     lasting = [each for each in fingers if not each[1].is_short]
     short = [each for each in fingers if each[1].is_short]
@@ -240,8 +240,7 @@ def _felt(
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
         (predicted,) = chosen.beside(beside).predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
-        meanwhile = [each for part in beside for each in part.beside([chosen]).predictions]
-        worst = min(worst, *[each.promised_contrast_db or 0.0 for each in (predicted, *meanwhile)])
+        worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]
 
 

@@ -2,10 +2,10 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator, Strict, model_validator
+from pydantic import Strict, model_validator
 
 from controller.effects.region import Region
 from controller.play.intent import Band, Pulse, Target
@@ -31,21 +31,12 @@ MIN_DURATION = 0.020
 MAX_DURATION = 10.0
 
 
-def _level(value: object) -> object:
-    if value == NEIGHBOURS:
-        return NEIGHBOURS
-    try:
-        return DB_SL.read(value)
-    except ValueError as error:
-        raise ValueError(f"{error}; or {NEIGHBOURS}") from error
-
-
 Modulation: TypeAlias = (
     Annotated[float, Quantity(FREQUENCY, at_least=MIN_MODULATION, at_most=MAX_MODULATION)] | None
 )
 """How often a second a vibration comes and goes [Hz]; None for a steady one."""
 
-Level: TypeAlias = Annotated[float | Literal["neighbours"], BeforeValidator(_level)]
+Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=NEIGHBOURS)]
 """dB above the detection threshold, or `neighbours`."""
 
 

@@ -19,6 +19,7 @@ what they state. One is held to the host's, and the others to it.
 """
 
 import math
+from statistics import median_low
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
@@ -30,10 +31,12 @@ WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""
 _PARTS, _MIN_PART = 32, 2.0**-8  # of what was read, lowest ones are kept; s of each, or twice that
 _MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal bends
+_AGREEING = 3  # Marks at least: of two none tells which is false
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
 _EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
+_MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or runs backwards
 _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
@@ -156,8 +159,11 @@ class HeldClock:
             return "clock_jumped"
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
-        is_off = abs(self._line.rate) - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
-        return "clock_rate" if is_off and len(self._lowest) > _PARTS // 2 else None
+        rate = abs(self._line.rate)
+        is_off = rate - _SURELY * self._line.rate_error > MAX_CLOCK_RATE
+        if not is_off or len(self._lowest) <= _PARTS // 2:
+            return None
+        return "clock_rate" if rate < _MAX_CRYSTAL else "clock_jumped"
 
     def shift(self, time: float) -> int:
         """Return the shift of an Arm that is sent at a time [s]."""
@@ -177,10 +183,12 @@ class HeldClock:
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
-        rate = -min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)  # of the crystal
+        led = 0.0
         for off, (within, highest) in ((common, _TOGETHER), (own, _GENTLE if is_gentle else _FAST)):
-            rate += min(max(-off / within, -highest), highest)
-        return round(rate * _PER_RATE)
+            led -= min(max(off / within, -highest), highest)
+        led = min(max(led, -_FAST[1]), _FAST[1])
+        crystal = min(max(line.rate, -MAX_CLOCK_RATE), MAX_CLOCK_RATE)
+        return round((led - crystal) * _PER_RATE)
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
@@ -272,13 +280,22 @@ class HeldClock:
     def _compare(self, time: float, lead: float) -> None:
         """Note a Mark, and lay a line through what it differs by from the other clock.
 
-        What is likely of two crystals counts as if it were measured, too.
+        What is likely of two crystals counts as if it were measured, too. Marks that most others
+        contradict do not count.
         """
         self._marked = {at: each for at, each in self._marked.items() if time - at <= _MARKED}
         self._marked[time] = lead
         others = {} if self._other is None else self._other._marked
         both = [(at, each - others[at]) for at, each in self._marked.items() if at in others]
-        if not both:
+        # Where a Mark or the reply that showed it was lost the present clock is shown: by median.
+        rate, near = self._beside.rate, _NEAR + 2 * self.stated / _PER_ERROR
+        level, middle = median_low([(each - rate * at, at) for at, each in both] or [(0.0, time)])
+        both = [
+            (at, each)
+            for at, each in both
+            if abs(each - rate * at - level) <= near + MAX_CLOCK_RATE * abs(at - middle)
+        ]
+        if len(both) < _AGREEING:
             return
         newest, count = both[-1][0], len(both)
         middle = sum([newest - at for at, _ in both]) / count

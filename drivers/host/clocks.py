@@ -11,12 +11,12 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
-from operator import attrgetter
 from statistics import median
 from typing import Any
 
 from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
+from drivers.host.clock import HeldClock
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members
@@ -41,6 +41,7 @@ class Clocks:
         self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
         self._turns: dict[Line, Iterator[Amplifier]] = {}
         self._marked: set[Line] = set()  # all on which know Mark, and are several
+        self._firsts: dict[Line, HeldClock | None] = {}  # to which the others of a line are held
 
     def follow(self) -> None:
         """Know all from now on: one alone, or by which lines and amplifiers they differ."""
@@ -85,7 +86,7 @@ class Clocks:
     async def settle(self) -> None:
         """Read clocks that are known poorly time and again, before anything plays: it costs none.
 
-        No more once one does not reply.
+        No more once one does not reply, or a stop or disarm has come.
         """
         every = self._amplifiers.values()
         lines = {each.line for each in every if not each.clock.is_alone}
@@ -103,6 +104,7 @@ class Clocks:
             for each in self._amplifiers.values()
             if each.line is line and each.clock.can_be_steered
         ]
+        before = self._members.epoch
         while (now := line.time()) < until:
             if max([each.clock.scatter(now) for each in of_line], default=0.0) <= _GOOD:
                 break
@@ -110,13 +112,23 @@ class Clocks:
                 self._compare(of_line, now)
                 await line.submit(None, Priority.READING, "Mark", {})
             for each in of_line:
+                if line.time() >= until or self._members.epoch != before:
+                    return
                 await each.read_status(Priority.READING)
                 await asyncio.sleep(self.later())
 
     def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
-        """Hold clocks of a line to the first one that can be trusted."""
-        ordered = sorted(of_line, key=attrgetter("address"))
-        first = next((each.clock for each in ordered if each.clock.error(now) < math.inf), None)
+        """Hold clocks of a line to one as long as nothing ails it, else to the best known."""
+        line = of_line[0].line
+        before = self._firsts.get(line)
+
+        def rank(one: HeldClock) -> tuple[bool, bool, bool, float]:
+            # One that has jumped is led back by itself: no other follows it.
+            error = one.error(now)
+            return error == math.inf, one.problem(now) is not None, one is not before, error
+
+        best = min([each.clock for each in of_line], key=rank)
+        first = self._firsts[line] = best if best.error(now) < math.inf else None
         for each in of_line:
             each.clock.compare(None if each.clock is first else first)
 

@@ -315,7 +315,9 @@ class Dialogue:
             self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
         elif name in _SILENCING:
             self._admitted = None
-            self.played_at = now if name == "Silence" else self.played_at
+            if name == "Silence" and self._ledger is not None:
+                self.played_at = now
+                self._ledger.may_be_silent.update(range(self.capabilities["layers"]))
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:

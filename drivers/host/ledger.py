@@ -72,6 +72,9 @@ class Ledger:
         self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self._starts, self._start_error = -math.inf, 0.0  # s; the moment of the last commit
+        self._advanced_to = -math.inf  # s; what was due by then was carried out
+        self.may_be_silent = set[int]()
+        """Layers that may be silent: by a silence without a reply, or a renewal that was late."""
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""
         self._first_sent = 0, 0.0  # token of the last set, and when [s] its first commit went out
@@ -164,8 +167,11 @@ class Ledger:
         if playback.next_due - 2 * self.lag <= now:
             for one in layers:
                 ends = playback.end_of(one.layer)
-                if not one.renew and sent_at < ends and ends - 2 * self.lag <= now:
-                    playback.add_ends(one.layer, sent_at)
+                if sent_at < ends and ends - 2 * self.lag <= now:
+                    if one.renew:
+                        self.may_be_silent.add(one.layer)
+                    else:
+                        playback.add_ends(one.layer, sent_at)
         playback.commit(layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
@@ -183,7 +189,7 @@ class Ledger:
 
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
-        self.doubt = None
+        self.doubt, self.may_be_silent = None, set()
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
         if not self._budget.is_unlimited:
@@ -195,37 +201,38 @@ class Ledger:
         sent_at, now [s]: of the request and its reply. Levels of voices that change are bounded
         from above alone: their commit is known as an interval.
         """
-        playback = self.playback
-        if sent_at < self._starts + self._start_error:  # it may show what played before
+        playback, late = self.playback, sent_at - self.lag
+        # It may show what played before.
+        if sent_at < self._starts + self._start_error or late < self._advanced_to:
             return None
-        if now - self.lag >= playback.changes_at:
-            playback.advance(now - self.lag)
+        self._advance(late)
         if len(status["levels"]) != playback.channels:
             return f"levels must be {playback.channels}, got {len(status['levels'])}"
         if len(status["tokens"]) != self.capabilities["layers"]:
             return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
-        is_steady, unsure = playback.next_due - 2 * self.lag > now, set[int]()
-        if not is_steady:  # a layer may have ended, or started what waits, or not yet
-            unsure = {layer for due, layer in playback.dues if due - 2 * self.lag <= now}
+        unsure, by = {*self.may_be_silent}, now + 2 * self.lag
+        if playback.changes_at <= by:  # a layer may have ended, or started what waits, or not yet
+            unsure |= playback.unsure(by)
         expected = playback.tokens
         for layer, token in enumerate(status["tokens"]):
             if token != expected.get(layer, 0) and not (
                 layer in unsure and token in playback.next_tokens(layer)
             ):
                 return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
-        late, tolerance = sent_at - self.lag, _STEPS * max(self.capabilities["level_step"], 1)
+        tolerance = _STEPS * max(self.capabilities["level_step"], 1)
         for channel, level in enumerate(status["levels"]):
-            highest, is_settled = 0.0, is_steady
+            highest, is_settled = 0.0, not unsure
             for voice in playback.all_voices[channel]:
                 transition = voice.transition
-                if transition.end <= late:
+                if voice.layer in unsure and not voice.has_ended:
+                    highest += voice.peak(late)
+                elif transition.end <= late:
                     highest += abs(transition.last)
-                    continue
-                is_settled = False
-                if transition.knots:
-                    highest += transition.peak(late)
                 else:
-                    highest += max(abs(transition.first), abs(transition.last))
+                    is_settled, highest = False, highest + transition.peak(late)
+            for one in playback.waiting if unsure else ():
+                tones = [each for each in one.commands if each.channel == channel]
+                highest += sum([each.peak for each in tones]) / _LEVEL.per_unit
             high = round(min(highest, 1.0) * _LEVEL.per_unit)
             if is_settled and high - tolerance <= level <= high + tolerance:  # nearly always
                 continue
@@ -239,6 +246,12 @@ class Ledger:
             if not low - tolerance <= level <= high + tolerance:
                 return f"level of channel {channel} must be {low} to {high} (1e-4), got {level}"
         return None
+
+    def _advance(self, time: float) -> None:
+        """Carry out what is due by a time [s]."""
+        if time >= self.playback.changes_at:
+            self.playback.advance(time)
+            self._advanced_to = time
 
     def _silence(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
@@ -260,8 +273,7 @@ class Ledger:
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
         late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
-        if late >= self.playback.changes_at:
-            self.playback.advance(late)
+        self._advance(late)
         if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
             return
         refusal = self._refusal_of_sums(layers, late, until)

@@ -10,14 +10,17 @@ import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 from drivers.playing.voices import Voice, cut_to, voices_after
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES
 
-__all__ = ["Playback", "Voice", "playback_of"]
+__all__ = ["LAYERS_MAX", "Playback", "Voice", "playback_of"]
 
+LAYERS_MAX = QUANTITIES["layer_count"].maximum
+"""Layers of an amplifier, at the most."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
@@ -223,6 +226,18 @@ class Playback:
         known = self._layers.get(layer)
         waiting = () if known is None or known.waiting is None else known.waiting[2:]
         return {0, self.tokens.get(layer, 0), *waiting}
+
+    def unsure(self, by: float, half: Sequence[float] = (0.0,) * LAYERS_MAX) -> set[int]:
+        """Return the layers that end, or start what waits, by a time [s].
+
+        half [s]: by how much sooner each may, for transitions by that of their own.
+        """
+        unsure = {layer for due, layer in self.dues if due - half[layer] <= by}
+        for voice in chain.from_iterable(self.all_voices):
+            way = voice.transition
+            if not (way.last or voice.has_ended) and way.end - way.half <= by:
+                unsure.add(voice.layer)
+        return unsure
 
     @property
     def silent_from(self) -> float:

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from itertools import chain
 from typing import TypeAlias
 
-from drivers.playing.playback import Playback
-from drivers.playing.voices import Transition, Voice, amplitude_of, peak_of
+from drivers.playing.playback import LAYERS_MAX, Playback
+from drivers.playing.voices import Transition, Voice
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
 
 Interval: TypeAlias = tuple[float, float]
-_LAYERS = QUANTITIES["layer_count"].maximum
+_PER_LEVEL = QUANTITIES["level"].per_unit
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 
 
@@ -27,7 +27,7 @@ class UncertainPlayback:
 
     def __init__(self, playback: Playback) -> None:
         self.playback = playback
-        self.half = [0.0] * _LAYERS
+        self.half = [0.0] * LAYERS_MAX
         # Channels of transitions that are gone, and until when [s] they may still play.
         self._ghosts: list[tuple[int, Transition, float]] = []
 
@@ -44,8 +44,8 @@ class UncertainPlayback:
 
         layers: of a set; None: all fall silent along a ramp [s].
         """
-        changed = dict.fromkeys(range(_LAYERS), False)
-        sooner = dict.fromkeys(range(_LAYERS), ramp)  # of what falls silent: its end, from now on
+        changed = dict.fromkeys(range(LAYERS_MAX), False)
+        sooner = dict.fromkeys(changed, ramp)  # of what falls silent: its end, from now on
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
             sooner = {one.layer: self._ends_after(one) for one in layers}
@@ -109,12 +109,7 @@ class UncertainPlayback:
     def unsure(self, start: float, end: float) -> set[int]:
         """Return the layers that may end or start by themselves about between two times."""
         self.advance(start)
-        unsure = {layer for due, layer in self.playback.dues if due - self.half[layer] <= end}
-        for voice in chain.from_iterable(self.playback.all_voices):
-            way = voice.transition
-            if not (way.last or voice.has_ended) and way.end - way.half <= end:
-                unsure.add(voice.layer)
-        return unsure
+        return self.playback.unsure(end, self.half)
 
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
         """Note by how much every transition that is new may differ."""
@@ -148,8 +143,7 @@ class UncertainPlayback:
         for one in self.playback.waiting:
             tones = [each for each in one.commands if each.channel == channel]
             for tone in tones if one.layer in unsure else ():
-                peak = max(peak_of(tone.onset), peak_of(tone.ending))
-                extra += max(abs(amplitude_of(tone.level, 0)), peak)
+                extra += tone.peak / _PER_LEVEL
         groups: dict[float, list[Transition]] = {}
         for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:

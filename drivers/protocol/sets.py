@@ -95,6 +95,12 @@ class Command:
         """Whether it starts or continues a tone; an onset may lead to level 0."""
         return self.level > 0 or self.onset is not None
 
+    @property
+    def peak(self) -> int:
+        """The highest level that it has, its onset and ending included."""
+        shapes = [each for each in (self.onset, self.ending) if each is not None]
+        return max(self.level, *(each.peak for each in shapes)) if shapes else self.level
+
 
 @dataclass(frozen=True, slots=True)
 class LayerSet:

@@ -232,14 +232,16 @@ class RingingUnderFingers:
 
         Tones with these have together the energy of the drive on any plate (Parseval), but for what
         its ramps excite far beside: of a duration T along raised cosines of r the amplitude is
-        sinc(f T) cos(pi f r) / (1 - 4 f² r²). Above the threshold at its own frequency.
+        sinc(f T) cos(pi f r) / (1 - 4 f² r²), each for what is nearest to it. Above the threshold
+        at its own frequency.
         """
         table, ramp = self.table, self.ramp
         off = table.frequencies - table.frequencies[row]
         rows = np.flatnonzero(np.abs(off) * self.duration < _BESIDE)
         off = off[rows]
         edges = np.sinc(off * ramp - 0.5) + np.sinc(off * ramp + 0.5)
-        amplitudes = np.sinc(off * self.duration) * edges
+        widths = np.gradient(table.frequencies)[rows] if len(table.frequencies) > 1 else 1.0
+        amplitudes = np.sinc(off * self.duration) * edges * np.sqrt(widths)
         thresholds = table.thresholds[rows] / table.thresholds[row]
         return rows, thresholds * amplitudes / np.linalg.norm(amplitudes)
 

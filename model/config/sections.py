@@ -31,7 +31,8 @@ PartT = TypeVar("PartT", bound=Section)
 class Quantity:
     """Annotation of a float field written with a unit or in SI; bounds in SI.
 
-    above and below exclude the bound, at_least and at_most include it.
+    above and below exclude the bound, at_least and at_most include it. word: what may stand in
+    place of a number, and is kept as it is.
     """
 
     dimension: Dimension
@@ -39,6 +40,7 @@ class Quantity:
     at_least: float = -float("inf")
     at_most: float = float("inf")
     below: float = float("inf")
+    word: str = ""
 
     def read(self, value: object) -> float:
         """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
@@ -61,7 +63,15 @@ class Quantity:
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(self.read)
+        return core_schema.no_info_plain_validator_function(self._read_or_word)
+
+    def _read_or_word(self, value: object) -> float | str:
+        if self.word and value == self.word:
+            return self.word
+        try:
+            return self.read(value)
+        except ValueError as error:
+            raise ValueError(f"{error}; or {self.word}" if self.word else str(error)) from error
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: object) -> dict[str, Any]:
         unit = self.dimension.unit or "no unit"

@@ -3,7 +3,7 @@
 Bounds are wide: they catch values in the wrong unit.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -70,6 +70,24 @@ class _MaterialByName:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
+
+
+class _OrNone:
+    """Annotation of a section in place of which `none` may stand: pydantic names both in errors."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        section = handler.generate_schema(get_args(source)[0])
+        return core_schema.no_info_wrap_validator_function(self._read, section)
+
+    def _read(self, value: object, section: core_schema.ValidatorFunctionWrapHandler) -> object:
+        return value if value == "none" else section(value)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), {"const": "none"}]}
 
 
 class MaterialSection(Section):
@@ -273,9 +291,9 @@ class AmplifierSection(Section):
     full_level: Literal["motion", "output"] = "motion"
     """What it plays at level 1."""
 
-    clock_error: (
-        Annotated[float, Quantity(TIME, at_least=0, at_most=0.001)] | Literal["unknown"]
-    ) = 5e-6
+    clock_error: Annotated[
+        float | Literal["unknown"], Quantity(TIME, at_least=0, at_most=0.001, word="unknown")
+    ] = 5e-6
     """By which its clock may be wrong, for `era config check`; once connected it states it itself.
 
     Limits: 0 to 1 ms, or `unknown` for a clock that cannot be steered
@@ -426,7 +444,7 @@ class RigSection(Section):
     uncertainty: UncertaintySection = UncertaintySection()
     """How well the rig is known, see [uncertainty](#uncertainty)."""
 
-    fingertip: FingertipSection | Literal["none"] = FingertipSection()
+    fingertip: Annotated[FingertipSection | Literal["none"], _OrNone()] = FingertipSection()
     """Load of each finger on the plate, see [fingertip](#fingertip); `none` for weightless ones.
 
     Limits: a mapping, or `none`

@@ -26,7 +26,6 @@ from drivers.protocol.table import (
     name_of,
 )
 from drivers.wires.can_bus.canopen import CANOPEN, cob_id
-from drivers.wires.can_bus.frames import segments
 from registry import clock
 
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127

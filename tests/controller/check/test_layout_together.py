@@ -127,7 +127,7 @@ def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effec
     contacts, player = fingers_at(found.at), EffectPlayer(changed)
     promised = promised_by_the_loop(contacts, player.intent(contacts, 0.0))
     assert found.contrasts[0] == pytest.approx(promised[0], abs=0.3)
-    assert found.worst_db <= min(promised) + 0.3
+    assert promised[1] <= found.contrasts[1] + 0.3  # less while a click plays
 
 
 def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:

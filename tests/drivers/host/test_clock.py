@@ -320,6 +320,22 @@ def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
         assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
 
 
+def mark(talks: list[Exchanges], count: int, late: Callable[[], float]) -> None:
+    """Have clocks keep the same byte of Marks, each 54 ms, and show it."""
+    for _ in range(count):
+        after = late()
+        for talk in talks:
+            talk.send("GetStatus")
+            talk.now += 0.05
+            talk.held.sent("Mark", {}, talk.now, talk.now)
+            talk.counter.go(talk.now + after)
+            marked = talk.counter.word
+            talk.now += 2e-3
+            talk.held.sent("GetStatus", {}, talk.now, talk.now)
+            status = {"state": talk.state, "clock": marked}
+            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
+
+
 def test_clocks_of_a_line_are_compared_by_marks() -> None:
     """Two behind one line: a Mark is as late for both, by 0.2 to 0.7 ms; other requests are not.
 
@@ -331,19 +347,38 @@ def test_clocks_of_a_line_are_compared_by_marks() -> None:
         talk.run(1.0)
         talks.append(talk)
     talks[1].held.compare(talks[0].held)
-    for _ in range(6):
-        late = 0.2e-3 + rng.uniform(0.0, 0.5e-3)
-        for talk in talks:
-            talk.send("GetStatus")
-            talk.now += 0.05
-            talk.held.sent("Mark", {}, talk.now, talk.now)
-            talk.counter.go(talk.now + late)
-            marked = talk.counter.word
-            talk.now += 2e-3
-            talk.held.sent("GetStatus", {}, talk.now, talk.now)
-            status = {"state": OFF, "clock": marked}
-            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
+    mark(talks, 6, lambda: 0.2e-3 + rng.uniform(0.0, 0.5e-3))
     for talk in talks:
         talk.counter.go(talk.now)
     seen = talks[0].held.lead(talks[0].now) - talks[1].held.lead(talks[1].now)
     assert seen == pytest.approx(talks[0].counter.lead - talks[1].counter.lead, abs=0.1e-6)
+
+
+def test_no_rate_is_more_than_a_ping_can_say() -> None:
+    """1.2 ms ahead of one that is 0.3 ms ahead, each 200 ppm fast: 3.5e-3 in all, 3.28e-3 go."""
+    talks = [Exchanges(Counter(200e-6)) for _ in range(2)]
+    for talk, ahead in zip(talks, (0.3e-3, 1.5e-3), strict=True):
+        talk.counter.shown += ahead
+        talk.run(1.0)
+        talk.send("Arm", shift=0)
+    talks[0].held.compare(None)
+    talks[1].held.compare(talks[0].held)
+    mark(talks, 4, lambda: 0.0)
+    assert talks[1].held.is_compared
+    assert -32768 <= talks[1].held.rate(talks[1].now, is_playing=False) < -25000
+
+
+def test_clocks_are_compared_once_three_marks_agree() -> None:
+    """One of which a Mark was not heard shows the present clock, 2 ms later: of two none tells."""
+    talks = [Exchanges(Counter()) for _ in range(2)]
+    for talk in talks:
+        talk.run(1.0)
+    talks[1].held.compare(talks[0].held)
+    mark(talks, 1, lambda: 0.0)
+    talks[1].counter.shown += 2e-3
+    mark(talks, 1, lambda: 0.0)
+    talks[1].counter.shown -= 2e-3
+    assert not talks[1].held.is_compared
+    mark(talks, 2, lambda: 0.0)
+    assert talks[1].held.is_compared
+    assert abs(talks[1].held.lead(talks[1].now)) < 1e-6

@@ -349,7 +349,10 @@ CLOCKS: dict[str, tuple[type[AmplifierClock], float, float]] = {
 async def test_clock_that_lies_costs_promise_and_stops_nothing(
     lie: str, lines: tuple[str, ...]
 ) -> None:
-    """It is said, its error is no longer known, and sets go on for 5 s."""
+    """It is said, its error is no longer known, and sets go on for 5 s.
+
+    One that stands still or runs backwards is too slow as well, as long as nothing plays.
+    """
     kind, ahead, jump = CLOCKS[lie]
     ends = [MemoryLine("serial", *names) for names in lines]
     far = ends[0].far["a"]
@@ -366,7 +369,8 @@ async def test_clock_that_lies_costs_promise_and_stops_nothing(
             await group.apply({name: [Layer(beat % 3, tones, 0.001)] for name in group.amplifiers})
         await asyncio.sleep(0.05)
         await group.beat()
-    (said,) = set(group.amplifiers["a"].reported_at) - {"clock_unsettled"}
+    too_slow = {"clock_rate"} if kind in (Still, Backwards) else set()
+    (said,) = set(group.amplifiers["a"].reported_at) - {"clock_unsettled"} - too_slow
     assert said == ("clock_not_steered" if "not steered" in lie else "clock_jumped")
     assert group.clock_errors["a"] > 0.1
     await stops_truthfully(group, ends[0])

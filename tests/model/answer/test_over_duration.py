@@ -20,6 +20,7 @@ from model.answer.plan import answer, query
 from model.ensemble.draws import JUDGING_DRAWS
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
+from model.table.build import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration.excitation import Excitation, Tone, base_amplitudes
@@ -205,6 +206,17 @@ def test_spectrum_has_the_energy_of_the_plate_in_time() -> None:
     threshold = detection_threshold(np.array(frequency), table.threshold)
     expected = 2 * squares / (duration - ramp / 4) / threshold**2
     assert 10 * np.log10(energies) == pytest.approx(10 * np.log10(expected), abs=0.5)
+
+
+def test_spectrum_counts_as_much_where_a_table_has_more_frequencies() -> None:
+    """It is even: half of what is beside 210 Hz is above it, in steps of 2 Hz from 230 Hz on."""
+    frequencies = np.array([*range(60, 230, 10), *range(230, 342, 2)], dtype=float)
+    table, row = build_table(smooth_rig(), frequencies=frequencies), 15
+    ringing = RingingUnderFingers(table, (TARGET,), (), 0.02, pulse_ramp(0.02))
+    rows, factors = ringing.spectrum(row)
+    energies = (factors * table.thresholds[row] / table.thresholds[rows]) ** 2
+    beside = energies[rows > row].sum() / energies[rows != row].sum()
+    assert beside == pytest.approx(0.5, abs=0.02)
 
 
 def test_other_plates_are_felt_by_their_energy() -> None:

@@ -214,7 +214,7 @@ def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
     assert check(example_rig_path()) == (0, [], [])
     links = EXAMPLE.replace(
         'main: {url: "sim://"}',
-        "main: {url: 'serial:///dev/ttyUSB0'}\n  two: {url: 'can+python-can://virtual/v#1'}",
+        "main: {url: 'serial:///dev/ttyUSB0'}\n  two: {url: 'serial:///dev/ttyUSB1'}",
     ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
     status, errors, (warning,) = check(tmp_path / "rig.yaml", links)
     assert (status, errors) == (0, [])

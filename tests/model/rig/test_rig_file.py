@@ -119,6 +119,7 @@ def check_refusal(
         (13, "    channel: 0.5", "13 eras.SW.channel"),
         (13, "    channel: '0'", "13 eras.SW.channel"),
         (20, "  main: sim://", "20 amplifiers.main"),
+        (20, '  main: {url: "sim://", clock_error: 2 ms}', "20 amplifiers.main.clock_error"),
         (22, "  frequency: [0, 500]", "22 limits.frequency[0]"),
         (22, "  frequency: [40, 500 rpm]", "22 limits.frequency[1]"),
         (23, "  level: .nan", "23 limits.level"),
@@ -130,6 +131,8 @@ def check_refusal(
         (23, "  level: 0.5\n" + MASS.replace("\n    mass: 5 g", ""), "25 masses.cam.mass"),
         (23, "  level: 0.5\n" + MASS.replace("cam", "2nd"), "25 masses.2nd"),
         (23, "  level: 0.5\nplates: 2", "24 plates, plate"),
+        (23, "  level: 0.5\nfingertip: 5", "24 fingertip"),
+        (23, "  level: 0.5\nfingertip: {phalanx: 1 g}", "24 fingertip.phalanx, phalanx_mass"),
     ],
 )
 def test_load_rig_refuses_an_invalid_value_with_line_and_key(

@@ -328,8 +328,8 @@ async def pieces(subject: Subject) -> None:
     whole, broken = frame(), bytearray(frame())
     broken[6] = 200  # bytes that would follow
     cases = [(whole[:5], pause, whole[5:], [whole])]
-    begun = (whole[:2], whole[:7], whole[:-1], bytes(broken)) if client.is_rtu else (whole[:7],)
-    cases += [(each, 1.2 * limit, last, [last]) for each in begun for last in [frame()]]
+    halves = (whole[:2], whole[:7], whole[:-1], bytes(broken)) if client.is_rtu else (whole[:7],)
+    cases += [(each, 1.2 * limit, last, [last]) for each in halves for last in [frame()]]
     both = [frame(), frame()]
     cases += [(b"", 0.0, b"".join(both), both)] * (not client.is_rtu)
     for first, wait, second, frames in cases:

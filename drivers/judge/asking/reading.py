@@ -290,8 +290,10 @@ async def broadcasts(subject: Subject) -> None:
     at = subject.moment(0.1 * subject.slowness)
     commit = partial(obey, "Commit", token=subject.token, at=at)
     await subject.run([commit, subject.follow, commit, subject.starve])
-    begun = client.request(MESSAGES["Commit"].number, _shortest("Commit"), to=0)
-    half = () if client.kind == "rtu" else (begun[: len(begun) // 2],)  # a frame of two on CAN
+    commit_all = client.request(MESSAGES["Commit"].number, _shortest("Commit"), to=0)
+    half = (
+        () if client.kind == "rtu" else (commit_all[: len(commit_all) // 2],)
+    )  # a frame of two on CAN
     await obey("Stop", *half, ramp=subject.ramp)
     await subject.run([subject.settle, 0.02])
     await ignore_all(session=subject.next_session)

@@ -85,14 +85,17 @@ def sessions(subject: Subject) -> Rows:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session, own = 0x1233, 0x1234
     quarter, maximum = subject.one(level=0.25), subject.can["watchdog_max"]
-    shortest, longest = QUANTITIES["watchdog"].minimum, QUANTITIES["watchdog"].maximum
+    outer = QUANTITIES["watchdog"]
     rows = (
         play(quarter, token=3, code="WRONG_SESSION"),
         send("Commit", token=2, code="WRONG_SESSION"),
         # The session comes before what is beyond the capabilities.
         send("Silence", ramp=QUANTITIES["ramp"].maximum, code="WRONG_SESSION"),
         send("Ping", code="WRONG_SESSION"),
-        *(send("Arm", watchdog=each, code="WRONG_SESSION") for each in (shortest, longest)),
+        *(
+            send("Arm", watchdog=each, code="WRONG_SESSION")
+            for each in (outer.minimum, outer.maximum)
+        ),
     )
     others = [
         partial(

@@ -136,11 +136,9 @@ def arming_ends_fades(subject: Subject) -> Rows:
 @driving(_STATES)
 def stop(subject: Subject) -> Rows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
-    first, *_ = subject.parts(subject.one(level=0.5), token=3, now=0, count=3)
     return [
-        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Set", **first)),
-        *(send("Stop", ramp=0), 0.02, *_latched(subject)),
-        *(send("Commit", token=3, code=_WRONG), 0.1),
+        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
+        *(*_latched(subject), send("Commit", token=2, code=_WRONG), 0.1),
     ]
 
 
@@ -152,8 +150,13 @@ def stop_ramps(subject: Subject) -> Rows:
     (stop, slowest_stop), (disarm, slowest_disarm) = (
         [send(name, ramp=each) for each in (subject.ramp, 0xFFFF)] for name in ("Stop", "Disarm")
     )
+    first, *_ = subject.parts(subject.one(), token=2, now=0, count=3)
     return [
-        *((whole, stop), (whole, disarm), (whole, slowest_stop, amid, disarm)),
+        *(
+            (whole, send("Set", **first), stop),
+            (whole, disarm),
+            (whole, slowest_stop, amid, disarm),
+        ),
         (whole, slowest_disarm, *fading, subject.clear, amid, stop),
     ]
 

@@ -57,7 +57,8 @@ def status(
     tokens: Sequence[int] = (0, 0, 0, 0),
 ) -> list[int]:
     """Return the words of a status: of two channels and four layers, at 25 degrees and 1800 V."""
-    is_on = state in (ENABLED, SWITCHED_ON) if high_voltage is None else high_voltage
+    is_driven = state in (ENABLED, SWITCHED_ON) or (state == STOPPED and any(levels))
+    is_on = is_driven if high_voltage is None else high_voltage
     counts = len(levels) << 8 | len(tokens)
     flags = is_on | limited << 2
     head = [state, fault, flags, latch, left if state == ENABLED else 0, 250, 1800]

@@ -22,6 +22,7 @@ from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from daemon_bench import daemon_at, far_end, ready
 from model.identification.learned_file import load_learned
+from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -219,7 +220,8 @@ async def test_loose_mount_is_named_and_its_contrast_comes_back(tmp_path: Path) 
         assert await contrast(bench) > before + 3
         while not bench.file.exists():  # written now and then
             await bench.patterns(1)
-    assert load_learned(bench.file).names
+    table = _table(load_rig(bench.file.with_name("rig.yaml")))
+    assert load_learned(bench.file, table=table.fingerprint).names
 
 
 async def contrast(bench: LearningBench) -> float:

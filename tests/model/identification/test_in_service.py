@@ -110,8 +110,8 @@ def retuned(mounted: Mounted) -> Mounted:
 
 def cracked(mounted: Mounted) -> Mounted:
     """A patch of 2.3 by 6.9 cm at an edge that has lost half of its stiffness."""
-    soft = (0.188, 0.211, 0.0, 0.069, 0.5)  # m, and the share of its rigidity that is lost
-    return replace(mounted, plate=replace(mounted.plate, soft=soft))
+    soft = (0.188, 0.211, 0.0, 0.069, -0.5, 0.0)  # m; more of its rigidity, and of its mass
+    return replace(mounted, plate=replace(mounted.plate, parts=(soft,)))
 
 
 def rested(mounted: Mounted) -> Mounted:

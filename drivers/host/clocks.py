@@ -70,14 +70,13 @@ class Clocks:
         held = [each for each in every.values() if each.clock.error(now) < math.inf]
         is_common = len({each.line for each in every.values()}) == 1
         is_common &= sum(not each.clock.is_compared for each in held) == 1
-        common = median([each.clock.lead(now) for each in held] or [0.0])
+        leads = {each: each.clock.lead(now) for each in every.values()}
+        common = median([leads[each] for each in held] or [0.0])
         # So that the rms of what is known is no less than that of their differences.
         wider = math.sqrt(len(held) / max(len(held) - 1, 1))
         return {
             name: math.hypot(
-                each.clock.error(
-                    now, off=wider * (each.clock.lead(now) - common), is_common=is_common
-                ),
+                each.clock.error(now, off=wider * (leads[each] - common), is_common=is_common),
                 0.0 if self._are_alike else each.clock.shortest / 2,
             )
             for name, each in every.items()
@@ -95,7 +94,7 @@ class Clocks:
             async with asyncio.TaskGroup() as settling:
                 for line in lines:
                     settling.create_task(self._settle(line, now + _SETTLING))
-        except* DriverError:  # whoever arms is told of it
+        except* DriverError:  # as arming says, too
             pass
 
     async def _settle(self, line: Line, until: float) -> None:

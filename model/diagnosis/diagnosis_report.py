@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import numpy as np
-
 from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
@@ -68,7 +66,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     if verdict.misses_promises:
         rows.append(
             "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
-            f"by {-np.median(verdict.promise_margins):.1f} dB or more"
+            f"by {verdict.missed_db:.1f} dB or more"
         )
     if rows:
         return rows

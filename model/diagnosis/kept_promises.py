@@ -29,7 +29,7 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
     if verdict.match is None or verdict.changes is None:
         return verdict
     rng, margins = np.random.default_rng(0), []
-    # A finger that rests there is none of a table's plate.
+    # The plate of a table has no finger on it.
     loads: list[object] = [*verdict.match.rig.masses]
     masses = tuple(each for each in loads if isinstance(each, PointLoad))
     plate = replace(verdict.match.rig, masses=masses)

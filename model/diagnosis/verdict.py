@@ -121,10 +121,14 @@ class Verdict:
         return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
 
     @property
+    def missed_db(self) -> float:
+        """By how much half of the table's answers miss their promises [dB]; 0 if not compared."""
+        return -float(np.median(self.promise_margins)) if self.promise_margins else 0.0
+
+    @property
     def misses_promises(self) -> bool:
         """Whether half of all answers give clearly less contrast than the table promises."""
-        median = np.median(self.promise_margins) if self.promise_margins else 0.0
-        return bool(median < -MISSED_DB)
+        return self.missed_db > MISSED_DB
 
 
 def diagnose(

@@ -291,9 +291,8 @@ async def broadcasts(subject: Subject) -> None:
     commit = partial(obey, "Commit", token=subject.token, at=at)
     await subject.run([commit, subject.follow, commit, subject.starve])
     commit_all = client.request(MESSAGES["Commit"].number, _shortest("Commit"), to=0)
-    half = (
-        () if client.kind == "rtu" else (commit_all[: len(commit_all) // 2],)
-    )  # a frame of two on CAN
+    # Of a message half, on CAN a frame of two.
+    half = () if client.kind == "rtu" else (commit_all[: len(commit_all) // 2],)
     await obey("Stop", *half, ramp=subject.ramp)
     await subject.run([subject.settle, 0.02])
     await ignore_all(session=subject.next_session)

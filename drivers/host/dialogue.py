@@ -353,7 +353,9 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        self.clock.replied(name, values, reply, now)
+        # Beside heartbeats a Commit's tells nothing more, unless it may show a Mark.
+        if name != "Commit" or len(self.line.members) > 1:
+            self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds

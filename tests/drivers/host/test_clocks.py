@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.errors import Preempted
+from drivers.host.clock import HeldClock
+from drivers.host.clocks import Clocks
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import CLOCK_UNKNOWN, FEATURES, HELLO
@@ -171,6 +173,30 @@ def test_sets_beside_readings_of_clocks_are_played(lines: tuple[str, ...]) -> No
 
     between = run_virtual(run())
     assert len(lines) == 1 or not any("out GetStatus" in each for each in between)
+
+
+@pytest.mark.parametrize(
+    ("error", "readings"), [(5e-6, 0), (6e-6, 0), (6.5e-6, 1), (7e-6, 2), (7.6e-6, 3)]
+)
+def test_clocks_are_read_the_seldomer_the_better_they_are_known(
+    monkeypatch: pytest.MonkeyPatch, error: float, readings: int
+) -> None:
+    """Beside each heartbeat of 50 ms: each 10 ms from 8 us on, which cost a tenth of a dB.
+
+    Nearer to 5 us, which cost nothing, as much more seldom: 6.5 us are half way, so each 20 ms.
+    """
+    read: list[float] = []
+    monkeypatch.setattr(HeldClock, "scatter", lambda clock, time: error)
+    monkeypatch.setattr(Clocks, "_read", lambda clocks, amplifier: read.append(error))
+
+    async def run() -> None:
+        group, clocks = await held("native", 1, "a", "b")
+        read.clear()
+        await skew(group, clocks, 1.0)
+        await asyncio.sleep(0.049)
+
+    run_virtual(run())
+    assert len(read) == 20 * 2 * readings
 
 
 @pytest.mark.parametrize(("lost", "bound"), [(0.0, 2e-6), (0.02, 10e-6)], ids=["all", "lossy"])

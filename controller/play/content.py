@@ -235,25 +235,19 @@ class Selection:
         if not levels:
             return self
 
-        def together(
-            predictions: Sequence[Prediction], above: Sequence[float] = (0.0,)
-        ) -> tuple[Prediction, ...]:
-            keys = [each.contact.key for each in predictions]
-            return tuple(
-                [
-                    each.beside(levels[key], total[key], above) if key in levels else each
-                    for key, each in zip(keys, predictions, strict=True)
-                ]
-            )
+        def together(each: Prediction, above: Sequence[float] = (0.0,)) -> Prediction:
+            key = each.contact.key
+            return each.beside(levels[key], total[key], above) if key in levels else each
 
         contents = []
-        for each in self.contents:
-            above = [*map(float, table.levels_by_set(0.0, each.layer.excitation))]
-            contents.append(replace(each, predictions=together(each.predictions, above)))
+        for one in self.contents:
+            above = [*map(float, table.levels_by_set(0.0, one.layer.excitation))]
+            felt = [together(each, above) for each in one.predictions]
+            contents.append(replace(one, predictions=tuple(felt)))
         return replace(
             self,
             contents=tuple(contents),
-            not_served=together(self.not_served),
+            not_served=tuple(map(together, self.not_served)),
             foreign_levels=total,
         )
 

@@ -157,9 +157,8 @@ class Clocks:
                     worst = max(worst, each.clock.scatter(now))
         if worst <= _GOOD:
             return
-        least = _INTERVAL * max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
-        if worst > _POOR:
-            least = _INTERVAL / 2
+        longer = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
+        least = _INTERVAL * (longer if worst <= _POOR else 0.5)
         for line, of_line in unmarked:
             if line.late <= GRACE:
                 # Each by itself: one behind the reply to another is sent in step with frames.

@@ -77,8 +77,8 @@ def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
 
 def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
     """Return what they feel of others there at most, by set of thresholds [dB SL]."""
-    foreign = found.tones.foreign_db_sl
-    heard = np.where(np.isnan(foreign), -math.inf, foreign)
+    levels = found.tones.foreign_db_sl
+    heard = np.where(np.isnan(levels), -math.inf, levels)
     if len(heard) == count:
         return heard.tolist()  # type: ignore[no-any-return]
     return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]

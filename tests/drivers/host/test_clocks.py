@@ -4,10 +4,11 @@ import asyncio
 import math
 import random
 from collections.abc import Sequence
+from contextlib import suppress
 
 import pytest
 
-from drivers.errors import Preempted
+from drivers.errors import LinkDegraded, Preempted
 from drivers.host.clock import HeldClock
 from drivers.host.clocks import Clocks
 from drivers.host.group import Group
@@ -79,7 +80,8 @@ async def skew(group: Group, clocks: Sequence[AmplifierClock], duration: float) 
     count = round(duration / 0.05)
     for number in range(count):
         await asyncio.sleep(0.05)
-        await group.beat()
+        with suppress(LinkDegraded):  # of 5 % lost frames three in a row, now and then
+            await group.beat()
         if number >= count // 2:
             ahead = leads(clocks)
             shown += [each - sum(ahead) / len(ahead) for each in ahead]

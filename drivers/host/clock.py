@@ -94,6 +94,7 @@ class HeldClock:
         self._marked: dict[float, float] = {}  # leads, by when a Mark arrived
         self._beside = _Line(-math.inf)  # to the other's, from the newest Mark of both
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
+        self._is_doubted = False  # whether the last reading was too early, as none before
 
     def identified(self, stated: int, *, bits: float) -> None:
         """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
@@ -134,8 +135,11 @@ class HeldClock:
         return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
-        """Return the standard error of its lead as it is read [s]; infinite before that."""
-        return self._seen(time).error
+        """Return the standard error of its lead as it is read [s].
+
+        Infinite before that, and where the last reading alone was too early.
+        """
+        return math.inf if self._is_doubted else self._seen(time).error
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
         """Return its error [s rms] with what it states; infinite if unknown.
@@ -146,7 +150,7 @@ class HeldClock:
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = (self.lead(time) if off is None else off) if self._is_armed else 0.0
-        seen = self.scatter(time)
+        seen = self._seen(time).error
         if is_common:
             seen = self._beside.at(time).error if self.is_compared else 0.0
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
@@ -179,7 +183,7 @@ class HeldClock:
         if is_trusted and (first is not None or self._is_first):
             common = lead if first is None else first.lead(time)
         own, seen = lead - common, self._line if first is None else self._beside
-        near = max(_NEAR, 2 * self.scatter(time))  # what is not seen accuses none
+        near = max(_NEAR, 2 * line.error)  # what is not seen accuses none
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
@@ -247,18 +251,23 @@ class HeldClock:
         line, shown = self._line, clock * _STEP - time - self._added - self._pace * time
         lead = line.lead + line.rate * (time - line.time)
         off = math.remainder(shown - lead, CLOCK_TURN)
-        far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
+        error = self._seen(time).error
+        far = _FAR + _FAR_ERRORS * error + self.stated / _PER_ERROR
         # What was read before came late where it is above, each by no more than its exchange took.
         sure = max(
             [low - late - line.rate * (at - time) for at, low, late in self._lowest],
             default=-math.inf,
         )
-        if not sure - lead - far - earlier <= off <= later + far:
+        is_early = off < sure - lead - far - earlier
+        self._is_doubted = is_early and not self._is_doubted
+        if self._is_doubted:  # one alone may show a Mark that came twice
+            return lead + off
+        if is_early or off > later + far:
             if is_reported:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
-        elif off < -_FAR - _SURELY * self.scatter(time):
+        elif off < -_FAR - _SURELY * error:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late

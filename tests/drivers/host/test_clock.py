@@ -320,6 +320,13 @@ def test_shift_of_an_arm_without_reply_is_not_assumed() -> None:
         assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=2e-6)
 
 
+def show(talk: Exchanges, clock: int) -> None:
+    """Have a status show a clock."""
+    talk.held.sent("GetStatus", {}, talk.now, talk.now)
+    status = {"state": talk.state, "clock": clock}
+    talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
+
+
 def mark(talks: list[Exchanges], count: int, late: Callable[[], float]) -> None:
     """Have clocks keep the same byte of Marks, each 54 ms, and show it."""
     for _ in range(count):
@@ -331,9 +338,7 @@ def mark(talks: list[Exchanges], count: int, late: Callable[[], float]) -> None:
             talk.counter.go(talk.now + after)
             marked = talk.counter.word
             talk.now += 2e-3
-            talk.held.sent("GetStatus", {}, talk.now, talk.now)
-            status = {"state": talk.state, "clock": marked}
-            talk.held.replied("GetStatus", {}, status, talk.now + 2e-3)
+            show(talk, marked)
 
 
 def test_clocks_of_a_line_are_compared_by_marks() -> None:
@@ -352,6 +357,27 @@ def test_clocks_of_a_line_are_compared_by_marks() -> None:
         talk.counter.go(talk.now)
     seen = talks[0].held.lead(talks[0].now) - talks[1].held.lead(talks[1].now)
     assert seen == pytest.approx(talks[0].counter.lead - talks[1].counter.lead, abs=0.1e-6)
+
+
+@pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
+def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
+    """Once more 40 ms later: the second status behind it shows a clock of 10 ms ago.
+
+    It is known by the next reading that the clock has not moved; before that it is to be read.
+    """
+    talk = Exchanges(Counter(20e-6, shown=START - 3.0), frames(1, 125e-6))
+    if is_armed:
+        talk.arm()
+    talk.run(10.0)
+    mark([talk], 1, lambda: 0.0)
+    talk.counter.go(talk.now + 0.038)
+    talk.now += 0.048
+    show(talk, talk.counter.word)
+    assert talk.held.scatter(talk.now) == math.inf
+    talk.run(0.05)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.scatter(talk.now) < 20e-6
+    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=20e-6)
 
 
 def test_no_rate_is_more_than_a_ping_can_say() -> None:

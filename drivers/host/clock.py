@@ -19,6 +19,7 @@ what they state. One is held to the host's, and the others to it.
 """
 
 import math
+from collections import deque
 from statistics import median_low
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ _MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal be
 _AGREEING = 3  # Marks at least: of two none tells which is false
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
+_BULK, _FAR_OUT = 64, 2.0  # readings; times what they lie within, but for an eighth either way
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
 _EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
 _MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or runs backwards
@@ -90,6 +92,7 @@ class HeldClock:
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
         self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
+        self._all = deque[tuple[float, float]](maxlen=_BULK)  # times and leads
         self._line = _Line(time)
         self._marked: dict[float, float] = {}  # leads, by when a Mark arrived
         self._beside = _Line(-math.inf)  # to the other's, from the newest Mark of both
@@ -135,10 +138,7 @@ class HeldClock:
         return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
-        """Return the standard error of its lead as it is read [s].
-
-        Infinite before that, and where the last reading alone was too early.
-        """
+        """Return the standard error of its lead as it is read [s]; infinite if it must be."""
         return math.inf if self._is_doubted else self._seen(time).error
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
@@ -271,6 +271,7 @@ class HeldClock:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
+        self._all.append((time, lead + off))
         part = _MIN_PART
         self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
         while self._lowest and time - self._lowest[0][0] > _PARTS * part:
@@ -362,5 +363,11 @@ class HeldClock:
         # None is later than its exchange took longer than the promptest one.
         if min([off - late for off, late in recent]) > _FAR / 2:
             del self._lowest[:-_RECENT]
-        off = min(recent)[0]
-        self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
+        error = max(error, min(recent)[0])
+        # Few far before most: most are late, or few are read wrong. Each is half the gap away.
+        bulk = sorted([each + (rate - bend * (time - at)) * (time - at) for at, each in self._all])
+        eighth = len(bulk) // 8
+        low, high = above[0][0], bulk[eighth]
+        if len(bulk) == _BULK and high - low > _FAR_OUT * (bulk[~eighth] - high):
+            lead, error = (low + high) / 2, error + (high - low) / 2
+        self._line = _Line(time, lead, rate, bend, error, rate_error)

@@ -9,12 +9,14 @@
 typedef struct {
     int count, bases, nodes, width; /* plates; thicknesses of changes; thicknesses of plates */
     int first_base, first_node;     /* of these by index among those of the plate */
-    int gains_of_row;               /* floats from the gains of a frequency to those of the next; 0: of all */
+    int amplifiers;                 /* whose clocks are off; 0 for none */
     const int *node;                /* (count) */
     const float *loss, *damping;    /* (width) */
-    const float *own, *gains;       /* (a, width); (rows, 2, a, width) real and imaginary parts */
+    const float *own, *gains;       /* (a, width); (2, a, width) real and imaginary parts */
     const float *errors;            /* (2, k, width) */
     const float *harmonics;         /* (2, n, width) second harmonics of ERAs, relative to their motion */
+    const float *delays;            /* (amplifiers, width) [s] */
+    const int *amplifier;           /* (n) of each ERA */
 } draws;
 
 /* Points of all fingers, and what tones at them are measured by. */
@@ -287,6 +289,16 @@ INLINE value add_scaled(value sum, value f, float re, float im) {
     return (value){.re = sum.re + re * f.re - im * f.im, .im = sum.im + re * f.im + im * f.re};
 }
 
+/* exp(-i phase). */
+INLINE value late_by(lanes phase) {
+    const lanes turns = phase * 0.15915494f, rounder = filled(12582912);
+    const lanes x = (turns - (turns + rounder - rounder)) * 1.5707963f, s = x * x; /* of a quarter of the phase */
+    const lanes cosine = 1 + s * (-1 / 2.f + s * (1 / 24.f + s * (-1 / 720.f + s * (1 / 40320.f))));
+    const lanes sine = x * (1 + s * (-1 / 6.f + s * (1 / 120.f + s * (-1 / 5040.f + s * (1 / 362880.f)))));
+    const value quarter = {.re = cosine, .im = -sine}, half = times(quarter, quarter);
+    return times(half, half);
+}
+
 /* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
 SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, value *found, value *force) {
     const draws *by = of->by;
@@ -305,11 +317,17 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     const size_t from = first - 1, base = tone * by->bases + (group - 1) / groups_of(by);
     const float *loss = of->forces + 2 * 4 * a * base, *damping = loss + 2 * a, *own = damping + 2 * a, *gain = own + 2 * a;
     const float *T = of->by_force + 2 * (a + 1) * padded * base;
-    const float *gains = by->gains + (size_t)of->rows[tone] * by->gains_of_row;
+    const float omega = sqrtf(-of->on->minus_omega2[of->rows[tone]]);
+    value late[1 + by->amplifiers];
+    for (int i = 0; i < by->amplifiers; i++) late[i] = late_by(omega * some(by->delays + i * width + from));
     lanes by_loss = some(by->loss + from), by_damping = some(by->damping + from);
     for (size_t j = 0; j < a; j++) {
         lanes by_own = some(by->own + j * width + from);
-        lanes re = some(gains + j * width + from), im = some(gains + (a + j) * width + from);
+        lanes re = some(by->gains + j * width + from), im = some(by->gains + (a + j) * width + from);
+        if (by->amplifiers && j < (size_t)of->on->n) {
+            const value found = times((value){.re = 1 + re, .im = im}, late[by->amplifier[j]]);
+            re = found.re - 1, im = found.im;
+        }
         force[j].re = loss[2 * j] * by_loss + damping[2 * j] * by_damping + own[2 * j] * by_own + gain[2 * j] * re -
                       gain[2 * j + 1] * im;
         force[j].im = loss[2 * j + 1] * by_loss + damping[2 * j + 1] * by_damping + own[2 * j + 1] * by_own +

@@ -62,8 +62,8 @@ class PlateDraws(Structure):
     """`draws`: plates within the uncertainty."""
 
     _fields_ = _fields(
-        i="count bases nodes width first_base first_node gains_of_row",
-        p="node loss damping own gains errors harmonics",
+        i="count bases nodes width first_base first_node amplifiers",
+        p="node loss damping own gains errors harmonics delays amplifier",
     )
 
 

@@ -56,31 +56,28 @@ INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
 /* found (count, 2, padded): real and imaginary parts at points of coordinates (count, r); columns (r, padded). */
 SHARED void at_points(float *found, const float *coordinates, size_t count, const float *columns, size_t padded,
                       size_t r) {
-    for (size_t first = 0; first < count; first += 3)
-        for (size_t point = 0; point < padded; point += 2 * LANES) {
-            const float *of[3];
-            lanes s[3][4] = {{{0}}};
-            for (size_t i = 0; i < 3; i++) of[i] = coordinates + 2 * r * (first + i < count ? first + i : first);
+    for (size_t first = 0; first < count; first += 4)
+        for (size_t point = 0; point < padded; point += LANES) {
+            const float *of[4];
+            value s[4] = {ZERO, ZERO, ZERO, ZERO};
+            for (size_t i = 0; i < 4; i++) of[i] = coordinates + 2 * r * (first + i < count ? first + i : first);
             for (size_t j = 0; j < r; j++) {
-                lanes a, b;
-                memcpy(&a, columns + j * padded + point, sizeof a);
-                memcpy(&b, columns + j * padded + point + LANES, sizeof b);
-                s[0][0] += a * of[0][2 * j], s[0][1] += b * of[0][2 * j];
-                s[0][2] += a * of[0][2 * j + 1], s[0][3] += b * of[0][2 * j + 1];
-                s[1][0] += a * of[1][2 * j], s[1][1] += b * of[1][2 * j];
-                s[1][2] += a * of[1][2 * j + 1], s[1][3] += b * of[1][2 * j + 1];
-                s[2][0] += a * of[2][2 * j], s[2][1] += b * of[2][2 * j];
-                s[2][2] += a * of[2][2 * j + 1], s[2][3] += b * of[2][2 * j + 1];
+                lanes shape;
+                memcpy(&shape, columns + j * padded + point, sizeof shape);
+                s[0].re += shape * of[0][2 * j], s[0].im += shape * of[0][2 * j + 1];
+                s[1].re += shape * of[1][2 * j], s[1].im += shape * of[1][2 * j + 1];
+                s[2].re += shape * of[2][2 * j], s[2].im += shape * of[2][2 * j + 1];
+                s[3].re += shape * of[3][2 * j], s[3].im += shape * of[3][2 * j + 1];
             }
-            for (size_t i = 0; i < 3 && first + i < count; i++) {
+            for (size_t i = 0; i < 4 && first + i < count; i++) {
                 float *to = found + 2 * padded * (first + i) + point;
-                memcpy(to, s[i], 2 * sizeof(lanes));
-                memcpy(to + padded, s[i] + 2, 2 * sizeof(lanes));
+                memcpy(to, &s[i].re, sizeof(lanes));
+                memcpy(to + padded, &s[i].im, sizeof(lanes));
             }
         }
 }
 
-INLINE size_t padded_to(size_t points) { return (points + 2 * LANES - 1) / (2 * LANES) * (2 * LANES); }
+INLINE size_t padded_to(size_t points) { return (points + LANES - 1) / LANES * LANES; }
 
 /* (r, padded) of rows (points, r). */
 SHARED float *columns_of(const float *rows, size_t points, size_t r, arena *memory) {

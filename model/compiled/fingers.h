@@ -105,9 +105,19 @@ SHARED void to_points(value *restrict found, size_t width, const float *points, 
     const size_t b = on->b, k = on->k;
     const value *X = of->at, *G = of->G; /* at the centres */
     if (points != on->centres || p != k) {
-        X = room, G = room + p * b;
-        multiply(room, points, of->T, p, on->r, b);
-        by_fingers(room + p * b, points, p, X, of, on);
+        value *of_eras = room, *of_fingers = room + p * b;
+        const size_t r = on->r, parts = p % k ? 1 : k, each = p / parts;
+        for (size_t part = 0; part < parts; part++) { /* what is known of a finger's first point is not computed again */
+            size_t first = part * each, count = each;
+            if (!memcmp(points + first * r, on->centres + part * r, r * sizeof(float))) {
+                memcpy(of_eras + first * b, of->at + part * b, b * sizeof(value));
+                memcpy(of_fingers + first * k, of->G + part * k, k * sizeof(value));
+                first++, count--;
+            }
+            multiply(of_eras + first * b, points + first * r, of->T, count, r, b);
+            by_fingers(of_fingers + first * k, points + first * r, count, of_eras + first * b, of, on);
+        }
+        X = of_eras, G = of_fingers;
     }
     for (size_t i = 0; i < p; i++) {
         row_product(of->row, G + i * k, 1, of->held, k, b, 0, 0);

@@ -12,11 +12,13 @@ typedef struct {
     const float *by_damping, *by_stiffness;                /* (f, n) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
     const float *centres, *stiffness;                      /* (k, r); (f, k) D */
+    const value *of_blocks; /* (blocks of LANES frequencies, up to 3 thicknesses, b, r) T of the first, as `load` gives it */
 } plates;
 
 /* Some cases, each of a frequency and a thickness, with the fingers on them. */
 typedef struct {
-    value *T, *g, *Y;        /* (b, r), (r), (b, b) */
+    const value *T;          /* (b, r) */
+    value *g, *Y;            /* (r), (b, b) */
     value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
     value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
     value *G;                /* (k, k) displacement of the fingers by a force at each, without the others */
@@ -70,14 +72,26 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
     }
 }
 
+/* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
+INLINE const value *of_block(const plates *on, const int *rows, const int *cases) {
+    const int kept = on->t < 3 ? on->t : 3, thickness = cases[0] - rows[0] * on->t;
+    int is_block = rows[0] % LANES == 0 && thickness < kept;
+    for (int l = 1; l < LANES; l++) {
+        is_block &= rows[l] == rows[0] + l || rows[l] == rows[l - 1]; /* the last one is repeated */
+        is_block &= cases[l] - rows[l] * on->t == thickness;
+    }
+    return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * kept + thickness) * on->b * on->r : NULL;
+}
+
 /* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
 SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
     const size_t b = on->b, k = on->k, r = on->r;
-    to->T = work, to->g = to->T + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
+    to->T = of_block(on, rows, cases);
+    to->g = work + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
     to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->G = to->D + k;
     to->through = to->G + k * k, to->held = to->through + b * k, to->forced = to->held + k * b;
     to->row = to->forced + k * k;
-    load(to->T, on->by_force, b * r, cases);
+    if (!to->T) load(work, on->by_force, b * r, cases), to->T = work;
     load(to->g, on->receptance, r, cases);
     load(to->Y, on->coupling, b * b, cases);
     load(to->D, on->stiffness, k, rows);

@@ -112,24 +112,26 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
     return to->row + b + k + r;
 }
 
-/* found (p, width): accelerations at points (p, r) by a force at each of the first width attachments
- * and fingers; room for (p, b + k). */
-SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, const touched *of,
+/* found (p, width): accelerations at points (p, r), each of them of a finger, by a force at each of the first width
+ * attachments and fingers; room for (p, b + k). */
+SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, size_t each, const touched *of,
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k;
     const value *X = of->at, *G = of->G; /* at the centres */
     if (points != on->centres || p != k) {
         value *of_eras = room, *of_fingers = room + p * b;
-        const size_t r = on->r, parts = p % k ? 1 : k, each = p / parts;
-        for (size_t part = 0; part < parts; part++) { /* what is known of a finger's first point is not computed again */
-            size_t first = part * each, count = each;
-            if (!memcmp(points + first * r, on->centres + part * r, r * sizeof(float))) {
-                memcpy(of_eras + first * b, of->at + part * b, b * sizeof(value));
-                memcpy(of_fingers + first * k, of->G + part * k, k * sizeof(value));
-                first++, count--;
+        const size_t r = on->r;
+        for (size_t first = 0, next; first < p; first = next) {
+            size_t finger = 0;
+            next = first + each;
+            while (finger < k && memcmp(points + first * r, on->centres + finger * r, r * sizeof(float))) finger++;
+            if (finger < k) { /* what is known of its centre is not computed again */
+                memcpy(of_eras + first * b, of->at + finger * b, b * sizeof(value));
+                memcpy(of_fingers + first * k, of->G + finger * k, k * sizeof(value));
+                first++;
             }
-            multiply(of_eras + first * b, points + first * r, of->T, count, r, b);
-            by_fingers(of_fingers + first * k, points + first * r, count, of_eras + first * b, of, on);
+            multiply(of_eras + first * b, points + first * r, of->T, next - first, r, b);
+            by_fingers(of_fingers + first * k, points + first * r, next - first, of_eras + first * b, of, on);
         }
         X = of_eras, G = of_fingers;
     }

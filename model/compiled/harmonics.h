@@ -32,7 +32,7 @@ SHARED float *harmonic_fields(const distortion *at, const draws *by, size_t m, c
         }
         touched of;
         put_fingers(&of, on, of_table, cases, space);
-        to_points(found, n, at->points, points, &of, on, room);
+        to_points(found, n, at->points, points, at->few, &of, on, room);
         load(drives, on->drives, n, of_table);
         load(w, weights, n, given);
         for (size_t e = 0; e < n; e++) drives[e] = times(drives[e], w[e]);

@@ -56,20 +56,25 @@ INLINE void add(value *to, const value *more, size_t count) {
     for (size_t i = 0; i < count; i++) to[i] = (value){.re = to[i].re + more[i].re, .im = to[i].im + more[i].im};
 }
 
+/* Add to G (p, k) what attachments add, of X (p, b), accelerations at points by a force at each. */
+INLINE void by_eras(value *restrict G, size_t p, const value *X, const touched *of, const plates *on) {
+    for (size_t i = 0; i < p; i++) {
+        row_product(of->row, X + i * on->b, 1, of->through, on->b, on->k, 0, 0);
+        add(G + i * on->k, of->row, on->k);
+    }
+}
+
 /* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),
- * accelerations there by a force at each attachment. */
+ * accelerations there by a force at each attachment, or without these. */
 INLINE void by_fingers(value *restrict G, const float *points, size_t p, const value *X, const touched *of,
                        const plates *on) {
-    const size_t b = on->b, k = on->k, r = on->r;
-    value *modal = of->row + b + k;
+    const size_t k = on->k, r = on->r;
+    value *modal = of->row + on->b + k;
     for (size_t j = 0; j < k; j++) {
         for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centres[j * r + s]));
         multiply_into(G + j, k, points, modal, p, r);
     }
-    for (size_t i = 0; i < p; i++) {
-        row_product(of->row, X + i * b, 1, of->through, b, k, 0, 0);
-        add(G + i * k, of->row, k);
-    }
+    if (X) by_eras(G, p, X, of, on);
 }
 
 /* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
@@ -83,25 +88,27 @@ INLINE const value *of_block(const plates *on, const int *rows, const int *cases
     return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * kept + thickness) * on->b * on->r : NULL;
 }
 
-/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
-SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
+/* Places in work space; the end of it. */
+INLINE value *place(touched *to, const plates *on, value *work) {
     const size_t b = on->b, k = on->k, r = on->r;
-    to->T = of_block(on, rows, cases);
     to->g = work + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
     to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->G = to->D + k;
     to->through = to->G + k * k, to->held = to->through + b * k, to->forced = to->held + k * b;
     to->row = to->forced + k * k;
-    if (!to->T) load(work, on->by_force, b * r, cases), to->T = work;
-    load(to->g, on->receptance, r, cases);
+    return to->row + b + k + r;
+}
+
+/* All that follows from what attachments do at the fingers, and from G of the free plate. */
+SHARED void couple(touched *to, const plates *on, const int *rows, const int *cases) {
+    const size_t b = on->b, k = on->k;
     load(to->Y, on->coupling, b * b, cases);
     load(to->D, on->stiffness, k, rows);
     load_real(&to->minus_omega2, on->minus_omega2, 1, rows);
-    multiply(to->at, on->centres, to->T, k, r, b);
     for (size_t i = 0; i < k; i++) {
         row_product(to->row, to->at + i * b, 1, to->Y, b, b, 0, 0); /* Y is symmetric */
         for (size_t j = 0; j < b; j++) to->through[j * k + i] = to->row[j];
     }
-    by_fingers(to->G, on->centres, k, to->at, to, on);
+    by_eras(to->G, k, to->at, to, on);
     memcpy(to->P, to->G, k * k * sizeof(value));
     invert(to->P, to->D, k);
     product(to->resting, to->P, k, to->at, k, k, b);
@@ -109,7 +116,18 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
         for (size_t j = 0; j < b; j++) to->held[i * b + j] = subtract_product(ZERO, to->D[i], to->resting[i * b + j]);
         for (size_t j = 0; j < k; j++) to->forced[i * k + j] = scaled(to->P[j * k + i], to->minus_omega2);
     }
-    return to->row + b + k + r;
+}
+
+/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
+SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
+    value *end = place(to, on, work);
+    to->T = of_block(on, rows, cases);
+    if (!to->T) load(work, on->by_force, (size_t)on->b * on->r, cases), to->T = work;
+    load(to->g, on->receptance, on->r, cases);
+    multiply(to->at, on->centres, to->T, on->k, on->r, on->b);
+    by_fingers(to->G, on->centres, on->k, NULL, to, on);
+    couple(to, on, rows, cases);
+    return end;
 }
 
 /* found (p, width): accelerations at points (p, r), each of them of a finger, by a force at each of the first width

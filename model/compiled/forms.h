@@ -63,7 +63,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     for (size_t i = 0; i < at; i++)
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(t[i * a + e], drives[e]);
     if (of->fine) {
-        to_points(fine, n, of->fine_points, of->fine, of->fine % k ? of->fine : of->fine / k, &now, on, room);
+        to_points(fine, n, of->fine_points, of->fine, of->fine / (of->fine % k ? 1 : k), &now, on, room);
         drive(fine, drives, of->fine, n);
     }
     memcpy(to->fields, h, at * n * sizeof(value));

@@ -49,7 +49,7 @@ static void run_tones(const job *each, arena *memory) {
     const sensors *at = each->of;
     const found_tones *to = each->to[0];
     const size_t points = at->points, k = on->k, plates = 1 + by->count, fine = points / k;
-    const float *columns = columns_of(at->rows, points, on->r, memory);
+    const float *columns = columns_of(at->rows, points, on, memory);
     const tones drawn = respond(on, by, at, columns, each->count, each->rows, each->to[1], memory);
     lanes *sensed = take(memory, points * sizeof(lanes));
     value *found = values(memory, points), *force = values(memory, on->b + k + 1);

@@ -6,6 +6,7 @@
 
 typedef struct {
     int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
+    int rows, lanes;            /* frequencies; lanes of the blocks below */
     float load_std;
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
@@ -80,9 +81,9 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
 /* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
 INLINE const value *of_block(const plates *on, const int *rows, const int *cases) {
     const int kept = on->t < 3 ? on->t : 3, thickness = cases[0] - rows[0] * on->t;
-    int is_block = rows[0] % LANES == 0 && thickness < kept;
+    int is_block = on->lanes == LANES && rows[0] % LANES == 0 && thickness < kept;
     for (int l = 1; l < LANES; l++) {
-        is_block &= rows[l] == rows[0] + l || rows[l] == rows[l - 1]; /* the last one is repeated */
+        is_block &= rows[l] == (rows[0] + l < on->rows ? rows[0] + l : on->rows - 1); /* the last one is repeated */
         is_block &= cases[l] - rows[l] * on->t == thickness;
     }
     return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * kept + thickness) * on->b * on->r : NULL;

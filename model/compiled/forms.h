@@ -12,6 +12,8 @@ typedef struct {
     const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
     const float *shares;       /* (f, n, n) by which the power of h grows; NULL for none */
+    const char *is_fine;       /* (k) fingers whose fine points count; NULL for all */
+    int rim;                   /* first of a finger's fine points beside its first that count */
 } grouped;
 
 /* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is nominal. */
@@ -62,9 +64,16 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     to_points(t, a, of->points, at, each, &now, on, room);
     for (size_t i = 0; i < at; i++)
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(t[i * a + e], drives[e]);
-    if (of->fine) {
-        to_points(fine, n, of->fine_points, of->fine, of->fine / (of->fine % k ? 1 : k), &now, on, room);
-        drive(fine, drives, of->fine, n);
+    const size_t fingers = of->fine % k ? 1 : k, fine_each = of->fine / fingers;
+    for (size_t finger = 0; of->fine && finger < fingers; finger++) {
+        if (of->is_fine && !of->is_fine[finger]) continue;
+        for (size_t part = 0; part < 2; part++) { /* the first alone where not all count */
+            const size_t first = finger * fine_each + (part ? of->rim : 0);
+            const size_t count = part ? fine_each - of->rim : of->rim > 0;
+            value *found = fine + first * n;
+            to_points(found, n, of->fine_points + first * on->r, count, count, &now, on, room);
+            drive(found, drives, count, n);
+        }
     }
     memcpy(to->fields, h, at * n * sizeof(value));
     with_fingers_moved(moved, without, &now, drives, on);

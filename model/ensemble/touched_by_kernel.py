@@ -121,24 +121,24 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
     if kept is not None:
         return kept
     plate = on.plate
-    (b, r), t = plate.shapes.shape, on.receptance.shape[1]
-    found = TouchedPlates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
+    (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
+    by = kernels()
+    lanes = by.lanes if by else _MAX_LANES
+    found = TouchedPlates(plate.era_count, b, 0, r, t, f, lanes, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
         attached=plate.stiffness,
-        of_blocks=_of_blocks(on.by_force[:, :_FIRST]),
+        of_blocks=_of_blocks(on.by_force[:, :_FIRST], lanes),
     )
     return _kept.setdefault(on, found)  # of threads at once all take the first one's
 
 
-def _of_blocks(by_force: Complex64Array) -> Float32Array:
+def _of_blocks(by_force: Complex64Array, lanes: int) -> Float32Array:
     """Accelerations (f, t, b, r) as lanes of kernels, of the last frequency up to whole blocks.
 
     Blocks of frequencies that are searched in their order are read as they are.
     """
-    by = kernels()
-    lanes = by.lanes if by else _MAX_LANES
     f, t, *_ = by_force.shape
     blocks = -(-f // lanes)
     rows = np.minimum(np.arange(blocks * lanes), f - 1)

@@ -54,7 +54,7 @@ class PointGroups(Structure):
 
     _fields_ = [
         *_fields(i="groups p fine others", f="gain_variance ridge"),
-        *_fields(p="points fine_points weights error shares"),
+        *_fields(p="points fine_points weights error shares is_fine", i="rim"),
     ]
 
 

@@ -13,7 +13,7 @@ typedef struct {
     const float *by_damping, *by_stiffness;                /* (f, n) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
     const float *centres, *stiffness;                      /* (k, r); (f, k) D */
-    const value *of_blocks; /* (blocks of LANES frequencies, up to 3 thicknesses, b, r) T of the first, as `load` gives it */
+    value *of_blocks; /* (blocks of LANES frequencies, the first 3 thicknesses or 1, b, r) T, as `load` gives it */
 } plates;
 
 /* Some cases, each of a frequency and a thickness, with the fingers on them. */

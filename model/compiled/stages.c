@@ -92,6 +92,22 @@ int fingertips_stage(const raster *on, const double *places, int count, void *fe
                                       .to = {few, fine, few_weights, fine_weights}});
 }
 
+/* Keep what searches of all frequencies in their order read. */
+int blocks_stage(plates *on) {
+    const size_t each = (size_t)on->b * on->r;
+    value *to = on->of_blocks;
+    for (int first = 0; first < on->rows; first += LANES)
+        for (int thickness = 0; thickness < (on->t < 3 ? on->t : 3); thickness++, to += each) {
+            int cases[LANES];
+            for (int l = 0; l < LANES; l++) {
+                const int row = first + l < on->rows ? first + l : on->rows - 1;
+                cases[l] = row * on->t + thickness;
+            }
+            load(to, on->by_force, each, cases);
+        }
+    return FOUND;
+}
+
 /* Forms at rows (count). */
 int forms_stage(const plates *on, const grouped *of, const int *rows, int count, found_forms *to) {
     return done(run_forms, (job){.on = on, .by = of, .rows = rows, .count = count, .to = {to}});

@@ -22,7 +22,6 @@ from model.ensemble.touched_plate import (
 )
 
 _MAX_LANES = 16
-_FIRST = 3  # thicknesses by which frequencies are ranked: modelled, thicker, thinner
 _OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
 _OF_ROWS = ("minus_omega2", "forces", "strokes", "by_damping", "by_stiffness", "shapes")
 
@@ -122,33 +121,19 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
         return kept
     plate = on.plate
     (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
-    by = kernels()
-    lanes = by.lanes if by else _MAX_LANES
-    found = TouchedPlates(plate.era_count, b, 0, r, t, f, lanes, plate.uncertainty.fingertip)
+    found = TouchedPlates(plate.era_count, b, 0, r, t, f, 0, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
         attached=plate.stiffness,
-        of_blocks=_of_blocks(on.by_force[:, :_FIRST], lanes),
     )
+    if (by := kernels()) is not None:
+        found.lanes = by.lanes
+        room = np.empty(2 * (f + by.lanes) * min(t, 3) * b * r + _MAX_LANES, dtype=np.float32)
+        found.arrays.append(room)
+        found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
+        run(by.library.blocks_stage, found)
     return _kept.setdefault(on, found)  # of threads at once all take the first one's
-
-
-def _of_blocks(by_force: Complex64Array, lanes: int) -> Float32Array:
-    """Accelerations (f, t, b, r) as lanes of kernels, of the last frequency up to whole blocks.
-
-    Blocks of frequencies that are searched in their order are read as they are.
-    """
-    f, t, *_ = by_force.shape
-    blocks = -(-f // lanes)
-    rows = np.minimum(np.arange(blocks * lanes), f - 1)
-    parts = by_force[rows].reshape(blocks, lanes, t, -1).view(np.float32)
-    every = parts.reshape(blocks, lanes, t, -1, 2).transpose(0, 2, 3, 4, 1)
-    room = np.empty(every.size + _MAX_LANES, dtype=np.float32)
-    start = -room.ctypes.data // room.itemsize % _MAX_LANES  # at a whole register
-    found = room[start : start + every.size]
-    found[:] = every.ravel()
-    return found
 
 
 _kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()

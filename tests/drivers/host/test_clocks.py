@@ -342,3 +342,27 @@ def test_status_that_shows_an_older_mark_accuses_no_clock() -> None:
         assert max(group.clock_errors.values()) < 1e-4
 
     run_virtual(run())
+
+
+def test_marks_that_come_twice_accuse_no_clock() -> None:
+    """Every third once more, up to 60 ms later: a status may show that again, while sets play."""
+
+    async def run() -> None:
+        end, rng = MemoryLine("serial", "a", "b"), random.Random(1)
+
+        def inward(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            is_doubled = name == "Mark" and rng.random() < 1 / 3
+            return unaltered(name, data) + [(rng.uniform(0.0, 0.06), data)] * is_doubled
+
+        end.inward = inward
+        group = await group_of(end)
+        for number in range(100):
+            await asyncio.sleep(0.05)
+            await group.beat()
+            await asyncio.sleep(rng.uniform(0.0, 0.04))
+            tones = (Tone(0, 100.0, 0.1 + number / 200),)
+            await group.apply({each: [Layer(0, tones, 0.001)] for each in "ab"})
+            assert max(group.clock_errors.values()) < 1e-4
+        assert not any(each.reported_at for each in group.amplifiers.values())
+
+    run_virtual(run())

@@ -43,8 +43,10 @@ _KIND_OF_SCHEME = {
 def line_kind_of(url: str) -> str:
     """Return the kind of line of an amplifier's URL, a key of `CLOCK_ERRORS` where it is valid."""
     scheme, _, rest = url.partition("://")
+    if kind := dict(parse_qsl(rest.partition("?")[2].partition("#")[0])).get("line"):
+        return kind
     if scheme == "sim":
-        return dict(parse_qsl(rest.partition("?")[2])).get("line", SIMULATED)
+        return SIMULATED
     port = re.match(r"/dev/([a-zA-Z]+)\d", rest)
     by_scheme = _KIND_OF_SCHEME.get(scheme, "usb-full-speed")
     return (

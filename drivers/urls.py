@@ -7,6 +7,7 @@ from typing import Final
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from drivers.errors import CommandError
+from drivers.line_kinds import CLOCK_ERRORS
 
 ADDRESS: Final = 1
 """Address, unit or node of an amplifier as it is made."""
@@ -50,7 +51,8 @@ class Place:
 class AmplifierUrl:
     """A URL, from which a wire takes the parts that it has; CommandError for an invalid one.
 
-    form: valid URLs, for messages; known: names of the options.
+    form: valid URLs, for messages; known: names of the options, besides `line`, which every URL may
+    have: the kind of what is between host and amplifier, a key of `CLOCK_ERRORS`.
     """
 
     def __init__(self, url: str, form: str, known: Collection[str] = ()) -> None:
@@ -68,12 +70,17 @@ class AmplifierUrl:
         self.path = unquote(parts.path, errors="surrogateescape")  # names of files are bytes
         pairs = parse_qsl(parts.query, keep_blank_values=True, errors="surrogateescape")
         self.options = dict(pairs)
+        known = (*known, "line")
         unknown = sorted(self.options.keys() - set(known))
         self.require(
             not unknown,
-            f"option {', '.join(unknown)} is unknown; known are {', '.join(known) or 'none'}",
+            f"option {', '.join(unknown)} is unknown; known are {', '.join(known)}",
         )
         self.require(len(pairs) == len(self.options), "an option must not be repeated")
+        kind = self.options.get("line", "prompt")
+        self.require(
+            kind in CLOCK_ERRORS, f"line must be one of {', '.join(CLOCK_ERRORS)}, got {kind!r}"
+        )
 
     def refused(self, why: str) -> CommandError:
         """Return the error for a URL that is invalid: why, as `X must be Y`."""

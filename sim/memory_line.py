@@ -31,7 +31,7 @@ from sim.control.server import control_socket
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line import TwoWayLine
-from sim.transport.line_kinds import LINE_NAMES, LineDelays, delays_of
+from sim.transport.line_kinds import LineDelays, delays_of
 
 _FORM = (
     "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, &line=KIND, and &seed=N or "
@@ -47,7 +47,7 @@ class SimulationUrl:
     """
 
     def __init__(self, url: str) -> None:
-        self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "line", "seed", "exact"))
+        self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "seed", "exact"))
         options = self._url.options
         file = unquote(self._url.place, errors="surrogateescape") + self._url.path
         self._url.require(bool(file), "rig file must be named")
@@ -62,10 +62,6 @@ class SimulationUrl:
         self.control = Path(options["control"]) if options.get("control") else None
         self.amplifier = options.get("amplifier")
         self.line_kind = options.get("line")
-        self._url.require(
-            self.line_kind in (None, *LINE_NAMES),
-            f"line must be one of {', '.join(LINE_NAMES)}, got {self.line_kind!r}",
-        )
 
     def delays(self, rig: Rig, amplifier: str) -> LineDelays | None:
         """Those of an amplifier's line; as is usual where the rig has several amplifiers."""

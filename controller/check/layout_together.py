@@ -238,7 +238,7 @@ def _felt(
         intended = Intention(contacts, (), (one,), protected or frozenset())
         requested = ChoiceRequest(intended, {}, tuple(beside))
         chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
-        (predicted,) = chosen.beside(beside).predictions
+        (predicted,) = chosen.beside(beside, simulator.table).predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
         worst = min(worst, found[key][0])
     return worst, [found[contact.key] for contact, _ in fingers]

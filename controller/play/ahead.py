@@ -77,9 +77,11 @@ def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
 
 def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
     """Return what they feel of others there at most, by set of thresholds [dB SL]."""
-    heard = np.nan_to_num(found.tones.foreign_db_sl, nan=-math.inf, neginf=-math.inf)
-    margin = MARGIN_DB if len(heard) > count else 0.0
-    return [(heard[way].max(axis=0) + margin).tolist() for way in _ways(found, count)]
+    levels = found.tones.foreign_db_sl
+    heard = np.where(np.isnan(levels), -math.inf, levels)
+    if len(heard) == count:
+        return heard.tolist()  # type: ignore[no-any-return]
+    return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]
 
 
 def _ways(found: Answer, count: int) -> list[list[int]]:

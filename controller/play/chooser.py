@@ -111,7 +111,7 @@ class Chooser:
             left = self._left_by(_contents(beside), capabilities)
             found = self._chosen(requested, (each,), left, beside)
             kept.append(found)
-            short[each[0].key] = found.beside([requested.fading])
+            short[each[0].key] = found.beside([requested.fading], self.table)
         return Choice(requested, lasting, short, is_limited)
 
     def _lasting(

@@ -32,8 +32,7 @@ class Prediction:
     others' contents here, which nine of ten plates do not exceed. None where there is nothing to
     compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
     nominal_db_sl: its level on the plate as modelled; pauses: whether it ends, or comes and goes;
-    by_set: its level by each set of thresholds, above that by the rig's own [dB]; is_apart: whether
-    all that others feel is 30 Hz away.
+    is_apart: whether all that others feel is 30 Hz away.
     """
 
     contact: Contact
@@ -47,7 +46,6 @@ class Prediction:
     content: str | None = None
     nominal_db_sl: float | None = None
     pauses: bool = False
-    by_set: Sequence[float] = (0.0,)
     is_apart: bool = True
 
     @property
@@ -64,16 +62,19 @@ class Prediction:
         )
         return replace(self, verdict=verdict if self.is_apart else MIXED)
 
-    def beside(self, others: Sequence[float], total: Sequence[float]) -> "Prediction":
+    def beside(
+        self, others: Sequence[float], total: Sequence[float], above: Sequence[float] = (0.0,)
+    ) -> "Prediction":
         """Return it with other contents besides, whose powers add, by the set that is worst.
 
-        others: of these alone [dB SL], by each set of thresholds; total: all that is foreign here.
+        others: of these alone [dB SL], by each set of thresholds; total: all that is foreign here;
+        above: its level by each set, above that by the rig's own [dB].
         """
         level, contrast = self.level_db_sl, self.promised_contrast_db
         found = replace(self, foreign_level_db_sl=max(total))
         if level is None:
             return found
-        own = [level + above for above in self.by_set]
+        own = [level + each for each in above]
         least, background = math.inf if contrast is None else contrast, total
         if contrast is not None and self.foreign_level_db_sl is not None:  # else to quiet fingers
             background = sums_db([[each - contrast for each in own], others])
@@ -221,8 +222,11 @@ class Selection:
             ),
         )
 
-    def beside(self, others: Sequence["Selection"]) -> "Selection":
-        """Return it with what the fingers of its targets feel of others that play beside it."""
+    def beside(self, others: Sequence["Selection"], table: LocalizationTable) -> "Selection":
+        """Return it with what the fingers of its targets feel of others that play beside it.
+
+        table: whose sets of thresholds count.
+        """
         levels, total = dict[ContactKey, list[float]](), {**self.foreign_levels}
         for key in self.target_keys:
             of_others = foreign_at(key, others)
@@ -231,14 +235,15 @@ class Selection:
         if not levels:
             return self
 
-        def together(each: Prediction) -> Prediction:
+        def together(each: Prediction, above: Sequence[float] = (0.0,)) -> Prediction:
             key = each.contact.key
-            return each.beside(levels[key], total[key]) if key in levels else each
+            return each.beside(levels[key], total[key], above) if key in levels else each
 
-        contents = [
-            replace(each, predictions=tuple(map(together, each.predictions)))
-            for each in self.contents
-        ]
+        contents = []
+        for one in self.contents:
+            above = [*map(float, table.levels_by_set(0.0, one.layer.excitation))]
+            felt = [together(each, above) for each in one.predictions]
+            contents.append(replace(one, predictions=tuple(felt)))
         return replace(
             self,
             contents=tuple(contents),

@@ -7,7 +7,7 @@ each reading, of which every one differs.
 import logging
 from collections.abc import Callable, Mapping
 
-from model.ensemble.delays import MAX_HELD, ClockErrors
+from model.ensemble.delays import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
@@ -25,6 +25,7 @@ class CountedClocks:
     def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
         self._rig, self._now = rig, now
         self._names = sorted(rig.channel_counts)
+        self._counted = EXACT_CLOCKS
         self.errors: dict[str, float] = {}
         """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
 
@@ -47,8 +48,9 @@ class CountedClocks:
             before = self.errors
             self.errors = {name: MARGIN * known[name] for name in self._names}
             self._say(before)
-        eras = [era.name for era in table.eras]
-        return table.with_clocks(ClockErrors.of(eras, self._rig.wiring, self.errors))
+            eras = [era.name for era in table.eras]
+            self._counted = ClockErrors.of(eras, self._rig.wiring, self.errors)
+        return table.with_clocks(self._counted)
 
     def is_one_lost(self, known: Mapping[str, float]) -> bool:
         """Whether one is held no longer to those with which its amplifier shares contents.
@@ -62,10 +64,10 @@ class CountedClocks:
 
     def _is_other(self, known: Mapping[str, float]) -> bool:
         """Whether a clock is worse than counted, or one far better."""
-        return not self.errors or any(
-            known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted
-            for name, counted in self.errors.items()
-        )
+        for name, counted in self.errors.items():  # as often
+            if known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted:
+                return True
+        return not self.errors
 
     def _say(self, before: Mapping[str, float]) -> None:
         """Log which amplifiers play contents of their own from now on, and which no longer.

@@ -8,7 +8,7 @@ import cmath
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -110,16 +110,10 @@ def selection_of(
 
     before: what fingers feel now, whose phases are kept if is_in_phase.
     """
-
     count = len(targets) + len(quiet)
     sensed = felt_on_ways(found, count)
     here = replace(found, asked=found.asked[:count])  # without the ends of ways
-
-    @cache
-    def fields() -> Complex64Array:
-        places = [each.finger.at for each in sensed[: len(targets)]]
-        return table.unit_fields(np.array(places), contacts=places)
-
+    fields: Complex64Array | None = None  # seldom needed
     contents: list[Content] = []
     skipped: list[Prediction] = []
     felt, unfelt = [*zip(targets, sensed, strict=False)], set[ContactKey]()
@@ -148,15 +142,18 @@ def selection_of(
         )
         for voice, played in enumerate(voices):
             if layer.side_bands or (is_in_phase and carrier is not None):
+                if fields is None:
+                    places = [each.finger.at for each in sensed[: len(targets)]]
+                    fields = table.unit_fields(np.array(places), contacts=places)
                 then = carrier if is_continued else None
-                played = _in_phase(played, then, fields(), layer.fingers[0], table)
+                played = _in_phase(played, then, fields, layer.fingers[0], table)
             contents.append(
                 Content(
                     (contact.key, target.voice + voice),
                     tuple(own),
                     placed,
                     shape(placed, played, is_continued) if shape else played,
-                    () if voice else _predictions(own, sensations, layer, table),
+                    () if voice else _predictions(own, sensations, layer),
                 )
             )
     contacts = [*[contact for contact, _ in targets], *quiet]
@@ -296,7 +293,6 @@ def _predictions(
     targets: Sequence[tuple[Contact, Target]],
     sensations: Sequence[Sensation],
     layer: Layer,
-    table: LocalizationTable,
 ) -> tuple[Prediction, ...]:
     """What is predicted of a layer's finger, and of those that share it."""
     first, own = targets[0]
@@ -304,7 +300,6 @@ def _predictions(
         f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
         "apart"
     )
-    by_set = tuple(map(float, table.levels_by_set(0.0, layer.excitation)))
     predictions: list[Prediction] = []
     for (contact, target), felt in zip(targets, sensations, strict=True):
         predictions.append(
@@ -320,7 +315,6 @@ def _predictions(
                 own.content,
                 felt.level_db_sl,
                 pauses=felt.pauses or target.pulse is not None,
-                by_set=by_set,
             ).judged()
         )
     return tuple(predictions)

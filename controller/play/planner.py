@@ -36,6 +36,8 @@ RETRY = 1.0
 """Time [s] after which a set is planned again that was refused without an end, fingers that rest
 included."""
 
+_CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; after which clocks are counted though fingers change
+
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
 
@@ -112,6 +114,7 @@ class Planner:
         self._plan: Plan | None = None  # the last, None where what plays is unknown
         self._intent_due = math.inf  # s; when the intent may change without a touch
         self._retry_at = math.inf  # s; when a ledger may admit what it refused
+        self._clocks_due = -math.inf  # s; though fingers change
         self._arrived, self._too_late = arrived, too_late
         self._seen: Sequence[Contact] = ()  # by the last plan
         self._awaited: dict[int, Pulse] = {}  # by identity: planned, and not known to have started
@@ -124,6 +127,17 @@ class Planner:
         self.timing, layers = timing, self.layers
         layers.builder = replace(layers.builder, timing=timing)
         self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
+
+    def _look_at_clocks(self, now: float) -> bool:
+        """Count the clocks at a time [s]; returns whether one is lost that was held.
+
+        Where fingers change only if none was for long, since their answer waits for it.
+        """
+        self._clocks_due, known = now + _CLOCKS_INTERVAL, self.clocks.known
+        if is_one_lost := self.clocks.is_one_lost(known):  # what plays may be part of it
+            self._selector.choose_anew()
+        self._count_clocks(known)
+        return is_one_lost
 
     def _count_clocks(self, known: Mapping[str, float] | None = None) -> None:
         """Answer by the clocks as they are now; what plays stays until it changes."""
@@ -243,15 +257,13 @@ class Planner:
         before, contacts = self._plan, self._tracker.contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
-            known = self.clocks.known
-            is_one_lost = self.clocks.is_one_lost(known)
+            is_one_lost = False
+            if now >= self._clocks_due or not self._tracker.changed:
+                is_one_lost = self._look_at_clocks(now)
             is_due = self._tracker.changed or now >= self.due or is_one_lost
             if before is not None and not is_due:
                 return self._go_on(before, now)
             self._seen = contacts
-            if is_one_lost:  # what plays may be part of it
-                self._selector.choose_anew()
-            self._count_clocks(known)
             self._intent_due = math.inf
             intent = self._intent_source.intent(contacts, now)
             self._intent_due = intent.due(now)

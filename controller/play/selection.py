@@ -36,6 +36,7 @@ from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
+from model.table.table import LocalizationTable
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for. One that moves is answered for
@@ -221,7 +222,7 @@ class Selector:
                         instead=unanswered(requested, GIVEN_UP),
                     )
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
-        found = _together(contacts, targets, parts, skipped, intent.reason)
+        found = _together(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
         if self._thread.is_busy and len(found.predictions) < len(by_key):
             reason = found.reason or (None if found.contents else BEING_CHOSEN)
             found = replace(found, is_pending=True, reason=reason)
@@ -356,6 +357,7 @@ def _together(
     parts: Sequence[Selection],
     skipped: tuple[Prediction, ...],
     reason: str,
+    table: LocalizationTable,
 ) -> Selection:
     """Join what was chosen apart, contacts as they were then; reason: why there are no targets."""
     chosen: list[Selection] = []
@@ -364,7 +366,9 @@ def _together(
             chosen.append(part)
     if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
         return chosen[0]
-    restated = [part.beside([each for each in chosen if each is not part]) for part in chosen]
+    restated = []
+    for part in chosen:
+        restated.append(part.beside([each for each in chosen if each is not part], table))
     then = {key: each for part in chosen for key, each in part.contacts.items()}
     keys = {contact.key for contact, _ in targets}
     quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]

@@ -19,6 +19,7 @@ what they state. One is held to the host's, and the others to it.
 """
 
 import math
+from collections import deque
 from statistics import median_low
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ _MARKED = 1.0  # s of Marks by which clocks are compared: over more a crystal be
 _AGREEING = 3  # Marks at least: of two none tells which is false
 _ROUNDS = 3  # of laying the line, and choosing what it goes through
 _RECENT = 8  # all above the line: by so much it may be wrong; far above: the clock was moved
+_BULK, _FAR_OUT = 64, 2.0  # readings; times what they lie within, but for an eighth either way
 _ERRORS = 1.4  # the lowest of some readings depend on each other: by simulation
 _EXPECTED_RATE = 50e-6  # of a crystal against the host's; more needs to be seen well
 _MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or runs backwards
@@ -90,10 +92,12 @@ class HeldClock:
     def _forget(self, time: float) -> None:
         """Begin anew at a time, as with a clock that was never read."""
         self._lowest: list[tuple[float, float, float]] = []  # time, lead, and how late at the most
+        self._all = deque[tuple[float, float]](maxlen=_BULK)  # times and leads
         self._line = _Line(time)
         self._marked: dict[float, float] = {}  # leads, by when a Mark arrived
         self._beside = _Line(-math.inf)  # to the other's, from the newest Mark of both
         self._added = -self._pace * time  # s; with pace * time what shifts and rates have added
+        self._is_doubted = False  # whether the last reading was too early, as none before
 
     def identified(self, stated: int, *, bits: float) -> None:
         """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
@@ -134,8 +138,8 @@ class HeldClock:
         return math.remainder(unsteered + self._added + self._pace * time, CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
-        """Return the standard error of its lead as it is read [s]; infinite before that."""
-        return self._seen(time).error
+        """Return the standard error of its lead as it is read [s]; infinite if it must be."""
+        return math.inf if self._is_doubted else self._seen(time).error
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
         """Return its error [s rms] with what it states; infinite if unknown.
@@ -146,7 +150,7 @@ class HeldClock:
         if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
             return math.inf
         lead = (self.lead(time) if off is None else off) if self._is_armed else 0.0
-        seen = self.scatter(time)
+        seen = self._seen(time).error
         if is_common:
             seen = self._beside.at(time).error if self.is_compared else 0.0
         return math.hypot(self.stated / _PER_ERROR / math.sqrt(3), seen, lead)
@@ -179,7 +183,7 @@ class HeldClock:
         if is_trusted and (first is not None or self._is_first):
             common = lead if first is None else first.lead(time)
         own, seen = lead - common, self._line if first is None else self._beside
-        near = max(_NEAR, 2 * self.scatter(time))  # what is not seen accuses none
+        near = max(_NEAR, 2 * line.error)  # what is not seen accuses none
         if abs(own) <= near and (first or abs(common) <= max(near, _TOGETHER[1] * CLOCK_SETTLING)):
             self._near_at = time
         is_gentle = is_playing or abs(own) <= max(_NEAR, seen.error)
@@ -247,21 +251,27 @@ class HeldClock:
         line, shown = self._line, clock * _STEP - time - self._added - self._pace * time
         lead = line.lead + line.rate * (time - line.time)
         off = math.remainder(shown - lead, CLOCK_TURN)
-        far = _FAR + _FAR_ERRORS * self.scatter(time) + self.stated / _PER_ERROR
+        error = self._seen(time).error
+        far = _FAR + _FAR_ERRORS * error + self.stated / _PER_ERROR
         # What was read before came late where it is above, each by no more than its exchange took.
         sure = max(
             [low - late - line.rate * (at - time) for at, low, late in self._lowest],
             default=-math.inf,
         )
-        if not sure - lead - far - earlier <= off <= later + far:
+        is_early = off < sure - lead - far - earlier
+        self._is_doubted = is_early and not self._is_doubted
+        if self._is_doubted:  # one alone may show a Mark that came twice
+            return lead + off
+        if is_early or off > later + far:
             if is_reported:
                 self._jumped_at = time
             self._forget(time)
             lead, off = 0.0, math.remainder(clock * _STEP - time, CLOCK_TURN)
-        elif off < -_FAR - _SURELY * self.scatter(time):
+        elif off < -_FAR - _SURELY * error:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
+        self._all.append((time, lead + off))
         part = _MIN_PART
         self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
         while self._lowest and time - self._lowest[0][0] > _PARTS * part:
@@ -353,5 +363,11 @@ class HeldClock:
         # None is later than its exchange took longer than the promptest one.
         if min([off - late for off, late in recent]) > _FAR / 2:
             del self._lowest[:-_RECENT]
-        off = min(recent)[0]
-        self._line = _Line(time, lead, rate, bend, max(error, off), rate_error)
+        error = max(error, min(recent)[0])
+        # Few far before most: most are late, or few are read wrong. Each is half the gap away.
+        bulk = sorted([each + (rate - bend * (time - at)) * (time - at) for at, each in self._all])
+        eighth = len(bulk) // 8
+        low, high = above[0][0], bulk[eighth]
+        if len(bulk) == _BULK and high - low > _FAR_OUT * (bulk[~eighth] - high):
+            lead, error = (low + high) / 2, error + (high - low) / 2
+        self._line = _Line(time, lead, rate, bend, error, rate_error)

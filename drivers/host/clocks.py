@@ -1,9 +1,9 @@
 """The clocks of all amplifiers of a plate: how well they agree, and what more is read of them.
 
 Where heartbeats alone do not show clocks well enough, on USB of full speed or in a busy network,
-statuses are read between them, as seldom as the lines allow, and given up for whatever is sent
-next. On a line that several share one Mark lets all keep the clock of the same byte, so that what
-delays it is common to all of them.
+statuses are read between them, the seldomer the better these are known, and given up for whatever
+is sent next. On a line that several share one Mark lets all keep the clock of the same byte, so
+that what delays it is common to all of them.
 """
 
 import asyncio
@@ -23,9 +23,10 @@ from drivers.host.members import Members
 from drivers.protocol.table import has_feature
 from drivers.protocol.timing import HEARTBEAT
 
-_GOOD, _POOR = 5e-6, 12e-6  # s; an error that costs nothing of a promise, and one that does
+# s; an error that costs nothing of a promise, one that costs a tenth of a dB, and more.
+_GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
 _MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
-_INTERVAL = 0.01  # s, at least, between these; half of that where an error is poor
+_INTERVAL = 0.01  # s, at least, between these; half where an error is poor, longer where near good
 _SETTLING = 0.2  # s, at most, for readings before clocks are needed
 _FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
@@ -156,7 +157,8 @@ class Clocks:
                     worst = max(worst, each.clock.scatter(now))
         if worst <= _GOOD:
             return
-        least = _INTERVAL if worst <= _POOR else _INTERVAL / 2
+        longer = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
+        least = _INTERVAL * (longer if worst <= _POOR else 0.5)
         for line, of_line in unmarked:
             if line.late <= GRACE:
                 # Each by itself: one behind the reply to another is sent in step with frames.

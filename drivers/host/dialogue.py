@@ -321,10 +321,12 @@ class Dialogue:
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:
-                self._may_wait_until = -math.inf if is_now else now + MAX_AHEAD
                 starts = None if is_now or self.starts <= now else self.starts
-                error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
-                self._is_start_known = error <= _MAX_START_ERROR
+                self._may_wait_until, error = -math.inf, 0.0
+                if not is_now:
+                    self._may_wait_until = now + MAX_AHEAD
+                    error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
+                    self._is_start_known = error <= _MAX_START_ERROR
                 error = 0.0 if starts is None else min(max(error, HIGH_TIME), _MAX_START_ERROR)
                 self.played_at = arrives if starts is None else starts
                 self._ledger.sent(admitted.token, admitted.layers, now, starts=starts, error=error)
@@ -353,7 +355,9 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        self.clock.replied(name, values, reply, now)
+        # Beside heartbeats a Commit's tells nothing more, unless it may show a Mark.
+        if name != "Commit" or len(self.line.members) > 1:
+            self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger, is_enabled, fed = self._ledger, reply["state"] == ENABLED, message.feeds

@@ -130,6 +130,7 @@ class ExpectedAmplifier(ExpectedStates):
                 if not self.is_enabled or values["session"] != self.session:
                     self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
                     self.token = 0
+                    self.clock.shifted()
                 self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
                 self.watchdog, self.fed = values["watchdog"] / 1000, when
             case "Silence":

@@ -30,18 +30,28 @@ class ExpectedClock:
 
     def mark(self, when: Interval) -> None:
         """Note a Mark that comes between two times."""
-        self._marked, self._is_unclear = when, False
+        self._marked = when
+
+    def shifted(self) -> None:
+        """Note that it may go on from elsewhere."""
+        self._read = None
 
     def unheard(self) -> None:
-        """Note that a status may have shown the clock of a Mark which was not heard."""
+        """Note that the next status may show another clock than what was heard says.
+
+        The present one, if a status before showed the Mark, or that of a Mark that came twice.
+        """
         self._is_unclear = True
 
     def check(self, shown: int, when: Interval) -> None:
         """Note what a status shows, or compare it where it is the clock of a Mark."""
         marked, self._marked = self._marked, None
+        is_unclear, self._is_unclear = self._is_unclear, False
+        if is_unclear:
+            return
         if marked is None:
             self._read = shown, when
-        elif self._read is not None and not self._is_unclear:
+        elif self._read is not None:
             clock, read = self._read
             slack = self._slack + _DRIFT * (marked[1] - read[0])
             low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack

@@ -57,8 +57,9 @@ class FingersOnPlate:
 
         def touched(on: PlateOnEras) -> TouchedPlate:
             if by_kernel:
-                return touch(on, centres, loads)
-            return TouchedPlate(on, centres, on.plate.finger_stiffness(len(centres), loads))
+                return touch(on, centres, loads, table.clocks)
+            stiffness = on.plate.finger_stiffness(len(centres), loads)
+            return TouchedPlate(on, centres, stiffness, table.clocks)
 
         has_harmonics = table.uncertainty.harmonic > 0
         twice = touched(table.at_harmonics) if has_harmonics else None

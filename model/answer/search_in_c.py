@@ -111,7 +111,8 @@ _kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
 
 def _with(table: LocalizationTable, fingers: int) -> _Fingers:
     judging, promise = (
-        draws_structure(table.on_eras, fingers, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
+        draws_structure(table.on_eras, table.clocks, fingers, by)
+        for by in (JUDGING_DRAWS, PROMISED_DRAWS)
     )
     return judging, promise, *_stiffness(table, fingers)
 
@@ -146,7 +147,7 @@ def _kept_of(table: LocalizationTable) -> _Kept:
         group=np.array(groups, dtype=np.int32) if groups else None,
         threshold=table.thresholds,
         error=table.error_power,
-        shares=table.attached.power_shares,
+        shares=table.power_shares,
         frequencies=table.frequencies,
         sensitivities=table.sensitivities.T,
         search_error=table.search_error_power,

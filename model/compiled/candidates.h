@@ -267,13 +267,17 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
     const size_t n = on->n, k = on->k;
     const int blocks = (count + LANES - 1) / LANES;
     int has_fine = 0;
-    char *is_other = take(memory, k);
-    for (int content = 0; content < of->contents; content++)
-        has_fine |= (int)find_others(is_other, of, content, k) <= by->max_by_point;
+    char *is_other = take(memory, k), *is_fine = take(memory, k);
+    memset(is_fine, 0, k);
+    for (int content = 0; content < of->contents; content++) {
+        if ((int)find_others(is_other, of, content, k) > by->max_by_point) continue;
+        has_fine = 1;
+        for (size_t finger = 0; finger < k; finger++) is_fine[finger] |= is_other[finger];
+    }
     const grouped each = {.groups = k, .p = of->few, .fine = has_fine ? k * of->fine : 0, .others = by->others,
                           .gain_variance = by->gain_variance, .ridge = by->ridge, .points = of->few_points,
                           .fine_points = of->fine_points, .weights = of->few_weights, .error = by->search_error,
-                          .shares = by->shares};
+                          .shares = by->shares, .is_fine = is_fine, .rim = by->is_deep ? 0 : by->rim[1]};
     formed *found = take(memory, blocks * sizeof(formed));
     searched *forms = take(memory, blocks * sizeof(searched));
     rows_found at = new_rows(blocks * LANES, n, memory);

@@ -244,7 +244,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
         is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
     }
     if (!from.count) return NOT_REACHED;
-    const float *columns = columns_of(of->fine_points, k * of->fine, on->r, memory);
+    const float *columns = columns_of(of->fine_points, k * of->fine, on, memory);
     const size_t draws = of->judging->count;
     float *own = floats(memory, from.count * draws + LANES);
     float *loudest = floats(memory, from.count * k * draws + LANES);

@@ -2,19 +2,20 @@
 #ifndef DRAWN_H
 #define DRAWN_H
 
-#include "arena.h"
-#include "fingers.h"
+#include "points.h"
 
 /* Plates in the order of their thicknesses; width: floats of a row, a register more than plates. */
 typedef struct {
     int count, bases, nodes, width; /* plates; thicknesses of changes; thicknesses of plates */
     int first_base, first_node;     /* of these by index among those of the plate */
-    int gains_of_row;               /* floats from the gains of a frequency to those of the next; 0: of all */
+    int amplifiers;                 /* whose clocks are off; 0 for none */
     const int *node;                /* (count) */
     const float *loss, *damping;    /* (width) */
-    const float *own, *gains;       /* (a, width); (rows, 2, a, width) real and imaginary parts */
+    const float *own, *gains;       /* (a, width); (2, a, width) real and imaginary parts */
     const float *errors;            /* (2, k, width) */
     const float *harmonics;         /* (2, n, width) second harmonics of ERAs, relative to their motion */
+    const float *delays;            /* (amplifiers, width) [s] */
+    const int *amplifier;           /* (n) of each ERA */
 } draws;
 
 /* Points of all fingers, and what tones at them are measured by. */
@@ -49,44 +50,6 @@ INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
     const size_t base = (group - 1) / groups, from = (group - 1) % groups * LANES;
     *first = 1 + base * each + from;
     return each - from < LANES ? each - from : LANES;
-}
-
-/* found (count, 2, padded): real and imaginary parts at points of coordinates (count, r); columns (r, padded). */
-SHARED void at_points(float *found, const float *coordinates, size_t count, const float *columns, size_t padded,
-                      size_t r) {
-    for (size_t first = 0; first < count; first += 3)
-        for (size_t point = 0; point < padded; point += 2 * LANES) {
-            const float *of[3];
-            lanes s[3][4] = {{{0}}};
-            for (size_t i = 0; i < 3; i++) of[i] = coordinates + 2 * r * (first + i < count ? first + i : first);
-            for (size_t j = 0; j < r; j++) {
-                lanes a, b;
-                memcpy(&a, columns + j * padded + point, sizeof a);
-                memcpy(&b, columns + j * padded + point + LANES, sizeof b);
-                s[0][0] += a * of[0][2 * j], s[0][1] += b * of[0][2 * j];
-                s[0][2] += a * of[0][2 * j + 1], s[0][3] += b * of[0][2 * j + 1];
-                s[1][0] += a * of[1][2 * j], s[1][1] += b * of[1][2 * j];
-                s[1][2] += a * of[1][2 * j + 1], s[1][3] += b * of[1][2 * j + 1];
-                s[2][0] += a * of[2][2 * j], s[2][1] += b * of[2][2 * j];
-                s[2][2] += a * of[2][2 * j + 1], s[2][3] += b * of[2][2 * j + 1];
-            }
-            for (size_t i = 0; i < 3 && first + i < count; i++) {
-                float *to = found + 2 * padded * (first + i) + point;
-                memcpy(to, s[i], 2 * sizeof(lanes));
-                memcpy(to + padded, s[i] + 2, 2 * sizeof(lanes));
-            }
-        }
-}
-
-INLINE size_t padded_to(size_t points) { return (points + 2 * LANES - 1) / (2 * LANES) * (2 * LANES); }
-
-/* (r, padded) of rows (points, r). */
-SHARED float *columns_of(const float *rows, size_t points, size_t r, arena *memory) {
-    const size_t padded = padded_to(points);
-    float *found = floats(memory, r * padded);
-    for (size_t j = 0; j < r; j++)
-        for (size_t i = 0; i < padded; i++) found[j * padded + i] = i < points ? rows[i * r + j] : 0;
-    return found;
 }
 
 /* Drives (n) at weights, the fingers' motions (k) by them. */
@@ -148,28 +111,6 @@ SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
     release(memory, mark);
 }
 
-/* coordinates (b + k, r) by a force at each attachment and then each finger. */
-INLINE void by_each_force(value *coordinates, const touched *of, const plates *on, value *room) {
-    const size_t b = on->b, k = on->k, r = on->r;
-    value *G = room; /* (k, r) displacement by a force at each finger, without the others */
-    for (size_t i = 0; i < k; i++) {
-        row_product(G + i * r, of->through + i, k, of->T, b, r, 0, 0);
-        for (size_t s = 0; s < r; s++) {
-            G[i * r + s].re += of->g[s].re * on->centres[i * r + s];
-            G[i * r + s].im += of->g[s].im * on->centres[i * r + s];
-        }
-    }
-    for (size_t j = 0; j < b; j++) {
-        row_product(coordinates + j * r, of->held + j, b, G, k, r, 0, 0);
-        add(coordinates + j * r, of->T + j * r, r);
-    }
-    for (size_t i = 0; i < k; i++) {
-        value *own = coordinates + (b + i) * r;
-        row_product(own, of->P + i * k, 1, G, k, r, 0, 0);
-        for (size_t s = 0; s < r; s++) own[s] = scaled(own[s], of->minus_omega2);
-    }
-}
-
 /* Forces (4, a) that a standard deviation of loss, damping, own stiffness and gain adds at attachments and
  * fingers, and the reduced coordinates (r) by the loss factor beside those. */
 INLINE void find_changes(value *forces, value *lost, const touched *of, const plates *on, const int *rows,
@@ -225,14 +166,15 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
     release(memory, mark);
 }
 
-/* What tones change by, at points (r, padded), of weights (m, n). */
+/* What tones change by, of weights (m, n); columns as of `columns_of`. */
 SHARED void find_by_force(tones *to, const float *columns, const float *weights, arena *memory) {
     const plates *on = to->on;
-    const size_t n = on->n, k = on->k, a = on->b + k, r = on->r, bases = to->by->bases, cases_in_all = to->m * bases;
+    const size_t n = on->n, a = on->b + on->k, r = on->r, bases = to->by->bases, cases_in_all = to->m * bases;
+    const size_t each = 2 * (a + 1) * to->padded;
     const arena mark = *memory;
-    value *space = values(memory, touched_space(on)), *room = values(memory, k * r);
-    value *coordinates = values(memory, (a + 1) * r), *forces = values(memory, 4 * a), *w = values(memory, n);
-    float *each = floats(memory, 2 * LANES * (a + 1) * r);
+    value *space = values(memory, touched_space(on)), *lost = values(memory, r), *forces = values(memory, 4 * a);
+    value *w = values(memory, n);
+    float *by_loss = floats(memory, 2 * LANES * r);
     for (size_t first = 0; first < cases_in_all; first += LANES) {
         size_t count = cases_in_all - first < LANES ? cases_in_all - first : LANES;
         int rows[LANES], cases[LANES], given[LANES];
@@ -242,15 +184,13 @@ SHARED void find_by_force(tones *to, const float *columns, const float *weights,
             cases[l] = rows[l] * on->t + to->by->first_base + (int)(at % bases);
         }
         touched of;
-        put_fingers(&of, on, rows, cases, space);
+        float *found = to->by_force + each * first;
+        put_fingers_at_points(&of, found, each, on, rows, cases, count, columns, to->padded, to->at->points, space, memory);
         load(w, weights, n, given);
-        by_each_force(coordinates, &of, on, room);
-        find_changes(forces, coordinates + a * r, &of, on, rows, cases, w, memory);
+        find_changes(forces, lost, &of, on, rows, cases, w, memory);
         store(to->forces + 2 * 4 * a * first, forces, 4 * a, count);
-        store(each, coordinates, (a + 1) * r, count);
-        for (size_t l = 0; l < count; l++)
-            at_points(to->by_force + 2 * (a + 1) * to->padded * (first + l), each + 2 * (a + 1) * r * l, a + 1, columns,
-                      to->padded, r);
+        store(by_loss, lost, r, count);
+        at_points(found + 2 * a * to->padded, each, by_loss, count, columns, to->padded, r);
     }
     release(memory, mark);
 }
@@ -258,7 +198,7 @@ SHARED void find_by_force(tones *to, const float *columns, const float *weights,
 /* Tones at rows (m) of weights (m, n). */
 SHARED tones respond(const plates *on, const draws *by, const sensors *at, const float *columns, size_t m,
                      const int *rows, const float *weights, arena *memory) {
-    const size_t n = on->n, a = on->b + on->k, padded = padded_to(at->points), cases = m * by->bases;
+    const size_t n = on->n, a = on->b + on->k, padded = padded_to(at->points + on->k), cases = m * by->bases;
     tones found = {.on = on, .by = by, .at = at, .m = m, .padded = padded, .rows = rows, .error = floats(memory, m),
                    .at_nodes = floats(memory, 2 * m * (1 + by->nodes) * at->points),
                    .by_force = floats(memory, 2 * cases * (a + 1) * padded),
@@ -276,15 +216,14 @@ SHARED tones respond(const plates *on, const draws *by, const sensors *at, const
     return found;
 }
 
-INLINE lanes some(const float *from) {
-    lanes found;
-    memcpy(&found, from, sizeof found);
-    return found;
-}
-
-/* sum + (re + i im) f. */
-INLINE value add_scaled(value sum, value f, float re, float im) {
-    return (value){.re = sum.re + re * f.re - im * f.im, .im = sum.im + re * f.im + im * f.re};
+/* exp(-i phase). */
+INLINE value late_by(lanes phase) {
+    const lanes turns = phase * 0.15915494f, rounder = filled(12582912);
+    const lanes x = (turns - (turns + rounder - rounder)) * 1.5707963f, s = x * x; /* of a quarter of the phase */
+    const lanes cosine = 1 + s * (-1 / 2.f + s * (1 / 24.f + s * (-1 / 720.f + s * (1 / 40320.f))));
+    const lanes sine = x * (1 + s * (-1 / 6.f + s * (1 / 120.f + s * (-1 / 5040.f + s * (1 / 362880.f)))));
+    const value quarter = {.re = cosine, .im = -sine}, half = times(quarter, quarter);
+    return times(half, half);
 }
 
 /* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
@@ -305,11 +244,17 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     const size_t from = first - 1, base = tone * by->bases + (group - 1) / groups_of(by);
     const float *loss = of->forces + 2 * 4 * a * base, *damping = loss + 2 * a, *own = damping + 2 * a, *gain = own + 2 * a;
     const float *T = of->by_force + 2 * (a + 1) * padded * base;
-    const float *gains = by->gains + (size_t)of->rows[tone] * by->gains_of_row;
+    const float omega = sqrtf(-of->on->minus_omega2[of->rows[tone]]);
+    value late[1 + by->amplifiers];
+    for (int i = 0; i < by->amplifiers; i++) late[i] = late_by(omega * some(by->delays + i * width + from));
     lanes by_loss = some(by->loss + from), by_damping = some(by->damping + from);
     for (size_t j = 0; j < a; j++) {
         lanes by_own = some(by->own + j * width + from);
-        lanes re = some(gains + j * width + from), im = some(gains + (a + j) * width + from);
+        lanes re = some(by->gains + j * width + from), im = some(by->gains + (a + j) * width + from);
+        if (by->amplifiers && j < (size_t)of->on->n) {
+            const value found = times((value){.re = 1 + re, .im = im}, late[by->amplifier[j]]);
+            re = found.re - 1, im = found.im;
+        }
         force[j].re = loss[2 * j] * by_loss + damping[2 * j] * by_damping + own[2 * j] * by_own + gain[2 * j] * re -
                       gain[2 * j + 1] * im;
         force[j].im = loss[2 * j + 1] * by_loss + damping[2 * j + 1] * by_damping + own[2 * j + 1] * by_own +

@@ -6,17 +6,20 @@
 
 typedef struct {
     int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
+    int rows, lanes;            /* frequencies; lanes of the blocks below */
     float load_std;
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
     const float *centres, *stiffness;                      /* (k, r); (f, k) D */
+    value *of_blocks; /* (blocks of LANES frequencies, the first 3 thicknesses or 1, b, r) T, as `load` gives it */
 } plates;
 
 /* Some cases, each of a frequency and a thickness, with the fingers on them. */
 typedef struct {
-    value *T, *g, *Y;        /* (b, r), (r), (b, b) */
+    const value *T;          /* (b, r) */
+    value *g, *Y;            /* (r), (b, b) */
     value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
     value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
     value *G;                /* (k, k) displacement of the fingers by a force at each, without the others */
@@ -54,40 +57,59 @@ INLINE void add(value *to, const value *more, size_t count) {
     for (size_t i = 0; i < count; i++) to[i] = (value){.re = to[i].re + more[i].re, .im = to[i].im + more[i].im};
 }
 
+/* Add to G (p, k) what attachments add, of X (p, b), accelerations at points by a force at each. */
+INLINE void by_eras(value *restrict G, size_t p, const value *X, const touched *of, const plates *on) {
+    for (size_t i = 0; i < p; i++) {
+        row_product(of->row, X + i * on->b, 1, of->through, on->b, on->k, 0, 0);
+        add(G + i * on->k, of->row, on->k);
+    }
+}
+
 /* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),
- * accelerations there by a force at each attachment. */
+ * accelerations there by a force at each attachment, or without these. */
 INLINE void by_fingers(value *restrict G, const float *points, size_t p, const value *X, const touched *of,
                        const plates *on) {
-    const size_t b = on->b, k = on->k, r = on->r;
-    value *modal = of->row + b + k;
+    const size_t k = on->k, r = on->r;
+    value *modal = of->row + on->b + k;
     for (size_t j = 0; j < k; j++) {
         for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centres[j * r + s]));
         multiply_into(G + j, k, points, modal, p, r);
     }
-    for (size_t i = 0; i < p; i++) {
-        row_product(of->row, X + i * b, 1, of->through, b, k, 0, 0);
-        add(G + i * k, of->row, k);
-    }
+    if (X) by_eras(G, p, X, of, on);
 }
 
-/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
-SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
+/* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
+INLINE const value *of_block(const plates *on, const int *rows, const int *cases) {
+    const int kept = on->t < 3 ? on->t : 3, thickness = cases[0] - rows[0] * on->t;
+    int is_block = on->lanes == LANES && rows[0] % LANES == 0 && thickness < kept;
+    for (int l = 1; l < LANES; l++) {
+        is_block &= rows[l] == (rows[0] + l < on->rows ? rows[0] + l : on->rows - 1); /* the last one is repeated */
+        is_block &= cases[l] - rows[l] * on->t == thickness;
+    }
+    return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * kept + thickness) * on->b * on->r : NULL;
+}
+
+/* Places in work space; the end of it. */
+INLINE value *place(touched *to, const plates *on, value *work) {
     const size_t b = on->b, k = on->k, r = on->r;
-    to->T = work, to->g = to->T + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
+    to->g = work + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
     to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->G = to->D + k;
     to->through = to->G + k * k, to->held = to->through + b * k, to->forced = to->held + k * b;
     to->row = to->forced + k * k;
-    load(to->T, on->by_force, b * r, cases);
-    load(to->g, on->receptance, r, cases);
+    return to->row + b + k + r;
+}
+
+/* All that follows from what attachments do at the fingers, and from G of the free plate. */
+SHARED void couple(touched *to, const plates *on, const int *rows, const int *cases) {
+    const size_t b = on->b, k = on->k;
     load(to->Y, on->coupling, b * b, cases);
     load(to->D, on->stiffness, k, rows);
     load_real(&to->minus_omega2, on->minus_omega2, 1, rows);
-    multiply(to->at, on->centres, to->T, k, r, b);
     for (size_t i = 0; i < k; i++) {
         row_product(to->row, to->at + i * b, 1, to->Y, b, b, 0, 0); /* Y is symmetric */
         for (size_t j = 0; j < b; j++) to->through[j * k + i] = to->row[j];
     }
-    by_fingers(to->G, on->centres, k, to->at, to, on);
+    by_eras(to->G, k, to->at, to, on);
     memcpy(to->P, to->G, k * k * sizeof(value));
     invert(to->P, to->D, k);
     product(to->resting, to->P, k, to->at, k, k, b);
@@ -95,19 +117,42 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
         for (size_t j = 0; j < b; j++) to->held[i * b + j] = subtract_product(ZERO, to->D[i], to->resting[i * b + j]);
         for (size_t j = 0; j < k; j++) to->forced[i * k + j] = scaled(to->P[j * k + i], to->minus_omega2);
     }
-    return to->row + b + k + r;
 }
 
-/* found (p, width): accelerations at points (p, r) by a force at each of the first width attachments
- * and fingers; room for (p, b + k). */
-SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, const touched *of,
+/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
+SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
+    value *end = place(to, on, work);
+    to->T = of_block(on, rows, cases);
+    if (!to->T) load(work, on->by_force, (size_t)on->b * on->r, cases), to->T = work;
+    load(to->g, on->receptance, on->r, cases);
+    multiply(to->at, on->centres, to->T, on->k, on->r, on->b);
+    by_fingers(to->G, on->centres, on->k, NULL, to, on);
+    couple(to, on, rows, cases);
+    return end;
+}
+
+/* found (p, width): accelerations at points (p, r), each of them of a finger, by a force at each of the first width
+ * attachments and fingers; room for (p, b + k). */
+SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, size_t each, const touched *of,
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k;
     const value *X = of->at, *G = of->G; /* at the centres */
     if (points != on->centres || p != k) {
-        X = room, G = room + p * b;
-        multiply(room, points, of->T, p, on->r, b);
-        by_fingers(room + p * b, points, p, X, of, on);
+        value *of_eras = room, *of_fingers = room + p * b;
+        const size_t r = on->r;
+        for (size_t first = 0, next; first < p; first = next) {
+            size_t finger = 0;
+            next = first + each;
+            while (finger < k && memcmp(points + first * r, on->centres + finger * r, r * sizeof(float))) finger++;
+            if (finger < k) { /* what is known of its centre is not computed again */
+                memcpy(of_eras + first * b, of->at + finger * b, b * sizeof(value));
+                memcpy(of_fingers + first * k, of->G + finger * k, k * sizeof(value));
+                first++;
+            }
+            multiply(of_eras + first * b, points + first * r, of->T, next - first, r, b);
+            by_fingers(of_fingers + first * k, points + first * r, next - first, of_eras + first * b, of, on);
+        }
+        X = of_eras, G = of_fingers;
     }
     for (size_t i = 0; i < p; i++) {
         row_product(of->row, G + i * k, 1, of->held, k, b, 0, 0);

@@ -12,6 +12,8 @@ typedef struct {
     const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
     const float *shares;       /* (f, n, n) by which the power of h grows; NULL for none */
+    const char *is_fine;       /* (k) fingers whose fine points count; NULL for all */
+    int rim;                   /* first of a finger's fine points beside its first that count */
 } grouped;
 
 /* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is nominal. */
@@ -34,7 +36,7 @@ INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
 /* At frequencies (LANES). */
 SHARED void find_forms(formed *to, const plates *on, const grouped *of, const int *rows, arena *memory) {
     const size_t n = on->n, b = on->b, k = on->k, a = b + k, j = n + k;
-    const size_t p = of->p, groups = of->groups, at = groups * p;
+    const size_t p = of->p, groups = of->groups, at = groups * p, each = at % k ? at : at / k; /* of a finger */
     const int parts = of->others ? 4 : 2;
     const arena mark = *memory;
     int cases[LANES];
@@ -59,12 +61,19 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     if (of->shares) load_real(shares, of->shares, n * n, rows);
 
     /* By a force at each attachment; h by each ERA; and how it changes with all dampers. */
-    to_points(t, a, of->points, at, &now, on, room);
+    to_points(t, a, of->points, at, each, &now, on, room);
     for (size_t i = 0; i < at; i++)
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(t[i * a + e], drives[e]);
-    if (of->fine) {
-        to_points(fine, n, of->fine_points, of->fine, &now, on, room);
-        drive(fine, drives, of->fine, n);
+    const size_t fingers = of->fine % k ? 1 : k, fine_each = of->fine / fingers;
+    for (size_t finger = 0; of->fine && finger < fingers; finger++) {
+        if (of->is_fine && !of->is_fine[finger]) continue;
+        for (size_t part = 0; part < 2; part++) { /* the first alone where not all count */
+            const size_t first = finger * fine_each + (part ? of->rim : 0);
+            const size_t count = part ? fine_each - of->rim : of->rim > 0;
+            value *found = fine + first * n;
+            to_points(found, n, of->fine_points + first * on->r, count, count, &now, on, room);
+            drive(found, drives, count, n);
+        }
     }
     memcpy(to->fields, h, at * n * sizeof(value));
     with_fingers_moved(moved, without, &now, drives, on);
@@ -82,22 +91,32 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
                 scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std));
     product(h + at * n, t, a, damped, at, n, n);
 
-    /* Plates thicker and thinner, each counting half. */
+    /* Plates thicker and thinner, each counting half, at points that count. */
     for (int part = 2; part < parts; part++) {
         for (int l = 0; l < LANES; l++) cases[l] = rows[l] * on->t + part - 1;
         put_fingers(&now, on, rows, cases, space);
-        value *other = h + part * at * n;
-        to_points(other, n, of->points, at, &now, on, room);
-        drive(other, drives, at, n);
-        for (size_t i = 0; i < at * n; i++)
-            other[i] = scaled((value){.re = other[i].re - h[i].re, .im = other[i].im - h[i].im}, filled(sqrtf(0.5f)));
+        for (size_t first = 0; first < at; first += each) {
+            value *other = h + (part * at + first) * n;
+            float weight = 0;
+            for (size_t i = first; i < first + each; i++) weight += of->weights[i];
+            if (weight == 0) continue;
+            to_points(other, n, of->points + first * on->r, each, each, &now, on, room);
+            drive(other, drives, each, n);
+            for (size_t i = 0; i < each * n; i++) {
+                const value own = h[first * n + i];
+                other[i] = scaled((value){.re = other[i].re - own.re, .im = other[i].im - own.im}, filled(sqrtf(0.5f)));
+            }
+        }
     }
 
     /* Forms of the mean over each group, of the rows at its points and of what is uncertain. */
     for (size_t group = 0; group < groups; group++) {
         value *form = R + group * n * n, *to = X;
+        size_t counted = 0;
         for (int part = 0; part < parts; part++)
             for (size_t i = group * p; i < (group + 1) * p; i++) {
+                if (of->weights[i] == 0) continue;
+                if (!part) counted++;
                 lanes share = filled(sqrtf(of->weights[i]));
                 for (size_t e = 0; e < n; e++) *to++ = scaled(h[(part * at + i) * n + e], share);
             }
@@ -108,8 +127,8 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }
-        gram(modelled, X, p, n);
-        gram(form, X + p * n, (parts - 1) * p + j, n);
+        gram(modelled, X, counted, n);
+        gram(form, X + counted * n, (parts - 1) * counted + j, n);
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
                 form[u * n + v].re += modelled[u * n + v].re;

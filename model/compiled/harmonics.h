@@ -13,31 +13,38 @@ typedef struct {
     size_t few;
 } distortion;
 
-/* fields (m, bases, points, n): by each ERA at tones' weights (m, n), at full harmonics. */
+/* fields (m, bases, b + k, 2, padded): by each ERA at tones' weights (m, n), at full harmonics. */
 SHARED float *harmonic_fields(const distortion *at, const draws *by, size_t m, const int *rows, const float *weights,
-                              arena *memory) {
+                              size_t padded, arena *memory) {
     const plates *on = at->on;
-    const size_t n = on->n, bases = by->bases, cases_in_all = m * bases, points = on->k * at->few, each = points * n;
-    float *fields = floats(memory, 2 * cases_in_all * each);
+    const size_t n = on->n, bases = by->bases, cases_in_all = m * bases, points = on->k * at->few;
+    const size_t each = 2 * (on->b + on->k) * padded;
+    float *fields = floats(memory, cases_in_all * each);
     const arena mark = *memory;
-    value *space = values(memory, touched_space(on)), *room = values(memory, points * (on->b + on->k));
-    value *found = values(memory, each), *w = values(memory, n), *drives = values(memory, n);
+    const float *columns = columns_of(at->points, points, on, memory);
+    value *space = values(memory, touched_space(on));
     for (size_t first = 0; first < cases_in_all; first += LANES) {
         const size_t count = cases_in_all - first < LANES ? cases_in_all - first : LANES;
-        int of_table[LANES], cases[LANES], given[LANES];
+        int of_table[LANES], cases[LANES];
         for (size_t l = 0; l < LANES; l++) {
             const size_t case_number = first + (l < count ? l : count - 1);
-            given[l] = case_number / bases, of_table[l] = rows[given[l]];
+            of_table[l] = rows[case_number / bases];
             cases[l] = of_table[l] * on->t + by->first_base + (int)(case_number % bases);
         }
         touched of;
-        put_fingers(&of, on, of_table, cases, space);
-        to_points(found, n, at->points, points, &of, on, room);
-        load(drives, on->drives, n, of_table);
-        load(w, weights, n, given);
-        for (size_t e = 0; e < n; e++) drives[e] = times(drives[e], w[e]);
-        for (size_t i = 0; i < each; i++) found[i] = times(found[i], drives[i % n]);
-        store(fields + 2 * first * each, found, each, count);
+        float *found = fields + each * first;
+        put_fingers_at_points(&of, found, each, on, of_table, cases, count, columns, padded, points, space, memory);
+        for (size_t l = 0; l < count; l++)
+            for (size_t e = 0; e < n; e++) {
+                const float *drive = on->drives + 2 * (of_table[l] * n + e), *w = weights + 2 * ((first + l) / bases * n + e);
+                const float re = drive[0] * w[0] - drive[1] * w[1], im = drive[0] * w[1] + drive[1] * w[0];
+                for (size_t point = 0; point < padded; point += LANES) {
+                    float *own = found + each * l + 2 * padded * e + point;
+                    const value by_force = {.re = some(own), .im = some(own + padded)};
+                    const value driven = add_scaled(ZERO, by_force, re, im);
+                    memcpy(own, &driven.re, sizeof(lanes)), memcpy(own + padded, &driven.im, sizeof(lanes));
+                }
+            }
     }
     release(memory, mark);
     return fields;
@@ -52,7 +59,8 @@ SHARED lanes *find_harmonics(const distortion *at, const draws *by, size_t k, si
     if (!at->on) return found;
     const arena mark = *memory;
     const size_t n = at->on->n, few = at->few, width = by->width;
-    const float *fields = harmonic_fields(at, by, m, rows, weights, memory);
+    const size_t padded = padded_to(k * few + k), each = 2 * (at->on->b + k) * padded;
+    const float *fields = harmonic_fields(at, by, m, rows, weights, padded, memory);
     value *drawn = values(memory, n);
     for (size_t group = 1; group < groups; group++) {
         size_t first;
@@ -66,9 +74,10 @@ SHARED lanes *find_harmonics(const distortion *at, const draws *by, size_t k, si
             for (size_t finger = 0; finger < k; finger++) {
                 lanes mean = {0};
                 for (size_t i = finger * few; i < (finger + 1) * few; i++) {
-                    const float *field = fields + 2 * (base * k * few + i) * n;
+                    const float *field = fields + each * base + i;
                     value sum = ZERO;
-                    for (size_t e = 0; e < n; e++) sum = add_scaled(sum, drawn[e], field[2 * e], field[2 * e + 1]);
+                    for (size_t e = 0; e < n; e++)
+                        sum = add_scaled(sum, drawn[e], field[2 * padded * e], field[2 * padded * e + padded]);
                     mean += at->weights[i] * power(sum);
                 }
                 found[(tone * k + finger) * groups + group] = above * mean;

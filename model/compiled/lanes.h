@@ -111,6 +111,7 @@ SHARED void load(value *restrict to, const float *from, size_t width, const int 
     size_t i = 0;
     for (; i + LANES / 2 <= width; i += LANES / 2) {
         lanes some[LANES];
+#pragma GCC unroll 16
         for (size_t l = 0; l < LANES; l++) memcpy(some + l, from + 2 * (width * rows[l] + i), sizeof *some);
         transpose(some);
         memcpy(to + i, some, sizeof some);
@@ -178,9 +179,28 @@ SHARED void multiply_into(value *restrict found, size_t step, const float *restr
     }
 }
 
+/* found (columns) = b (columns, r) times a (r), real. */
+SHARED void multiply_row(value *restrict found, const float *restrict a, const value *restrict b, size_t r, size_t columns) {
+    size_t column = 0;
+    for (; column < columns && columns >= 4; column += 4) {
+        if (column + 4 > columns) column = columns - 4; /* as above */
+        const value *b0 = b + column * r, *b1 = b0 + r, *b2 = b1 + r, *b3 = b2 + r;
+        value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
+        for (size_t j = 0; j < r; j++) {
+            s0.re += a[j] * b0[j].re, s0.im += a[j] * b0[j].im;
+            s1.re += a[j] * b1[j].re, s1.im += a[j] * b1[j].im;
+            s2.re += a[j] * b2[j].re, s2.im += a[j] * b2[j].im;
+            s3.re += a[j] * b3[j].re, s3.im += a[j] * b3[j].im;
+        }
+        found[column] = s0, found[column + 1] = s1, found[column + 2] = s2, found[column + 3] = s3;
+    }
+    for (; column < columns; column++) multiply_into(found + column, 1, a, b + column * r, 1, r);
+}
+
 /* found (rows, columns) = a (rows, r), real, times b (columns, r) transposed. */
 INLINE void multiply(value *found, const float *a, const value *b, size_t rows, size_t r, size_t columns) {
-    for (size_t column = 0; column < columns; column++)
+    for (size_t row = 0; row < rows && rows < 4; row++) multiply_row(found + row * columns, a + row * r, b, r, columns);
+    for (size_t column = 0; column < columns && rows >= 4; column++)
         multiply_into(found + column, columns, a, b + column * r, rows, r);
 }
 

@@ -49,7 +49,7 @@ static void run_tones(const job *each, arena *memory) {
     const sensors *at = each->of;
     const found_tones *to = each->to[0];
     const size_t points = at->points, k = on->k, plates = 1 + by->count, fine = points / k;
-    const float *columns = columns_of(at->rows, points, on->r, memory);
+    const float *columns = columns_of(at->rows, points, on, memory);
     const tones drawn = respond(on, by, at, columns, each->count, each->rows, each->to[1], memory);
     lanes *sensed = take(memory, points * sizeof(lanes));
     value *found = values(memory, points), *force = values(memory, on->b + k + 1);
@@ -90,6 +90,22 @@ int fingertips_stage(const raster *on, const double *places, int count, void *fe
                      void *fine_weights) {
     return done(run_fingertips, (job){.on = on, .by = places, .count = count,
                                       .to = {few, fine, few_weights, fine_weights}});
+}
+
+/* Keep what searches of all frequencies in their order read. */
+int blocks_stage(plates *on) {
+    const size_t each = (size_t)on->b * on->r;
+    value *to = on->of_blocks;
+    for (int first = 0; first < on->rows; first += LANES)
+        for (int thickness = 0; thickness < (on->t < 3 ? on->t : 3); thickness++, to += each) {
+            int cases[LANES];
+            for (int l = 0; l < LANES; l++) {
+                const int row = first + l < on->rows ? first + l : on->rows - 1;
+                cases[l] = row * on->t + thickness;
+            }
+            load(to, on->by_force, each, cases);
+        }
+    return FOUND;
 }
 
 /* Forms at rows (count). */

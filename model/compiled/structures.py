@@ -43,9 +43,9 @@ class TouchedPlates(Structure):
     """`plates`: the plate on its ERAs, with fingers on it."""
 
     _fields_ = [
-        *_fields(i="n b k r t", f="load_std"),
+        *_fields(i="n b k r t rows lanes", f="load_std"),
         *_fields(p="receptance by_force coupling moved minus_omega2 forces strokes by_damping"),
-        *_fields(p="by_stiffness by_loss attached shapes centres stiffness"),
+        *_fields(p="by_stiffness by_loss attached shapes centres stiffness of_blocks"),
     ]
 
 
@@ -54,7 +54,7 @@ class PointGroups(Structure):
 
     _fields_ = [
         *_fields(i="groups p fine others", f="gain_variance ridge"),
-        *_fields(p="points fine_points weights error shares"),
+        *_fields(p="points fine_points weights error shares is_fine", i="rim"),
     ]
 
 
@@ -62,8 +62,8 @@ class PlateDraws(Structure):
     """`draws`: plates within the uncertainty."""
 
     _fields_ = _fields(
-        i="count bases nodes width first_base first_node gains_of_row",
-        p="node loss damping own gains errors harmonics",
+        i="count bases nodes width first_base first_node amplifiers",
+        p="node loss damping own gains errors harmonics delays amplifier",
     )
 
 

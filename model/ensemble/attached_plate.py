@@ -32,7 +32,6 @@ from statistics import NormalDist
 import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
-from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     Era,
@@ -96,7 +95,7 @@ class AttachedPlate(Mounts):
     - shapes: (b, r) of the attachments
     - omega: (f,) [rad/s]
     - fingertip: of the rig, None for weightless ones
-    - uncertainty: of the rig's parameters; clocks: errors of those of its amplifiers
+    - uncertainty: of the rig's parameters
     """
 
     modal: ComplexArray
@@ -104,7 +103,6 @@ class AttachedPlate(Mounts):
     omega: FloatArray
     fingertip: Fingertip | None
     uncertainty: Uncertainty
-    clocks: ClockErrors
 
     @property
     def era_count(self) -> int:
@@ -142,10 +140,10 @@ class AttachedPlate(Mounts):
                     found[:, number] = self.fingertip.scaled(load).dynamic_stiffness(self.omega)
         return found.astype(np.complex64)
 
-    @cached_property
-    def power_shares(self) -> Float32Array | None:
-        """`ClockErrors.power_shares` at its frequencies."""
-        return self.clocks.power_shares(self.omega / (2 * math.pi))
+    @property
+    def frequencies(self) -> FloatArray:
+        """Its frequencies [Hz], (f,)."""
+        return self.omega / (2 * math.pi)
 
     @cached_property
     def _finger(self) -> ComplexArray:
@@ -166,7 +164,6 @@ def attach(
     uncertainty: Uncertainty,
     frequencies: FloatArray,
     dispersion: Dispersion | None = None,
-    clocks: ClockErrors = EXACT_CLOCKS,
 ) -> AttachedPlate:
     """Attach ERAs and masses to a reduced free plate.
 
@@ -184,7 +181,6 @@ def attach(
         omega=w,
         fingertip=fingertip,
         uncertainty=uncertainty,
-        clocks=clocks,
     )
 
 

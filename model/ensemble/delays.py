@@ -6,14 +6,13 @@ amplifier alone has none that counts: a phase of all ERAs together is not felt.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, FloatArray
-from model.ensemble.draws import Draws, standard_normal
+from model.ensemble.draws import Drawing, standard_normal
 from model.errors import InputError
 from model.rig.rig import Channel
 
@@ -84,36 +83,40 @@ class ClockErrors:
         if not self.errors:
             return None
         own = np.array(self.amplifier)
-        variance = _phases(self, frequencies)[:, own] ** 2
+        phases = 2 * math.pi * np.multiply.outer(frequencies, self._known)
+        variance = phases[:, own] ** 2
         is_same = own[:, None] == own
         grown = np.expm1(np.minimum(variance, _MAX_VARIANCE))[:, :, None] * is_same
         return np.asarray(grown, dtype=np.float32)
+
+    def delays(self, by: Drawing) -> FloatArray:
+        """By how much each of the amplifiers is late on drawn plates, (amplifiers, d) [s]."""
+        return self._known[:, None] * _numbers(by.seed, len(self.errors), by.count)
+
+    @property
+    def _known(self) -> FloatArray:
+        return np.minimum(self.errors, _AS_GOOD_AS_UNKNOWN)
 
 
 EXACT_CLOCKS = ClockErrors()
 """All ERAs on one amplifier, or clocks that agree."""
 
 
-def _phases(clocks: ClockErrors, frequencies: FloatArray) -> FloatArray:
-    """Phases by the errors of all amplifiers, (f, a) [rad], an unknown one any."""
-    errors = np.minimum(clocks.errors, _AS_GOOD_AS_UNKNOWN)
-    return np.asarray(2 * math.pi * np.multiply.outer(frequencies, errors))
-
-
 @lru_cache(maxsize=64)
-def delayed(draws: Draws, clocks: ClockErrors, frequencies: tuple[float, ...], seed: int) -> Draws:
-    """Drawn plates whose amplifiers' clocks are off, too, with gains at each frequency.
+def _numbers(seed: int, amplifiers: int, count: int) -> FloatArray:
+    """In no order, where drawn plates are in that of their thicknesses."""
+    return standard_normal(np.random.default_rng([seed, amplifiers, 1]), amplifiers, count)
 
-    frequencies (f,) [Hz]. The plates are the same otherwise.
+
+def delayed(
+    gains: Complex64Array, clocks: ClockErrors, by: Drawing, omega: FloatArray
+) -> Complex64Array:
+    """Gains (a, d) on drawn plates, at each of f frequencies (f,) [rad/s], as clocks are off.
+
+    The ERAs come first of the a attachments and fingers. Returns (f, a, d).
     """
-    rng = np.random.default_rng([seed, len(clocks.errors), 1])
-    numbers = standard_normal(rng, len(clocks.errors), len(draws.node))
-    # The plates are in the order of their thicknesses, and numbers are not in any.
-    phases = _phases(clocks, np.array(frequencies))[:, :, None] * numbers
-    factors: NDArray[np.complex64] = np.exp(-1j * phases).astype(np.complex64)
+    factors = np.exp(-1j * omega[:, None, None] * clocks.delays(by))
+    found = np.repeat(gains[None], len(omega), axis=0)
     own = [*clocks.amplifier]
-    gains: Complex64Array = np.repeat(draws.gains, len(frequencies), axis=0)
-    n = len(own)
-    gains[:, :n] = (1 + gains[:, :n]) * factors[:, own] - 1
-    gains.setflags(write=False)  # cached, and so shared
-    return replace(draws, gains=gains)
+    found[:, : len(own)] = (1 + gains[: len(own)]) * factors[:, own] - 1
+    return found

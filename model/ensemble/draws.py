@@ -41,10 +41,10 @@ class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
     loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
-    masses, load of each finger; gains (1, a, d): relative change of each ERA's, complex, or (f, a,
-    d) at f frequencies; errors (k, d): of discretisation at each finger, complex of mean square 1;
-    harmonics (n, d): second harmonic of each ERA, complex, relative to its motion; node (d,): which
-    of the thicknesses each has.
+    masses, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
+    d): of discretisation at each finger, complex of mean square 1; harmonics (n, d): second
+    harmonic of each ERA, complex, relative to its motion; node (d,): which of the thicknesses each
+    has.
     """
 
     loss: Float32Array
@@ -91,7 +91,7 @@ def draw(
         loss=parameters[1].astype(np.float32),
         damping=parameters[2].astype(np.float32),
         own=own.astype(np.float32),
-        gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64)[None],
+        gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64),
         errors=_complex(real, imaginary),
         harmonics=_complex(harmonics, quadrature, harmonic),
         node=np.arange(count) * thicknesses // count,

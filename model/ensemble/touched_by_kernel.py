@@ -1,16 +1,17 @@
 """`model.ensemble.touched_plate` by kernels in C."""
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.compiled.kernels import Kernels, kernels, run
 from model.compiled.structures import PlateDraws, PointGroups, Sensors, TouchedPlates, as_given
 from model.ensemble.attached_plate import PlateOnEras
+from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import Drawing, Draws
 from model.ensemble.touched_plate import (
     RIDGE,
@@ -25,22 +26,28 @@ _OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
 _OF_ROWS = ("minus_omega2", "forces", "strokes", "by_damping", "by_stiffness", "shapes")
 
 
-def touch(on: PlateOnEras, centres: Float32Array, loads: tuple[float, ...] = ()) -> TouchedPlate:
+def touch(
+    on: PlateOnEras,
+    centres: Float32Array,
+    loads: tuple[float, ...] = (),
+    clocks: ClockErrors = EXACT_CLOCKS,
+) -> TouchedPlate:
     """Put fingers on a plate, by kernels in C where they can be compiled.
 
-    centres (k, r): shapes there; loads (k,): of each relative to the rig's fingertip, empty for 1.
+    centres (k, r): shapes there; loads (k,): of each relative to the rig's fingertip, empty for 1;
+    clocks: errors of those of the amplifiers.
     """
     by, stiffness = kernels(), on.plate.finger_stiffness(len(centres), loads)
     if by is None or not len(centres):
-        return TouchedPlate(on, centres, stiffness)
-    return TouchedByKernel(on, centres, stiffness, by)
+        return TouchedPlate(on, centres, stiffness, clocks)
+    return TouchedByKernel(on, centres, stiffness, clocks, kernels=by)
 
 
 @dataclass(frozen=True, eq=False)
 class TouchedByKernel(TouchedPlate):
     """A plate with fingers, whose stages are kernels."""
 
-    kernels: Kernels
+    kernels: Kernels = field(kw_only=True)
 
     @cached_property
     def structure(self) -> TouchedPlates:
@@ -69,7 +76,7 @@ class TouchedByKernel(TouchedPlate):
             fine_points=fine,
             weights=weights,
             error=error_power,
-            shares=plate.power_shares,
+            shares=self.clocks.power_shares(plate.frequencies),
         )
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
@@ -99,7 +106,7 @@ class TouchedByKernel(TouchedPlate):
         to = (ctypes.c_void_p * 3)(
             powers.ctypes.data if with_powers else None, means.ctypes.data, loudest.ctypes.data
         )
-        draws = draws_structure(self.on, k, by)
+        draws = draws_structure(self.on, self.clocks, k, by)
         run(
             self.kernels.library.tones_stage,
             *(self.structure, draws, at, given[0].ctypes, m, given[1].ctypes, to),
@@ -113,40 +120,54 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
     if kept is not None:
         return kept
     plate = on.plate
-    (b, r), t = plate.shapes.shape, on.receptance.shape[1]
-    found = TouchedPlates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
+    (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
+    found = TouchedPlates(plate.era_count, b, 0, r, t, f, 0, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
         attached=plate.stiffness,
     )
+    if (by := kernels()) is not None:
+        found.lanes = by.lanes
+        room = np.empty(2 * (f + by.lanes) * min(t, 3) * b * r + _MAX_LANES, dtype=np.float32)
+        found.arrays.append(room)
+        found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
+        run(by.library.blocks_stage, found)
     return _kept.setdefault(on, found)  # of threads at once all take the first one's
 
 
 _kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()
 
 
-def draws_structure(on: PlateOnEras, finger_count: int, by: Drawing) -> PlateDraws:
-    """Drawn plates with so many fingers as kernels read them."""
+def draws_structure(
+    on: PlateOnEras, clocks: ClockErrors, finger_count: int, by: Drawing
+) -> PlateDraws:
+    """Drawn plates with so many fingers as kernels read them; of other clocks in no time."""
     draws, nodes, (bases, first_base), first_node = drawn_on(on, finger_count, by)
-    return _structure(draws, nodes, bases, first_base, first_node)
+    exact = _structure(draws, nodes, bases, first_base, first_node)
+    if not clocks.errors:
+        return exact
+    found = PlateDraws.from_buffer_copy(exact)
+    found.arrays, found.amplifiers = exact.arrays, len(clocks.errors)
+    found.point(delays=_padded(clocks.delays(by)), amplifier=np.array(clocks.amplifier))
+    return found
 
 
 @lru_cache(maxsize=64)
 def _structure(
     draws: Draws, nodes: int, bases: int, first_base: int, first_node: int
 ) -> PlateDraws:
-    def padded(values: Float32Array) -> Float32Array:
-        return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])
-
     count = len(draws.node)
-    width, (f, a, _) = count + _MAX_LANES, draws.gains.shape
-    of_row = 2 * a * width if f > 1 else 0
-    found = PlateDraws(count, bases, nodes, width, first_base, first_node, of_row)
+    found = PlateDraws(count, bases, nodes, count + _MAX_LANES, first_base, first_node)
     errors = np.stack([draws.errors.real, draws.errors.imag])
-    gains = np.stack([draws.gains.real, draws.gains.imag], axis=1)
+    gains = np.stack([draws.gains.real, draws.gains.imag])
     floats = {"loss": draws.loss, "damping": draws.damping, "own": draws.own}
     harmonics = np.stack([draws.harmonics.real, draws.harmonics.imag])
     floats |= {"gains": gains, "errors": errors, "harmonics": harmonics}
-    found.point(node=draws.node, **{name: padded(each) for name, each in floats.items()})
+    found.point(node=draws.node, **{name: _padded(each) for name, each in floats.items()})
     return found
+
+
+def _padded(values: Float32Array | FloatArray) -> Float32Array:
+    """Values (..., d) as rows of one register more, in single precision."""
+    return np.pad(as_given(values), [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])

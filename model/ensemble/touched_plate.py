@@ -28,7 +28,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
-from model.ensemble.delays import delayed
+from model.ensemble.delays import EXACT_CLOCKS, ClockErrors, delayed
 from model.ensemble.draws import Drawing, Draws, draw, over_fingertips
 
 RIDGE = 1e-6
@@ -80,11 +80,15 @@ class FingertipAmplitudes:
 
 @dataclass(frozen=True, eq=False)
 class TouchedPlate:
-    """Plates with k fingers at centres of shapes (k, r), of dynamic stiffness (f, k) [N/m]."""
+    """Plates with k fingers at centres of shapes (k, r), of dynamic stiffness (f, k) [N/m].
+
+    clocks: errors of those of the amplifiers.
+    """
 
     on: PlateOnEras
     centres: Float32Array
     stiffness: Complex64Array
+    clocks: ClockErrors = EXACT_CLOCKS
 
     def sources(
         self, rows: IntArray, nodes: IntArray, points: Float32Array
@@ -162,7 +166,7 @@ class TouchedPlate:
             weights,
             gain_variance=plate.uncertainty.gain_variance,
             error_power=error_power[rows, None],
-            shares=None if plate.power_shares is None else plate.power_shares[rows],
+            shares=self.clocks.power_shares(plate.frequencies[rows]),
         )
         uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
         if fine is None:
@@ -217,7 +221,7 @@ class TouchedPlate:
         mean over fingertips; error_power (f, n): mean square of the discretisation error of each
         ERA's field; threshold (f,) [m/s²]; both at all frequencies of the plate.
         """
-        m, (k, p), d = len(rows), shares.shape, by.count
+        m, (k, p), d, clocks = len(rows), shares.shape, by.count, self.clocks
         draws, nodes, (t, first_base), first = drawn_on(self.on, k, by)
         cases = np.array([MODELLED, *range(first, first + nodes)])
         at_nodes = self.fields(
@@ -225,6 +229,9 @@ class TouchedPlate:
         ).reshape(m, 1 + nodes, -1)
         bases = first_base + np.tile(np.arange(t), m)
         at, of_base = rows.repeat(t), weights.repeat(t, axis=0)
+        gains = draws.gains
+        if clocks.errors:
+            gains = delayed(gains, clocks, by, self.on.plate.omega[at])
         by_force, moved = self.sources(at, bases, points)
         changes = self.changes(at, bases, of_base, np.matvec(moved, of_base), points)
         parts = [
@@ -233,7 +240,7 @@ class TouchedPlate:
                 (changes.loss, draws.loss),
                 (changes.damping, draws.damping),
                 (changes.own, draws.own),
-                (changes.drives, draws.gains[at if len(draws.gains) > 1 else 0]),
+                (changes.drives, gains),
             )
         ]
         forces = np.add.reduce(parts).reshape(m, t, -1, t, d // t)
@@ -327,9 +334,6 @@ def drawn_on(
         harmonic=plate.uncertainty.harmonic,
         thicknesses=nodes,
     )
-    if plate.clocks.errors:
-        frequencies = plate.omega / (2 * math.pi)
-        draws = delayed(draws, plate.clocks, tuple(frequencies.tolist()), by.seed)
     first_base = on.first.get(by.bases, MODELLED)
     return draws, nodes, (by.bases if first_base else 1, first_base), first
 

@@ -164,11 +164,7 @@ class LocalizationTable:
             return self
         found = replace(self, clocks=clocks)
         vars(found).update(vars(self) | vars(found))
-        if "on_eras" in vars(self):
-            plate = replace(self.attached, clocks=clocks)
-            vars(found).update(attached=plate, on_eras=replace(self.on_eras, plate=plate))
-        else:
-            vars(found).pop("attached", None)
+        vars(found).pop("power_shares", None)
         return found
 
     def unit_fields(
@@ -374,7 +370,6 @@ class LocalizationTable:
             uncertainty=self.uncertainty,
             frequencies=frequencies,
             dispersion=self.modal_dispersion,
-            clocks=self.clocks,
         )
 
     @cached_property
@@ -458,8 +453,13 @@ class LocalizationTable:
         points, fields, power = self._everywhere
         is_near = ~is_background(points, targets)
         mean = (power - _power(fields[:, :, is_near])) / np.float32(np.sum(~is_near))
-        shares = self.attached.power_shares
+        shares = self.power_shares
         return mean if shares is None else mean * (1 + shares)
+
+    @cached_property
+    def power_shares(self) -> Float32Array | None:
+        """`ClockErrors.power_shares` at all frequencies."""
+        return self.clocks.power_shares(self.frequencies)
 
 
 def _power(fields: Complex64Array) -> Complex64Array:

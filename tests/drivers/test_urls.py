@@ -67,6 +67,7 @@ def test_url_is_parsed(url: str, line: str, number: int, settings: dict[str, obj
         ("serial:///dev/x?baud=", "baud .*''"),
         ("serial:///dev/x?address=248", "address .*1 to 247"),
         ("serial:///dev/x?speed=9600", "option speed is unknown"),
+        ("serial:///dev/x?line=usb", "line must be one of"),
         ("serial:///dev/x?baud=9600&baud=1200", "repeat"),
         (f"serial:///dev/x?baud={'9' * 5000}", "baud .*'999"),
         ("serial:///dev/x#7", r"\?address=7"),

@@ -35,10 +35,18 @@ def judged(run: Path, *options: str) -> tuple[int, dict[str, str]]:
 
 
 def test_no_fault_is_stale() -> None:
-    """Every text that a fault changes occurs once in its file; who rewrites it, the fault too."""
+    """Every text that a fault changes occurs once in its file, and every test of a fault exists.
+
+    Who rewrites a text or renames a test does so in the fault, too.
+    """
     judge = runpy.run_path(str(RUN))
-    stale = {one.name: judge["stale_edits"](one, judge["ROOT"]) for one in judge["load_faults"]()}
+    faults = judge["load_faults"]()
+    stale = {one.name: judge["stale_edits"](one, judge["ROOT"]) for one in faults}
     assert {name: files for name, files in stale.items() if files} == {}
+    tests = sorted({test for one in faults for test in one.tests})
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
+    done = subprocess.run([*command, *tests], cwd=judge["ROOT"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr.splitlines()) == (0, [])
 
 
 def test_quick_faults_are_found() -> None:

@@ -143,7 +143,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
         (half, other, timed, beside),
         (play(half, sooner), play(timed, beside)),
         *([(together, timed)] if is_quarter else []),
-        (ends, timed, 0.25 * subject.slowness),
+        (ends, replace(timed, valid_for=0), 0.25 * subject.slowness),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
     ]
 

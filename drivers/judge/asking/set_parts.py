@@ -109,6 +109,7 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
     refused: list[tuple[Values, str]] = [
         *(({"index": count}, "BAD_VALUE"), ({"index": count, "token": 10}, "BAD_VALUE")),
         *(({"index": 255, "token": 10}, "BAD_VALUE"), ({"parts": 1, "index": 0}, "BAD_VALUE")),
+        ({"index": 0, "parts": 0, "token": 10}, "BAD_VALUE"),
         *(({"token": 8}, _OLD), ({"token": 4}, _OLD), ({"token": 10}, "")),
         ({"token": 4, "index": count}, _OLD),
     ]

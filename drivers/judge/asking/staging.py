@@ -149,8 +149,9 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
     ]
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
     later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
-    # No status is read as it starts.
-    unseen = stage(subject.one(ramp=subject.ramp)), partial(subject.commit_in, left)
+    # No status is read as it starts; its end counts from there.
+    timed = subject.one(ramp=subject.ramp, valid_for=subject.lasting(100))
+    unseen = stage(timed), partial(subject.commit_in, left)
     lefts = [left if len(each) > 1 else 0.6 * left for each in ends]
     courses = [
         [waiting, partial(subject.commit_in, each), *rows, 1.25 * each]

@@ -129,16 +129,18 @@ class Subject(Material):
             token, now = row.values.get("token", 0), row.values["now"]
             parts = self.parts(*row.layers, token=token, now=now)
             several = [{**each, **row.values} for each in parts]
+        codes = [each or _DONE for each in row.codes]
         for values in several:
             answer = await self.answer(row.name, row.raw, **values)
+            if not _has_reply(row.name, row.raw, values):
+                continue
+            brief = {name: value for name, value in values.items() if name != "stream"}
+            what = f"{row.name} {row.raw or brief}"
+            # First, since what has words too few has not all of its values.
+            expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
             if answer.code:
                 break
-            if _has_reply(row.name, row.raw, values):
-                answer = await self._carried_out(row.name, self.filled(values), answer)
-        brief = {name: value for name, value in values.items() if name != "stream"}
-        what = f"{row.name} {row.raw or brief}"
-        codes = [each or _DONE for each in row.codes]
-        expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
+            answer = await self._carried_out(row.name, self.filled(values), answer)
         is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
         if answer.code and is_named:
             expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")

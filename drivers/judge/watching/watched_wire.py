@@ -276,8 +276,10 @@ class WatchedWire:
         if request.name == "GetCaps":
             amplifier.identified(values)
         self._host.request_granted(session, time, request)
-        if self.is_disturbed(time) and request.name == "Arm":
-            amplifier.forget()
+        if self.is_disturbed(time):
+            if request.name == "Arm":
+                amplifier.forget()
+            amplifier.clock.unheard()
         self._host.status_heard(session, values)
         token = amplifier.token
         amplifier.replied(request, values, time if request.end is None else request.end)

@@ -138,7 +138,8 @@ def parse_request(adu: Adu) -> Message | None:
     request = _REQUEST_KINDS[pdu[0]](dev_id=adu.unit, transaction_id=adu.transaction)
     try:
         request.decode(pdu[1:])
-        is_whole = pdu_of(request) == pdu
+        written = request.count if pdu[0] == WRITE else 0
+        is_whole = pdu_of(request) == pdu and len(request.registers) == written
     except Exception:  # whatever a library raises for bytes that were damaged
         return None
     return request if is_whole and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None

@@ -93,16 +93,31 @@ async def test_promise_is_broken_if_clocks_are_not_counted(monkeypatch: pytest.M
     assert min((await beyond_the_promise()).values()) < -1
 
 
+class _Changing(dict[ContactKey | None, float]):
+    """Fingers that have changed in every plan."""
+
+    def __bool__(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("is_changing", [False, True], ids=["resting", "changing"])
 @in_virtual_time
-async def test_contents_leave_a_clock_that_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within 0.1 s none plays over both amplifiers, though no finger has changed."""
+async def test_contents_leave_a_clock_that_is_lost(
+    monkeypatch: pytest.MonkeyPatch, is_changing: bool
+) -> None:
+    """Within 0.1 s none plays over both amplifiers, though no finger has changed.
+
+    Within 0.2 s where fingers change in every plan: clocks are counted every 0.1 s then.
+    """
     known = {"a": 2e-6, "b": 2e-6}
     monkeypatch.setattr(Group, "clock_errors", property(lambda group: known))
     async with two_fingers(is_stated=False) as fingers:
         await fingers.hold(1.0)
         assert shared(fingers)
+        if is_changing:
+            fingers.controller.cycle.tracker.changed = _Changing()
         known["b"] = math.inf
-        await fingers.hold(0.1)
+        await fingers.hold(0.2 if is_changing else 0.1)
         assert not shared(fingers)
         await fingers.hold(0.5)
         assert not shared(fingers)

@@ -28,6 +28,11 @@ def arranged(*urls: str) -> Arrangement | None:
         (["modbus+rtu:///dev/serial/x#1", "can+slcan:///y#1"], ["usb-full-speed", "can-usb"], True),
         (["serial:///dev/ttyS0", "can+socketcan://can0#1"], ["native", "can"], False),
         (["serial+tcp://one:5000?baud=921600", "modbus+tcp://two/1"], ["ethernet"] * 2, True),
+        (
+            ["serial:///dev/ttyACM0?line=usb-high-speed", "modbus+rtu:///b?line=native#1"],
+            ["usb-high-speed", "native"],
+            False,
+        ),
         ([f"serial:///dev/ttyS0?address={each}" for each in (1, 2, 3)], ["native"] * 3, False),
         (["modbus+tcp://host/1", "modbus+tcp://host/2"], ["ethernet"] * 2, True),
         (["sim://r?amplifier=a", "sim://r?amplifier=b&line=ftdi"], [SIMULATED, "ftdi"], True),
@@ -36,7 +41,7 @@ def arranged(*urls: str) -> Arrangement | None:
 def test_clocks_are_held_as_closely_as_the_line_allows(
     urls: list[str], kinds: list[str], has_remedy: bool
 ) -> None:
-    """By separate lines of each kind, one bus, one connection, simulated; sums of squares."""
+    """By separate lines of each kind, named or not, one bus, simulated; sums of squares."""
     found = arranged(*urls)
     assert found is not None
     errors = [math.hypot(STATED, CLOCK_ERRORS[each]) for each in kinds]

@@ -104,7 +104,8 @@ def test_searching_for_the_least_costs_less_than_promising_it():
         kept = answer(table(*THRESHOLDS), same, min_contrast_db=-99)
         cost.append(one.promised_worst_db - every.promised_worst_db)
         unsearched.append(one.promised_worst_db - kept.promised_worst_db)
-    assert 0 <= np.median(cost) < 2.0
+    assert np.median(cost) >= 0
+    assert np.mean(cost) < 1.5
     assert np.mean(unsearched) > np.mean(cost) + 1
 
 

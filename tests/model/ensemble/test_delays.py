@@ -55,7 +55,8 @@ def test_two_equal_halves_leave_what_their_delay_says() -> None:
         "thicknesses": 1,
     }
     draws, off = draw(2, 1, count=200, seed=8, **known), ClockErrors((0, 1), (20e-6, 20e-6))
-    gains = delayed(draws, off, (1.0, 250.0), 8).gains.astype(complex)
+    omega = 2 * math.pi * np.array([1.0, 250.0])
+    gains = delayed(draws.gains, off, Drawing(200, 8, 1), omega).astype(complex)
     delays = -np.angle(1 + gains[0, :2]) / (2 * math.pi)  # [s], by the phase at 1 Hz
     assert delays.std(axis=1) == pytest.approx([20e-6, 20e-6], rel=0.01)
     left = np.abs(gains[1, 0] - gains[1, 1])
@@ -78,7 +79,8 @@ def test_eras_of_one_amplifier_are_late_together() -> None:
         "thicknesses": 1,
     }
     draws = draw(4, 2, count=64, seed=1, **known)
-    gains = delayed(draws, clocks(a=1e-4, b=2e-4), (100.0,), 1).gains[0]
+    by, omega = Drawing(64, 1, 1), np.array([200 * math.pi])
+    (gains,) = delayed(draws.gains, clocks(a=1e-4, b=2e-4), by, omega)
     assert (gains[0] == gains[2]).all()
     assert (gains[1] == gains[3]).all()
     assert np.abs(gains[0] - gains[1]).min() > 0
@@ -205,8 +207,17 @@ def test_amplifiers_that_are_held_play_together_beside_one_that_is_not() -> None
     assert ClockErrors.of(ERAS, wiring, dict.fromkeys("abc", 1e-3)).groups == (0, 1, 2, 2)
 
 
+def test_clocks_change_nothing_else() -> None:
+    """Errors of a femtosecond change no promise, where the places of ERAs are uncertain, too."""
+    known = replace(table(), uncertainty=replace(IDENTIFIED, place=0.003))
+    places = next(iter(contact_sets(1, fingers=2, seed=5)))
+    exact = two(known, places).promised_worst_db
+    off = two(known.with_clocks(clocks(a=1e-15, b=1e-15)), places).promised_worst_db
+    assert off == pytest.approx(exact, abs=1e-3)
+
+
 def test_plates_of_the_promise_are_the_same_but_for_the_clocks() -> None:
-    """Only gains differ, and these by factors of magnitude 1."""
+    """Gains differ by factors of magnitude 1."""
     known = {
         "masses": 0,
         "gain": 0.05,
@@ -216,7 +227,6 @@ def test_plates_of_the_promise_are_the_same_but_for_the_clocks() -> None:
         "thicknesses": 40,
     }
     exact = draw(4, 1, count=PROMISED_DRAWS.count, seed=PROMISED_DRAWS.seed, **known)
-    off = delayed(exact, clocks(a=1e-4, b=1e-4), (100.0, 200.0), PROMISED_DRAWS.seed)
-    for name in ("loss", "damping", "own", "errors", "node"):
-        assert getattr(off, name) is getattr(exact, name)
-    np.testing.assert_allclose(np.abs(1 + off.gains[1]), np.abs(1 + exact.gains[0]), rtol=1e-5)
+    omega = 2 * math.pi * np.array([100.0, 200.0])
+    off = delayed(exact.gains, clocks(a=1e-4, b=1e-4), PROMISED_DRAWS, omega)
+    np.testing.assert_allclose(np.abs(1 + off[1]), np.abs(1 + exact.gains), rtol=1e-5)

@@ -14,7 +14,7 @@ def test_common_gain_moves_all_channels_together():
     """
     known = {"masses": 0, "count": 200, "seed": 8, "phase": 0.0, "harmonic": 0.0, "thicknesses": 40}
     drawn = draw(4, 2, gain=0.0, common_gain=0.03, **known)
-    factors = 1 + drawn.gains[0, :4]
+    factors = 1 + drawn.gains[:4]
     np.testing.assert_allclose(factors, np.broadcast_to(factors[0], factors.shape), rtol=1e-6)
     sizes, counts = np.unique(np.log(factors[0].real).round(5), return_counts=True)
     assert sizes == pytest.approx([-0.06, 0.06], rel=1e-3)

@@ -281,6 +281,36 @@ def test_status_that_was_not_heard_may_have_shown_a_mark(is_heard: bool, broken:
     assert [each for each in talk.found if each != "answer"] == broken
 
 
+@pytest.mark.parametrize(("is_disturbed", "broken"), [(True, set()), (False, {"clock"})])
+def test_status_amid_a_fault_may_show_a_mark_that_came_twice(
+    is_disturbed: bool, broken: set[str]
+) -> None:
+    """Its copy comes 40 ms later, so that a status 80 ms behind it shows a clock of 40 ms ago.
+
+    By that every later Mark would be 40 ms late, of which 12 ms and the rate explain 16 at most.
+    """
+    talk = Talk().armed()
+    begin = talk.time
+    for copied in (0.04, 0.0, 0.0, 0.0, 0.0):
+        talk.rest(0.15).sends(hand.MARK, address=0)
+        marked = talk.time - begin
+        talk.rest(0.01).says(clock=round(marked / 20 * 2**32))
+        if copied and is_disturbed:
+            talk.told("faults", "a", are_on=True).told("faults", "a", are_on=False)
+        if copied:
+            talk.rest(0.068).says(clock=round((marked + copied) / 20 * 2**32))
+    assert {*talk.found} == broken
+
+
+def test_clock_goes_on_from_where_an_arm_has_shifted_it() -> None:
+    """By 16384 steps, 5 s; the status before it was not heard, so that of Arm may show a Mark."""
+    talk = Talk().identified().sends(hand.GET_STATUS).rest(0.1)
+    talk.exchange(hand.ARM, (9, 250, 16384), hand.status(clock=round(5.1 / 20 * 2**32)))
+    talk.rest(0.1).sends(hand.MARK, address=0)
+    talk.rest(0.01).says(clock=round(5.2 / 20 * 2**32))
+    assert "clock" not in talk.found
+
+
 def test_capture_replays_as_it_was_heard(tmp_path: Path) -> None:
     """What was recorded while a rule was broken breaks it again, with the same frames around."""
     talk = Talk().armed().playing().says(token=5, levels=(4000, 0), tokens=(5, 0, 0, 0))

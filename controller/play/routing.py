@@ -85,22 +85,21 @@ class SetBuilder:
         *,
         playing: Drive,
         valid_for: float,
-        restarts: bool = False,
         is_led: bool = False,
         is_shaped: bool = True,
         among: int = 1,
     ) -> tuple[PlateLayer, answer.Layer]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
-        playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
-        it restarts; nor does one that is led along its ramp, though an ERA joins it.
+        playing: what each ERA plays now in this layer; a tone that continues needs no onset, nor
+        does one that is led along its ramp, though an ERA joins it.
         valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
         onset; its ending follows (`build_ending`). among: layers that change at once, which share
         the time on the wires.
         """
         tones, ramp = layer.excitation, min(layer.ramp, self.ramp_max)
         onset = None
-        restarted = restarted_by(tones, {} if restarts else playing)
+        restarted = restarted_by(tones, playing)
         if is_shaped:
             is_continued = is_led or not restarted.issuperset(
                 [tone.frequency for tone in tones.values()]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.line_kinds import CLOCK_ERRORS, line_kind_of
+from drivers.line_kinds import BUS_ERROR, CLOCK_ERRORS, line_kind_of
 from drivers.protocol.table import QUANTITIES
 from drivers.protocol.timing import (
     MAX_LOSS_DETECTION_TIME,
@@ -102,7 +102,8 @@ _REMEDIES = {
     "can-usb": "an adapter of high speed",
     "ethernet": _ONE_BUS,
 }
-"""What is better, by the kind of line; nothing much for others."""
+"""What is better than lines of a kind, each its own; nothing much for others."""
+_CLOCKS = "clocks of a smaller clock_error"
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,13 @@ def arrangement_of(
     kinds = {name: line_kind_of(urls[name]) for name in addresses}
     is_one = len({address.line for address in addresses.values()}) == 1
     lines = f"{'one line' if is_one else 'separate lines'} ({', '.join(sorted({*kinds.values()}))})"
-    errors = {
-        name: math.hypot(stated[name] / math.sqrt(3), CLOCK_ERRORS[kind])
+    is_bus = is_one and "ethernet" not in kinds.values()  # behind which each has its connection
+    by_line = {
+        name: min(CLOCK_ERRORS[kind], BUS_ERROR) if is_bus else CLOCK_ERRORS[kind]
         for name, kind in kinds.items()
     }
-    worst = max(kinds.values(), key=CLOCK_ERRORS.__getitem__)
-    return Arrangement(lines, errors, _REMEDIES.get(worst, ""))
+    errors = {name: math.hypot(stated[name] / math.sqrt(3), by_line[name]) for name in kinds}
+    worst = max(errors, key=errors.__getitem__)
+    if stated[worst] / math.sqrt(3) > by_line[worst]:
+        return Arrangement(lines, errors, _CLOCKS)
+    return Arrangement(lines, errors, "" if is_bus else _REMEDIES.get(kinds[worst], ""))

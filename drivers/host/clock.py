@@ -271,7 +271,8 @@ class HeldClock:
             for number, (at, low, late) in enumerate(self._lowest):
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
-        self._all.append((time, lead + off))
+        # Less what its exchange took longer than the promptest one: by so much it may be late.
+        self._all.append((time, lead + off - max(later - self.shortest - self._bits, 0.0)))
         part = _MIN_PART
         self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
         while self._lowest and time - self._lowest[0][0] > _PARTS * part:

@@ -48,7 +48,7 @@ class Clocks:
         """Know all from now on: one alone, or by which lines and amplifiers they differ."""
         every = self._amplifiers.values()
         self._are_alike = len({_kind(each) for each in every}) == 1
-        for line in {each.line for each in every}:
+        for line in self._members.lines:
             of_line = [each for each in every if each.line is line]
             self._turns[line] = cycle(of_line)
             if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
@@ -69,7 +69,7 @@ class Clocks:
             return dict.fromkeys(every, 0.0)
         now = next(iter(every.values())).line.time()
         held = [each for each in every.values() if each.clock.error(now) < math.inf]
-        is_common = len({each.line for each in every.values()}) == 1
+        is_common = len(self._members.lines) == 1
         is_common &= sum(not each.clock.is_compared for each in held) == 1
         leads = {each: each.clock.lead(now) for each in every.values()}
         common = median([leads[each] for each in held] or [0.0])
@@ -88,8 +88,7 @@ class Clocks:
 
         No more once one does not reply, or a stop or disarm has come.
         """
-        every = self._amplifiers.values()
-        lines = {each.line for each in every if not each.clock.is_alone}
+        lines = self._members.lines if len(self._amplifiers) > 1 else ()
         now = asyncio.get_running_loop().time()
         try:
             async with asyncio.TaskGroup() as settling:

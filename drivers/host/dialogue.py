@@ -355,8 +355,8 @@ class Dialogue:
         ):
             self.latch = latch
         self.status, self.status_at = reply, now
-        # Beside heartbeats a Commit's tells nothing more, unless it may show a Mark.
-        if name != "Commit" or len(self.line.members) > 1:
+        # Beside heartbeats a Commit's tells nothing more, unless it may show a Mark, or an end.
+        if name != "Commit" or len(self.line.members) > 1 or reply["state"] != ENABLED:
             self.clock.replied(name, values, reply, now)
         for kind in reports_of(reply, self.clock.problem(now)):
             self._note_report(kind, now)

@@ -6,7 +6,10 @@ from drivers.protocol.table import FAULTS, STATES, name_of
 from drivers.wires.wire import Nak
 
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
-_REMEDIES = {"WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew"}
+_REMEDIES = {
+    "WRONG_SESSION": "; another host has armed it, or did last: disarm, then arm anew",
+    "WRONG_STATE": "; see what ails it by `era amp status`, then clear and arm again",
+}
 
 
 def refused_by_amplifier(where: str, refusal: Nak, *, may_play: bool) -> CommandRefused:

@@ -277,7 +277,7 @@ class Group:
         if self.is_open:
             self.state = GroupState.STOPPED
         members, stops = self.members, dict[str, asyncio.Future[Stopped]]()
-        for line in {each.line for each in self.amplifiers.values()}:
+        for line in members.lines:
             if len(line.members) > 1:  # so that none waits for the reply of another
                 try:
                     members.broadcast_stop(line, ramp)

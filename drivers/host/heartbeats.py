@@ -45,7 +45,7 @@ class Heartbeats:
     def follow(self) -> None:
         """Know those of a line from now on, who are fed ahead of one's sets."""
         every = self._members.amplifiers.values()
-        for line in {each.line for each in every}:
+        for line in self._members.lines:
             of_line = [each for each in every if each.line is line]
             line.ahead = partial(self._ahead, line, of_line) if len(of_line) > 1 else None
 

@@ -40,6 +40,11 @@ class Members:
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
 
     @property
+    def lines(self) -> tuple[Line, ...]:
+        """Their lines, each once, in the order of the amplifiers, so that runs can be repeated."""
+        return tuple(dict.fromkeys([each.line for each in self.amplifiers.values()]))
+
+    @property
     def by_need(self) -> list[Amplifier]:
         """All, first the one that was fed longest ago: replies may come late."""
         return sorted(self.amplifiers.values(), key=need)

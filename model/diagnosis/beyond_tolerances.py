@@ -47,13 +47,13 @@ _LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
 _LEAST_SHOWN = 1e-6  # of a variance
 _CLEAR = 40.0  # of half the sum of squares
 
-_THICKNESS, _MASS = "thickness", "distribution of mass"
+_THICKNESS = "thickness"
 _WORDS = {
     "place": "places of ERAs",
     "mode_shifts": "natural frequencies",
     "sensor_scale": "scales of sensors",
     "sensor_place": "places of sensors",
-    "foreign_mass": _MASS,
+    "foreign_mass": "distribution of mass",
     "side": "length and width",
     "poisson": "Poisson's ratio",
 }
@@ -127,10 +127,8 @@ def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
     """The kind of form error that is least likely, its rms in standard deviations, its chance."""
     space = match.plate.model.space
     kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
-    # Foreign mass may be one lump, whose weight is then all that is unknown of it.
-    kinds[_MASS] = np.array([np.sqrt((kinds[_MASS] ** 2).mean())])
-    found = [("", 0.0, 1.0)]
     kinds[_THICKNESS] = rises
+    found = [("", 0.0, 1.0)]
     for words, own in kinds.items():
         among = 1 if words == _THICKNESS else len(_WORDS)
         chance = among * float(chdtrc(len(own), own @ own))

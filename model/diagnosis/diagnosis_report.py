@@ -26,7 +26,7 @@ _MIN_SHARE = 0.05  # likelihood of a reported explanation
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
-    """Lines of findings with their remedies; one line if there are none."""
+    """Lines of findings with their remedies, and one that all is well where nothing is amiss."""
     by_era = {channel.era: channel for channel in verdict.channels}
     rows = []
     for cycle in verdict.swapped:
@@ -68,11 +68,12 @@ def verdict_rows(verdict: Verdict) -> list[str]:
             "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
             f"by {verdict.missed_db:.1f} dB or more"
         )
-    if rows:
+    if not verdict.is_well or verdict.bad_sensors:
         return rows
     if difference_rows(verdict):
-        return ["WIRING WELL: every channel that was driven drives its ERA as the rig says"]
-    return ["ALL WELL: plate and channels match the rig"]
+        well = "WIRING WELL: every channel that was driven drives its ERA as the rig says"
+        return [*rows, well]
+    return [*rows, "ALL WELL: plate and channels match the rig"]
 
 
 def difference_rows(verdict: Verdict) -> list[str]:

@@ -15,6 +15,10 @@ ABOVE: dict[str, Any] = {"token": 6, "tokens": (5, 6, 0, 0)}
 BROKEN: Broken = {
     "state_that_is_none": ("garbage", lambda: Talk().armed().says(9)),
     "set_accepted_before_arm": ("enabled", lambda: Talk().identified().staged(5, hand.layer(0))),
+    "present_clock_in_place_of_a_mark": (  # 0.15 s are 32.2 million steps
+        "clock",
+        lambda: Talk().armed().sends(hand.MARK, address=0).rest(0.15).says(clock=32_212_000),
+    ),
     "refused_though_staged": (
         "commit",
         lambda: Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5, 0), 6),

@@ -71,7 +71,7 @@ async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
         fingers.at[1] = (LEFT[0] - 0.02, LEFT[1])
         await fingers.hold(1.0)
         assert len(fingers.applied[-1].contents) == 3
-        # Its carrier has played before: all three start anew, or they would beat in frequency.
+        # Its carrier has played before: side bands join it on the amplifier's clock.
         assert 0.8 < depth_of(fingers, "1") < 1.3
 
 
@@ -169,4 +169,4 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     playing.start(Sets(started=frozenset({0})), contents, 0.0)
     numbers = playing.numbered([lasting, clicking])
     assert numbers == {0: lasting, 1: clicking}
-    assert playing.starting(numbers) == ([], set())
+    assert playing.starting(numbers) == []

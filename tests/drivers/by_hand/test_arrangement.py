@@ -49,6 +49,19 @@ def test_clocks_are_held_as_closely_as_the_line_allows(
     assert bool(found.remedy) == has_remedy
 
 
+def test_what_would_be_better_is_not_there_already() -> None:
+    """One bus of full speed is held by Marks, whatever its adapter; 0.2 ms are of the clocks."""
+    bus = [f"serial:///dev/ttyACM0?address={each}" for each in (1, 2)]
+    found = arranged(*bus)
+    assert found is not None
+    assert found.remedy == ""
+    assert found.errors["a"] == pytest.approx(math.hypot(STATED, 7e-6))
+    named = {"a": "serial:///dev/ttyACM0", "b": "serial:///dev/ttyACM1"}
+    wide = arrangement_of(named, channels={"a": 4, "b": 4}, stated={"a": 5e-6, "b": 2e-4})
+    assert wide is not None
+    assert "clock_error" in wide.remedy
+
+
 def test_every_kind_of_line_that_is_simulated_has_an_error() -> None:
     """Under the same names: what the check says of one is measured with it."""
     assert CLOCK_ERRORS.keys() == {*LINE_KINDS, PROMPT}

@@ -232,6 +232,24 @@ def test_clock_that_is_rarely_read_wrong_is_off_by_no_more_than_is_said() -> Non
     assert rms(leads) < STEP / 2 < rms(said) < STEP
 
 
+def test_requests_that_are_late_for_a_second_leave_a_clock_known() -> None:
+    """Each 0.7 ms late, as its exchange shows, of a clock known to some microseconds before."""
+    for seed in range(3):
+        rng, late = random.Random(seed), [0.0]
+        talk = Exchanges(Counter(20e-6), lambda rng=rng, late=late: rng.uniform(0, 5e-5) + late[0])
+        talk.arm()
+        talk.run(5.0)
+        late[0], said = 0.7e-3, list[float]()
+        for number in range(100):
+            talk.now += 0.01
+            if number % 5 == 4:
+                talk.send("Ping", rate=talk.held.rate(talk.now, is_playing=True))
+            else:
+                talk.send("GetStatus")
+            said.append(talk.held.error(talk.now))
+        assert max(said) < 50e-6
+
+
 def test_bits_of_a_request_are_no_lead() -> None:
     """A request of 5 ms: the clock of its last bit is compared with that moment."""
     talk = Exchanges(Counter(), bits=5e-3)
@@ -407,6 +425,22 @@ def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
     assert talk.held.problem(talk.now) is None
     assert talk.held.scatter(talk.now) < 20e-6
     assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=20e-6)
+
+
+def test_a_status_that_may_show_either_of_two_marks_is_no_reading() -> None:
+    """The second Mark is lost, twice in a row: the status shows the clock of 50 ms before."""
+    talk = Exchanges(Counter(20e-6), frames(1, 125e-6))
+    talk.arm()
+    talk.run(5.0)
+    for _ in range(2):
+        heard = talk.now
+        for at in (heard, heard + 0.05):
+            talk.held.sent("Mark", {}, at, at)
+        talk.counter.go(heard)
+        word, talk.now = talk.counter.word, heard + 0.06
+        show(talk, word)
+    assert talk.held.problem(talk.now) is None
+    assert talk.held.scatter(talk.now) < 50e-6
 
 
 def test_no_rate_is_more_than_a_ping_can_say() -> None:

@@ -55,6 +55,14 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
     with_group(test, wire, *LINES[lines])
 
 
+@grouped(*map(tuple, "abcdefgh"), wire="serial")
+async def test_lines_come_in_the_order_of_the_amplifiers(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Not by where they are in memory: runs of one random seed send the same bytes."""
+    assert [*group.members.lines] == [end.line for end in ends]
+
+
 @grouped(("a",))
 async def test_stop_does_not_wait_for_a_reply_that_is_lost(
     group: Group, ends: list[MemoryLine], wire: str

@@ -306,8 +306,9 @@ def test_diagnose_passes_a_plate_of_which_some_values_are_glitches(coarse_rig, b
     verdict = diagnose(coarse_rig, with_glitches(built))
     assert verdict.is_well
     assert verdict.bad_sensors == ()
-    (row,) = verdict_rows(verdict)
+    row, well = verdict_rows(verdict)
     assert row.startswith("OUTLIERS: 1")
+    assert well.startswith("ALL WELL")
 
 
 def test_diagnose_names_a_sensor_with_a_loose_contact(coarse_rig, built):
@@ -316,7 +317,7 @@ def test_diagnose_names_a_sensor_with_a_loose_contact(coarse_rig, built):
     values[:8:2, :, 4] *= -1
     verdict = diagnose(coarse_rig, replace(built, values=values))
     assert verdict.is_well
-    (row,) = verdict_rows(verdict)
+    row, _ = verdict_rows(verdict)
     assert "16 of them of sensor P5" in row
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from model.arrays import FloatArray
@@ -37,12 +39,17 @@ def random_contacts(
     *,
     margin: float = 0.0,
     apart: float = APART,
+    beside: "Sequence[tuple[float, float]]" = (),
 ) -> "FloatArray":
-    """Contacts (count, 2) [m] on a plate of a size, so far apart and so far from its edges."""
+    """Contacts (count, 2) [m] on a plate of a size, so far apart and so far from its edges.
+
+    beside: places [m] on the plate that they are as far from.
+    """
     import numpy as np
 
     while True:
         places = rng.uniform(margin, np.array(size) - margin, (count, 2))
-        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-        if gaps[np.triu_indices(count, 1)].min(initial=np.inf) > apart:
+        every = np.array([*places, *beside])
+        gaps = np.linalg.norm(every[:, None] - every, axis=-1)
+        if gaps[np.triu_indices(len(every), 1)].min(initial=np.inf) > apart:
             return places

@@ -132,6 +132,17 @@ class Heard:
         )
         return float((own - foreign).min())
 
+    def short_until(self, least_db: float, time: float) -> float:
+        """How long [ms] after a time [s] it first feels a contrast over 40 ms; a second at most.
+
+        In steps of 5 ms.
+        """
+        for after in range(0, 1000, 5):
+            start = time + after / 1000
+            if self.contrast_db((start, start + STRONGEST)) >= least_db:
+                return float(after)
+        return 1000.0
+
     def _level(self, bench: Bench, spans: Sequence[Span], strongest: bool, is_mean: bool) -> float:
         records = [bench.fingers.felt(*span)[str(self.finger)] for span in spans]
         squares = np.cumsum(np.concatenate([each.accelerations for each in records]) ** 2, axis=0)

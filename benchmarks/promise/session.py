@@ -9,7 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -51,6 +51,9 @@ STEP, REPORTED = 0.0025, 4
 reports every fourth."""
 ANSWERS = "answers while moving, above their promise"
 """Of the contrast over the next 80 ms; its share of 0 dB and more is what is kept."""
+UNTIL = "joining, 3 dB short until [ms]"
+"""After the commit: from then on a finger that joins feels, over 40 ms, no more than 3 dB less than
+its steady promise. Until then foreign contents ring on, which were loud where it lands."""
 STEPS = "cross-fades, foreign above promise"
 """Until anything else happens, and above what has been felt before: a landing may ring yet."""
 LANDED = "100 to 300 ms after a landing, foreign above promise"
@@ -142,13 +145,17 @@ class _Session:
     def __init__(self, case: Case, timing: Timing, seed: int) -> None:
         self._case, self._timing, self._rig = case, timing, case.rig
         plate = self._rig.plate
-        drawn = random_contacts(
+        draw = partial(
+            random_contacts,
             np.random.default_rng([seed, 14]),
-            case.contents + case.quiet,
-            (plate.length, plate.width),
+            size=(plate.length, plate.width),
             margin=FINGERTIP_RADIUS + 0.001,
         )
-        self._places: list[Point] = [(float(x), float(y)) for x, y in drawn]
+        count = case.contents + case.quiet
+        self._places: list[Point] = [(float(x), float(y)) for x, y in draw(count)]
+        if JOINS in case.events:  # elsewhere: where it left, others may be quiet yet
+            ((x, y),) = draw(1, beside=self._places)
+            self._landing = float(x), float(y)
         self._drawn = draw_imperfections(self._rig, seed=1000 + seed)
         self._wanted = _Wanted()
         self._last = case.contents - 1
@@ -224,7 +231,7 @@ class _Session:
             began = clock.now()
             del on.at[self._last]
         elif name == JOINS:
-            on.at[self._last] = self._places[self._last]
+            on.at[self._last] = self._landing
         elif name == CHANGES:
             self._wanted.targets[self._last]["band"] = self._other_band(before)
         else:
@@ -395,6 +402,8 @@ def _note(
         if event.name == JOINS and promised is not None:
             kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"
             found.events[kind].append(contrast - promised)
+            if id == last:
+                found.events[UNTIL].append(heard[id].short_until(promised - 3, event.time))
         if id != last and id in event.before.served:
             levels = [onset, _most(id, before, after)]
             found.events[f"{event.name}, above promise"].append(foreign - levels[1])

@@ -86,7 +86,7 @@ class Playback:
             if one.renew:
                 layer.ends = _end_of(one, time) + self.uncertainty
                 continue
-            start = self._onsets_end(one.layer, time) if one.after else time
+            start = self.onsets_end(one.layer, time) if one.after else time
             layer.waiting = (start, one, token) if start > time else None
             if start <= time:
                 self._start(one, token, time)
@@ -292,7 +292,8 @@ class Playback:
                 dues.append((due, number))
         return dues
 
-    def _onsets_end(self, layer: int, time: float) -> float:
+    def onsets_end(self, layer: int, time: float) -> float:
+        """Return when the onsets with knots of a layer have ended [s]; a time without any."""
         ends = (
             voice.transition.end
             for voices in self.all_voices

@@ -5,6 +5,7 @@ or later it may have begun, and a radius by which its first amplitude may differ
 any one clock; intervals are two times.
 """
 
+import math
 from collections.abc import Sequence
 from itertools import chain
 from typing import TypeAlias
@@ -79,7 +80,11 @@ class UncertainPlayback:
         self.advance(when[0])
         self._pass_until(when[0] + half)
         for one in layers:
-            self.half[one.layer] = max(half, self.half[one.layer] if one.after else 0.0)
+            known = self.half[one.layer]
+            onset_by = self.playback.onsets_end(one.layer, -math.inf) + known
+            # What waits, or will, starts as the onset ends, whenever that is renewed.
+            is_kept = one.after or (one.renew and onset_by > when[0])
+            self.half[one.layer] = max(half, known if is_kept else 0.0)
         before = [*self.playback.all_voices]
         self.playback.commit(layers, token, when[0] + half)
         self._mark(before, when)

@@ -147,5 +147,4 @@ async def judge(
         ]
         found = await run_checks(chosen, client, level=level, on_result=on_result, before=results)
     results = (*results, *found)
-    driven = level if any(each.check.drives for each in results) else 0.0
-    return Report(url, driven, results, len(checks) - len(results))
+    return Report(url, level, results, len(checks) - len(results))

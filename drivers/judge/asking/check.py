@@ -106,7 +106,7 @@ class CheckResult:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of checks on one amplifier; level: the highest at which channels were driven.
+    """Results of checks on one amplifier; level: the highest at which channels may be driven.
 
     left: number of checks that were not chosen.
     """
@@ -115,6 +115,12 @@ class Report:
     level: float
     results: tuple[CheckResult, ...]
     left: int
+
+    @property
+    def driven(self) -> float:
+        """The highest level at which channels were driven, 0 if none were."""
+        tried = (each for each in self.results if each.result is not Result.NOT_RUN)
+        return self.level * any(each.check.drives for each in tried)
 
     @property
     def not_run(self) -> int:
@@ -133,7 +139,7 @@ class Report:
     def summary(self) -> str:
         """The number of checks with each result."""
         counted = [f"{count} {name}" for name, count in [*self._counts().items()][:-1]]
-        driven = f", driven at up to {self.level:.0%} of full level" if self.level else ""
+        driven = f", driven at up to {self.driven:.0%} of full level" if self.driven else ""
         left = f", {self.not_run} not run" if self.not_run else ""
         return f"{', '.join(counted)}{left}{driven}"
 
@@ -142,7 +148,7 @@ class Report:
         return {
             "url": self.url,
             "overall": self.overall,
-            "level": self.level,
+            "level": self.driven,
             **self._counts(),
             "not_run": self.not_run,
             "seconds": round(sum(each.seconds for each in self.results), 3),
@@ -211,7 +217,7 @@ async def run_checks(
     why_none = next((each.reason for each in before if each.result is Result.NOT_RUN), "")
     for number, check in checks:
         if (took := clock.now() - began) > _MAX_TIME:
-            why_none = why_none or f"the checks before took {took:.0f} s"
+            why_none = why_none or f"the time of the run is used up: {took:.0f} s"
         is_armed = any(isinstance(each.finding, Armed) for each in (*before, *results))
         if why := _ARMED if check.drives and is_armed else why_none:
             result = CheckResult(check, number, Result.NOT_RUN, why)
@@ -234,7 +240,10 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
     reason = str(finding)
     if is_late:
         late = client.slow_reply or f"this machine was late by {1e3 * client.lag:.0f} ms"
-        reason = f"no verdict in {client.attempts or 1} attempts: {reason}; {late}"
+        tried = f"in {client.attempts or 1} attempts"
+        if client.is_used_up:
+            tried = "since the time of the run is used up"
+        reason = f"no verdict {tried}: {reason}; {late}"
     if why and why != reason:
         reason = f"{reason}; then {why}"
     result = CheckResult(

@@ -171,7 +171,7 @@ class Client(ABC):
     looked around. fastest, reactions: the shortest exchange by the name of its message [s], and the
     times until a reply began. attempts: of this check that came too late; mute: its requests
     without a reply; wasted: the time [s] of all of the run. lag: by how much this machine was late
-    since the check began, at most.
+    since the check began, at most; lateness: by how much this machine or a reply was, of all.
     """
 
     kind: ClassVar[str]
@@ -204,7 +204,7 @@ class Client(ABC):
         self.free = self.attempts = self.mute = 0
         self.fastest: dict[str, float] = {}
         self.reactions: dict[str, list[float]] = defaultdict(list)
-        self.wasted = self.lag = 0.0
+        self.wasted = self.lag = self.lateness = 0.0
         self.quiet = QUIET
         self.session = 0
         self.loss: str | None = None
@@ -294,13 +294,18 @@ class Client(ABC):
                 return f"its replies to {name} begin after {1e3 * least:.3g} ms at least"
         return ""
 
+    @property
+    def is_used_up(self) -> bool:
+        """Whether the time of the run for attempts that came too late is used up."""
+        return self.wasted >= _MAX_WASTED
+
     def was_late(self, since: float) -> bool:
         """Note an attempt from a time on that came too late; returns whether to make it again."""
         if self.slow_reply:
             return False
         self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
         self.wasted += clock.now() - since
-        return self.attempts < _MAX_ATTEMPTS and self.wasted < _MAX_WASTED
+        return self.attempts < _MAX_ATTEMPTS and not self.is_used_up
 
     @contextmanager
     def watching(self) -> Iterator[None]:
@@ -310,7 +315,8 @@ class Client(ABC):
             while True:
                 due = clock.now() + _LOOK
                 await asyncio.sleep(_LOOK)
-                self.lag = max(self.lag, clock.now() - due)
+                self.lag = max(self.lag, late := clock.now() - due)
+                self.lateness = max(self.lateness, late)
 
         self.attempts, self.mute, self.lag = 0, 0, 0.0
         looking = asyncio.create_task(look(), name="how late this machine is")

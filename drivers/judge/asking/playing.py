@@ -97,7 +97,7 @@ def after(subject: Subject) -> Rows:
 def after_the_last_onset(subject: Subject) -> Rows:
     """It waits for the last onset with knots of this layer on any channel, and for nothing else."""
     long = subject.long_onset
-    short = subject.envelope(max(0.02, 2 * min(subject.exchange_time, 0.1)), 0.5)
+    short = subject.envelope(min(max(0.02, 2 * subject.exchange_time), 0.1), 0.5)
     last = len(subject.channels) - 1
     both, exchanged = (
         [subject.tone(0, 0.5, onset=each), subject.tone(last, 0.5, onset=other)]
@@ -318,10 +318,10 @@ def voices(subject: Subject) -> Rows:
     """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
     channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
     count = min(subject.can["voices"], _MAX_VOICES)
-    fades, apart = count - others, math.ceil(5 * subject.exchange_time * 1000) + 5
+    fades = count - others
     at_once, shape = subject.envelope(0.0001), subject.envelope(0.1, *[_SHARES[1]] * 8)
     pause = 0.004 + at_once.step / 10_000  # s; until a tone is at its level
-    time = (count + 3) * (subject.exchange_time + pause) + 3 * apart / 1000
+    time = (count + 3) * (subject.exchange_time + pause) + 6 * subject.lead
     subject.require_ramp(time)
     ramp = min(max(math.ceil(2500 * time), 200), subject.can["ramp_max"])
     ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
@@ -340,8 +340,14 @@ def voices(subject: Subject) -> Rows:
             if at == 1 and ending:
                 await subject.play(layer(0))
 
-    def from_a_moment(at: int, ramp: int = ramp, apart: float = 0.0) -> Row:
-        return partial(subject.at, layer(0, *tones(at), ramp=ramp), apart=apart)
+    def from_a_moment(at: int) -> Row:
+        return partial(subject.at, layer(0, *tones(at), ramp=ramp))
+
+    async def count_until(left: float) -> None:
+        """Begin a tone while the fade that began last has a time left [s]."""
+        apart = math.ceil(2000 * subject.lead)
+        await subject.at(layer(0, *tones(fades - 1), ramp=apart))
+        await subject.at(layer(0, *tones(fades), ramp=ramp), apart=apart / 1000 - left)
 
     look = partial(subject.follow, 0.015)
     cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]
@@ -350,10 +356,7 @@ def voices(subject: Subject) -> Rows:
     fade_all = play(*(layer(each, ramp=ramp) for each in subject.layers[:3]))
     silence = send("Silence", ramp=0)
     full = layer(1, *tones(count + 1), ramp=ramp), fade_all, play(subject.one()), silence
-    counted = [
-        (from_a_moment(fades - 1, apart), from_a_moment(fades, ramp, apart / 1000 - left), look)
-        for left in _LEFT
-    ]
+    counted = [(partial(count_until, left), look) for left in _LEFT]
     return [
         # The oldest tone fades last: what is cut is the way to 0 that began first.
         (lasting, partial(fade, fades - 1), layer(1, ramp=ramp), *cuts, *full),

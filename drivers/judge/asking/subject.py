@@ -54,7 +54,8 @@ _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
 _MAX_UNFED, _UNFED = 0.1, 0.02  # of the watchdog; s before what must not feed
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
-_LEAD = 0.003  # s; of a commit before its moment, beside the exchanges until then
+# s; of a commit before its moment, beside the exchanges until then, and for lateness at most
+_LEAD, _MAX_LATENESS = 0.0025, 0.02
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 RATE = 1 / QUANTITIES["rate"].per_unit
@@ -182,7 +183,9 @@ class Subject(Material):
             client.fastest[name] = min(client.fastest.get(name, math.inf), took)
         beyond = max(took - client.pace * (before + bits), 0.0)
         count = 1 if name in _READ_ALONE else client.transactions
-        client.reactions["refusals" if answer.code else name].append(beyond / count)
+        reactions = client.reactions["refusals" if answer.code else name]
+        reactions.append(beyond / count)
+        client.lateness = max(client.lateness, beyond - count * min(reactions))
         self.heard_at = answer.when.latest
         return answer
 
@@ -407,11 +410,16 @@ class Subject(Material):
         Raises Late where its Commit may have come behind that.
         """
         await self.send(stage(*layers))
-        lead = 2.5 * self.exchange_time + _LEAD
-        self._moment = await self.commit_in(self._until_moment + apart if apart else lead)
+        ahead_by = self._until_moment + apart if apart else self.lead
+        self._moment = await self.commit_in(ahead_by)
         require_in_time(self._until_moment > HIGH_TIME, "a Commit came behind its moment")
         while self._until_moment >= 0:
             await self.status()
+
+    @property
+    def lead(self) -> float:
+        """How long before its moment a Commit is sent [s], by how late this run has been."""
+        return 2.5 * self.exchange_time + _LEAD + min(self.client.lateness, _MAX_LATENESS)
 
     @property
     def _until_moment(self) -> float:

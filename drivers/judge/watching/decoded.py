@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from drivers.judge.amplifier import FEEDING as FEEDING
@@ -216,19 +216,23 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         return damaged("a frame of the wrong direction")
     key = (frame.address, frame.sequence, frame.type) if frame.address else None
     is_hello = frame.type == HELLO_NUMBER
+    version = NEUTRAL if is_hello else VERSION
+    is_other = frame.version != version
     try:
         words = () if is_hello else unpack_words(frame.payload)
         if direction == "amplifier":
-            message: Message = request_of(frame.type, words, frame.address, key)
-        elif is_hello:
-            message = Reply(frame.address, key, unpack_identity(frame.payload))
+            request = request_of(frame.type, words, frame.address, key)
+            # One of another version has its reply, too: the identity, or a refusal.
+            wrong = f"version must be {version}, got {frame.version}" if is_other else ""
+            return replace(request, problem=wrong or request.problem)
+        if is_hello:
+            message: Message = Reply(frame.address, key, unpack_identity(frame.payload))
         else:
             message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
     except Refusal as refusal:
         if direction == "amplifier":
             return Request(f"type {frame.type}", frame.address, key, problem=str(refusal))
         return Reply(frame.address, key, problem=str(refusal))
-    is_other = frame.version != (NEUTRAL if is_hello else VERSION)
     if is_other and getattr(message, "refusal", 0) != REFUSALS["UNSUPPORTED_VERSION"]:
         return damaged(f"protocol version {frame.version}")
     return message

@@ -134,7 +134,9 @@ class WatchedAmplifier(ExpectedAmplifier):
 
     def refused(self, request: Request, code: int, time: float) -> None:
         """Note a refusal; what silences must not be refused, nor a commit of what is staged."""
-        if request.name == "Set" and not request.problem:
+        if request.problem:  # which must be refused
+            return
+        if request.name == "Set":
             self.part_refused(request.values, name_of(REFUSALS, code))
         if request.name in FEEDING:
             self.fed = self.fed[0], self._fed_before

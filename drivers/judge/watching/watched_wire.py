@@ -259,7 +259,7 @@ class WatchedWire:
         amplifier.unanswered = [one for one in amplifier.unanswered if one is not request]
         if reply.refusal:
             amplifier.refused(request, reply.refusal, time)
-        elif request.problem or reply.problem:
+        elif reply.problem or (request.problem and request.name != HELLO):
             if request.problem:
                 what = f"{session.name} accepted {request.name}: {request.problem}"
                 session.report_always("garbage", time, what)

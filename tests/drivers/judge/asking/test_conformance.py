@@ -17,7 +17,7 @@ from cobs import cobs
 
 import era_haptics
 from drivers.errors import CommandError
-from drivers.judge.asking import CHECKS, Result, judge, of_kind
+from drivers.judge.asking import CHECKS, Result, judge, of_kind, states
 from drivers.judge.asking.check import Check, CheckResult, Report, in_words, run_checks
 from drivers.judge.asking.client import Late, Violation, When
 from drivers.judge.asking.judge import Judge
@@ -214,6 +214,7 @@ def test_amplifier_that_is_not_identified_fails_once(
     assert re.fullmatch(reason, failed.reason), failed.reason
     after = {(each.result, each.reason) for each in others}
     assert after == {(Result.NOT_RUN, f"{failed.check.name} failed")}
+    assert Report("x", 0.2, tuple(found), 0).to_json()["level"] == 0  # nothing was driven
 
 
 def _stall(duration: float) -> None:
@@ -255,6 +256,17 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     assert (late.result, good.result) == ("skipped", "passed")
     assert isinstance(late.finding, Late)
     assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
+
+
+@in_virtual_time
+async def test_check_says_that_the_time_of_the_run_is_used_up() -> None:
+    """It is late after 20 s of attempts that came too late before it, so that none follows."""
+    line = JudgedLine("serial", varied())
+    line.client.wasted = 20.0
+    (late,) = await run_checks([(1, _tried([0.11]))], line.client, level=0.2)
+    line.close()
+    assert isinstance(late.finding, Late)
+    assert late.reason.startswith("no verdict since the time of the run is used up: "), late.reason
 
 
 SLOW = {
@@ -356,6 +368,33 @@ def test_request_that_comes_after_an_onset_is_no_violation(
     assert (result.result, delays) == (Result.PASSED, []), result.reason
 
 
+@pytest.mark.parametrize("is_obeyed_late", [False, True])
+@pytest.mark.parametrize("delay", [0.005, 0.009, 0.03, 0.042])
+def test_set_whose_reply_is_late_is_no_violation(
+    delay: float, is_obeyed_late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It began at once or late, and what waits for its onset counts from then, renewed too."""
+    write, send, late = JudgedLine.write, JudgedLine._send, list[bool]()
+
+    def written(line: JudgedLine, data: bytes) -> None:
+        (frame,) = FrameReader().feed(data)
+        is_meant = frame.type == MESSAGES["Set"].number and b"\x84\x03" in frame.payload  # 900 ms
+        late[:] = [is_meant]
+        asyncio.get_running_loop().call_later(
+            delay * (is_meant and is_obeyed_late), write, line, data
+        )
+
+    def sent(line: JudgedLine, data: bytes) -> None:
+        asyncio.get_running_loop().call_later(
+            delay * (late == [True] and not is_obeyed_late), send, line, data
+        )
+
+    monkeypatch.setattr(JudgedLine, "write", written)
+    monkeypatch.setattr(JudgedLine, "_send", sent)
+    (result,) = judged("serial", ["what_waits_for_an_onset"])
+    assert result.result is Result.PASSED, result.reason
+
+
 async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     """Those that only read; the keys of the report are a contract, and all frames are traced."""
     far, near = pty.openpty()
@@ -392,7 +431,7 @@ def test_report_says_the_worst() -> None:
     found = Violation("latch", expected=3, seen=4)
     assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
-    good = CheckResult(CHECKS[1], 2, Result.PASSED)
+    good = CheckResult(states.stop, 2, Result.PASSED)
     assert Report("x", 0.2, (bad, good), 0).overall == "failed"
     assert Report("x", 0.2, (good,), 1).overall == "incomplete"
     report = Report("x", 0.2, (good,), 0)

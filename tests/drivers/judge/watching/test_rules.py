@@ -1,6 +1,7 @@
 """Rules of the witness: each violation is found; correct traffic and own delays are none."""
 
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,33 @@ def test_layer_may_have_ended_by_itself_just_before_a_set(
     talk.replies(hand.COMMIT, hand.status(token=5, tokens=(5, 0, 0, 0)))
     talk.rest(0.049).staged(6, hand.layer(0, ramp=40)).committed(6, levels=(4878, 0))
     assert talk.rest(after).says(token=6, levels=(level, 0)).found == broken
+
+
+def refusal(kind: int, code: int) -> bytes:
+    """Return the payload of a Nak that names no channel."""
+    return struct.pack("<HHH", kind, code, 255)
+
+
+@pytest.mark.parametrize(
+    ("kind", "version", "words", "reply", "payload"),
+    [
+        (hand.HELLO, 3, (7,), hand.HELLO, hand.identity()),
+        (hand.GET_STATUS, 3, (), hand.NAK, refusal(hand.GET_STATUS, 8)),  # UNSUPPORTED_VERSION
+        (hand.STOP, hand.VERSION, (), hand.NAK, refusal(hand.STOP, 2)),  # BAD_LENGTH
+        (hand.DISARM, hand.VERSION, (5, 0), hand.NAK, refusal(hand.DISARM, 2)),
+    ],
+)
+def test_reply_to_what_no_host_may_send_is_no_fault(
+    kind: int, version: int, words: tuple[int, ...], reply: int, payload: bytes
+) -> None:
+    """Of another version or length: refused as the pages say, but a Hello is replied to."""
+    talk = Talk().identified()
+    talk.host_bytes(hand.frame(kind, words, sequence=77, version=version)).rest(0.001)
+    version = hand.VERSION if version == hand.VERSION else 0
+    reply |= hand.REPLY
+    talk.amplifier_bytes(hand.raw_frame(reply, payload, sequence=77, version=version))
+    assert talk.found == ["garbage"]
+    assert "host sent" in str(talk.witness.finish()[0])
 
 
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:

@@ -268,9 +268,9 @@ class PlateSelfMeasurement:
             known, plays = np.isfinite(values), self._rig.wiring[era].amplifier
             for name in {*held} - {plays}:
                 rows = known & (hears == name)
-                most = math.tau * frequency * _TURNED * math.hypot(held[plays], held[name])
+                limit = math.tau * frequency * _TURNED * math.hypot(held[plays], held[name])
                 turned = np.angle(np.vdot(repeated[rows], values[rows]))
-                repeated[rows] *= np.exp(1j * np.clip(turned, -most, most))
+                repeated[rows] *= np.exp(1j * np.clip(turned, -limit, limit))
             found.append(Repeat(era, frequency, values[known], repeated[known]))
         return tuple(found)
 

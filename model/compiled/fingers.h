@@ -6,14 +6,14 @@
 
 typedef struct {
     int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
-    int rows, lanes;            /* frequencies; lanes of the blocks below */
+    int rows, lanes, kept;      /* frequencies; lanes and thicknesses of the blocks below */
     float load_std;
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
     const float *centres, *stiffness;                      /* (k, r); (f, k) D */
-    value *of_blocks; /* (blocks of LANES frequencies, the first 3 thicknesses or 1, b, r) T, as `load` gives it */
+    value *of_blocks; /* (blocks of LANES frequencies, the first thicknesses, b, r) T, as `load` gives it */
 } plates;
 
 /* Some cases, each of a frequency and a thickness, with the fingers on them. */
@@ -78,15 +78,18 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
     if (X) by_eras(G, p, X, of, on);
 }
 
+/* Frequency at a place of a block; beyond the last one it is repeated. */
+INLINE int row_of_block(const plates *on, int first, int l) { return first + l < on->rows ? first + l : on->rows - 1; }
+
 /* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
 INLINE const value *of_block(const plates *on, const int *rows, const int *cases) {
-    const int kept = on->t < 3 ? on->t : 3, thickness = cases[0] - rows[0] * on->t;
-    int is_block = on->lanes == LANES && rows[0] % LANES == 0 && thickness < kept;
+    const int thickness = cases[0] - rows[0] * on->t;
+    int is_block = on->lanes == LANES && rows[0] % LANES == 0 && thickness < on->kept;
     for (int l = 1; l < LANES; l++) {
-        is_block &= rows[l] == (rows[0] + l < on->rows ? rows[0] + l : on->rows - 1); /* the last one is repeated */
+        is_block &= rows[l] == row_of_block(on, rows[0], l);
         is_block &= cases[l] - rows[l] * on->t == thickness;
     }
-    return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * kept + thickness) * on->b * on->r : NULL;
+    return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * on->kept + thickness) * on->b * on->r : NULL;
 }
 
 /* Places in work space; the end of it. */

@@ -97,12 +97,9 @@ int blocks_stage(plates *on) {
     const size_t each = (size_t)on->b * on->r;
     value *to = on->of_blocks;
     for (int first = 0; first < on->rows; first += LANES)
-        for (int thickness = 0; thickness < (on->t < 3 ? on->t : 3); thickness++, to += each) {
+        for (int thickness = 0; thickness < on->kept; thickness++, to += each) {
             int cases[LANES];
-            for (int l = 0; l < LANES; l++) {
-                const int row = first + l < on->rows ? first + l : on->rows - 1;
-                cases[l] = row * on->t + thickness;
-            }
+            for (int l = 0; l < LANES; l++) cases[l] = row_of_block(on, first, l) * on->t + thickness;
             load(to, on->by_force, each, cases);
         }
     return FOUND;

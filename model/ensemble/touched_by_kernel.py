@@ -10,7 +10,7 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.compiled.kernels import Kernels, kernels, run
 from model.compiled.structures import PlateDraws, PointGroups, Sensors, TouchedPlates, as_given
-from model.ensemble.attached_plate import PlateOnEras
+from model.ensemble.attached_plate import THINNER, PlateOnEras
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import Drawing, Draws
 from model.ensemble.touched_plate import (
@@ -116,12 +116,13 @@ class TouchedByKernel(TouchedPlate):
 
 def plates_structure(on: PlateOnEras) -> TouchedPlates:
     """A plate without fingers as kernels read it, kept with it."""
-    kept = _kept.get(on)
-    if kept is not None:
-        return kept
+    known = _kept.get(on)
+    if known is not None:
+        return known
     plate = on.plate
     (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
-    found = TouchedPlates(plate.era_count, b, 0, r, t, f, 0, plate.uncertainty.fingertip)
+    kept = min(t, THINNER + 1)  # thicknesses that searches rank by
+    found = TouchedPlates(plate.era_count, b, 0, r, t, f, 0, kept, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
@@ -129,7 +130,7 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
     )
     if (by := kernels()) is not None:
         found.lanes = by.lanes
-        room = np.empty(2 * (f + by.lanes) * min(t, 3) * b * r + _MAX_LANES, dtype=np.float32)
+        room = np.empty(2 * (f + by.lanes) * kept * b * r + _MAX_LANES, dtype=np.float32)
         found.arrays.append(room)
         found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
         run(by.library.blocks_stage, found)

@@ -139,12 +139,10 @@ def arrangement_of(
     is_one = len({address.line for address in addresses.values()}) == 1
     lines = f"{'one line' if is_one else 'separate lines'} ({', '.join(sorted({*kinds.values()}))})"
     is_bus = is_one and "ethernet" not in kinds.values()  # behind which each has its connection
-    by_line = {
-        name: min(CLOCK_ERRORS[kind], BUS_ERROR) if is_bus else CLOCK_ERRORS[kind]
-        for name, kind in kinds.items()
-    }
-    errors = {name: math.hypot(stated[name] / math.sqrt(3), by_line[name]) for name in kinds}
+    highest = BUS_ERROR if is_bus else math.inf
+    by_line = {name: min(CLOCK_ERRORS[kind], highest) for name, kind in kinds.items()}
+    by_clock = {name: stated[name] / math.sqrt(3) for name in kinds}
+    errors = {name: math.hypot(by_clock[name], by_line[name]) for name in kinds}
     worst = max(errors, key=errors.__getitem__)
-    if stated[worst] / math.sqrt(3) > by_line[worst]:
-        return Arrangement(lines, errors, _CLOCKS)
-    return Arrangement(lines, errors, "" if is_bus else _REMEDIES.get(kinds[worst], ""))
+    remedy = "" if is_bus else _REMEDIES.get(kinds[worst], "")
+    return Arrangement(lines, errors, _CLOCKS if by_clock[worst] > by_line[worst] else remedy)

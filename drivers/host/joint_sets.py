@@ -114,8 +114,9 @@ class JointSets:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         try:
-            several = zip(amplifiers, results, strict=True)
-            self._members.checked([one for each, one in several if each.name not in refusals])
+            if refusals:  # of which nothing is told where anything worse happened
+                several = zip(amplifiers, results, strict=True)
+                self._members.checked([one for each, one in several if each.name not in refusals])
             staged = dict(zip(amplifiers, self._members.checked(results), strict=True))
         except Overtaken as overtaken:
             return overtaken

@@ -213,6 +213,8 @@ class HeldClock:
             return
         (sent, arrives), marks, self._marks = self._requested, self._marks, 0
         time = min(arrives, received)
+        if time - self._beside.time > _MARKED:  # what it differs by is no longer seen
+            self._beside = _Line(-math.inf)
         was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and self._is_armed:

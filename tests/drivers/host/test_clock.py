@@ -406,6 +406,19 @@ def test_clocks_of_a_line_are_compared_by_marks() -> None:
     assert seen == pytest.approx(talks[0].counter.lead - talks[1].counter.lead, abs=0.1e-6)
 
 
+def test_marks_that_are_no_longer_seen_do_not_count() -> None:
+    """A crystal changes by 20 ppm, and no Mark comes for a minute: its own readings tell of it."""
+    talks = [Exchanges(Counter(crystal)) for crystal in (40e-6, -30e-6)]
+    for talk in talks:
+        talk.run(1.0)
+    talks[1].held.compare(talks[0].held)
+    mark(talks, 6, lambda: 0.2e-3)
+    talks[1].counter.crystal += 20e-6
+    for talk in talks:
+        talk.run(60.0)
+        assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead, abs=20e-6)
+
+
 @pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
 def test_mark_that_comes_twice_moves_no_clock(is_armed: bool) -> None:
     """Once more 40 ms later: the second status behind it shows a clock of 10 ms ago.

@@ -1,0 +1,37 @@
+"""Patterns: the one form into which all content formats are read.
+
+Events and curves over time, as AHAP, HJIF and their relatives have them: how strongly what lasts is
+felt, how sharply, and transients beside it.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+Curve: TypeAlias = tuple[tuple[float, float], ...]
+"""Times [s], none before the one ahead of it, and values 0 to 1: straight lines, steps where two
+times are equal."""
+
+
+@dataclass(frozen=True)
+class Transient:
+    """A short tap at a time [s]: intensity and sharpness, 0 to 1."""
+
+    time: float
+    intensity: float
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What a file asks for.
+
+    duration [s]; intensity, sharpness: of what lasts, intensity 0 outside its curve, sharpness as
+    at its ends; transients: ascending in time; remarks: what of the file was changed or left out,
+    in words.
+    """
+
+    duration: float
+    intensity: Curve = ()
+    sharpness: Curve = ()
+    transients: tuple[Transient, ...] = ()
+    remarks: tuple[str, ...] = ()

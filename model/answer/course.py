@@ -1,0 +1,56 @@
+"""Courses: how strongly a stimulus is felt over its duration, as an envelope of its amplitude."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+
+MAX_POINTS = 20_000
+
+
+@dataclass(frozen=True)
+class Course:
+    """Shares of the highest amplitude of a stimulus over its duration.
+
+    times [s]: ascending, the first is 0, the last its duration; shares: 0 to 1, along straight
+    lines between.
+    """
+
+    times: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check everything."""
+        if not 2 <= len(self.times) == len(self.shares) <= MAX_POINTS:
+            raise InputError(
+                f"a course must have 2 to {MAX_POINTS} times and as many shares, got "
+                f"{len(self.times)} and {len(self.shares)}"
+            )
+        if self.times[0] != 0 or not all(one < after for one, after in pairwise(self.times)):
+            raise InputError("times of a course must ascend from 0")
+        if not all(0 <= each <= 1 for each in self.shares):  # False for NaN
+            raise InputError(
+                f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
+                f"{max(self.shares):g}"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Its last time [s]."""
+        return self.times[-1]
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Shares at times [s] (n,), 0 outside."""
+        return np.asarray(np.interp(times, self.times, self.shares, left=0.0, right=0.0))
+
+    def left(self, since: float) -> Self:
+        """What is left of it from a time [s] within it on."""
+        later = bisect_right(self.times, since)
+        first = float(self.at(np.array([since]))[0])
+        times = (0.0, *[each - since for each in self.times[later:]])
+        return type(self)(times, (first, *self.shares[later:]))

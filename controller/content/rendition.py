@@ -33,10 +33,12 @@ CLICK_DURATION, DUCKING = 0.040, 0.030
 SMOOTHING = 0.020
 """Width at half height [s] of the raised cosine over which courses beside others are averaged."""
 
+_APART = 0.060  # s; between the starts of clicks at least, as at different fingers
 _BAND = 0.1  # on each side of a frequency
 _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
 _MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
 _ROUNDING = 1e-9  # of times [s], and of counts of steps
+_TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 _DEEP = 0.5  # amplitude of a modulation to its mean that is felt as a texture
 
 
@@ -70,12 +72,17 @@ class Rendition:
     def smoothed(self) -> "Rendition":
         """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
 
-        It starts from rest and ends at rest, 20 ms each, within its duration.
+        Its modulation stays. It starts from rest and ends at rest, within its duration.
         """
         if self.course is None:
             return self
-        times = np.array(self.course.times)
-        shares = _averaged(np.array(self.course.shares), times[1], SMOOTHING)
+        times, shares = np.array(self.course.times), np.array(self.course.shares)
+        texture = np.zeros(len(times))
+        if self.modulation_hz is not None:
+            spectrum = np.fft.rfft(shares)
+            away = np.abs(np.fft.rfftfreq(len(shares), times[1]) - self.modulation_hz)
+            texture = np.fft.irfft(spectrum * (away <= _TEXTURE), len(shares))
+        shares = averaged(shares - texture, times[1], SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
         course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
         return replace(self, course=course)
@@ -84,15 +91,18 @@ class Rendition:
 def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] that a pattern asks for at times [s] (n,), before anything of it is lost.
 
-    level_db_sl: of intensity 1; -inf for nothing.
+    level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
+    between them, from which each is set apart.
     """
-    level, taps = _lasting(pattern, level_db_sl, times), pattern.transients
-    starts = np.array([each.time for each in taps])
+    starts, intensities = (
+        np.array([getattr(each, name) for each in pattern.transients])
+        for name in ("time", "intensity")
+    )
+    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(np.sort(starts), times))
     first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
-    number = np.repeat(np.arange(len(taps)), last - first)
+    number = np.repeat(np.arange(len(starts)), last - first)
     during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
-    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    np.maximum.at(level, during, levels[number])
+    np.maximum.at(level, during, _level_of(intensities, level_db_sl)[number])
     return level
 
 
@@ -103,6 +113,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
     energy is; transients are clicks, of those too close together the strongest.
     """
+    pattern = _as_tap(pattern)
     taps = _apart(pattern)
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     hertz = _hertz(np.array([each.sharpness for each in taps]))
@@ -119,7 +130,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     if merged := sum(each.intensity > 0 for each in pattern.transients) - len(taps):
         remarks.append(
             f"{merged} of {merged + len(taps)} taps are left out, as they are less than "
-            f"{1000 * (CLICK_DURATION + DUCKING):.0f} ms from a stronger one"
+            f"{1000 * _APART:.0f} ms from a stronger one"
         )
     if not shares.any():
         return Rendition(
@@ -173,6 +184,21 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
     )
 
 
+def _as_tap(pattern: Pattern) -> Pattern:
+    """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
+    highest = max((value for _, value in pattern.intensity), default=0.0)
+    if pattern.transients or not highest or pattern.duration >= CLICK_DURATION:
+        return pattern
+    sharpness = float(_along(pattern.sharpness, np.zeros(1))[0])
+    lost = f"lasts {1000 * pattern.duration:.0f} ms, less than a plate follows: it is a tap"
+    return replace(
+        pattern,
+        intensity=(),
+        transients=(Transient(0.0, highest, sharpness),),
+        remarks=(*pattern.remarks, lost),
+    )
+
+
 def _apart(pattern: Pattern) -> list[Transient]:
     """The transients that are felt, ascending: the strongest first, those too close left out."""
     kept, times = list[Transient](), list[float]()
@@ -180,7 +206,7 @@ def _apart(pattern: Pattern) -> list[Transient]:
         at = bisect_left(times, tap.time)
         around = times[max(at - 1, 0) : at + 1]
         apart = min((abs(tap.time - each) for each in around), default=np.inf)
-        if tap.intensity > 0 and apart >= CLICK_DURATION + DUCKING - _ROUNDING:
+        if tap.intensity > 0 and apart >= _APART - _ROUNDING:
             kept.insert(at, tap)
             times.insert(at, tap.time)
     return kept
@@ -228,9 +254,9 @@ def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
     Slow is what is left after an average of 0.1 s, which holds nothing from 10 Hz on.
     """
     step = times[1]
-    slow = _averaged(shares, step, 1 / MIN_MODULATION)
+    slow = averaged(shares, step, 1 / MIN_MODULATION)
     fast = shares - slow
-    depth = np.sqrt(2 * _averaged(fast**2, step, 1 / MIN_MODULATION))
+    depth = np.sqrt(2 * averaged(fast**2, step, 1 / MIN_MODULATION))
     if np.count_nonzero(depth > _DEEP * slow) <= np.count_nonzero(slow > 0) / 2:
         return None
     hertz, power = np.fft.rfftfreq(len(fast), step), np.abs(np.fft.rfft(fast)) ** 2
@@ -240,7 +266,7 @@ def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
     return float(hertz[is_texture][best_of(power[is_texture])])
 
 
-def _averaged(values: FloatArray, step: float, width: float) -> FloatArray:
+def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
     """Values a step [s] apart, averaged by a raised cosine of a width [s] at half its height."""
     count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
     kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2

@@ -59,11 +59,12 @@ class Part:
 class CheckedContent:
     """Content at a finger as it will be felt.
 
-    parts: what lasts, if anything does, and the taps; lost: what was changed or left out, in words;
-    wanted, given (n,) [dB SL]: levels every `step` [s], root mean squares over 20 ms, given so long
-    later; kept: shares of the time in which they agree, for delays [s] (d,).
+    duration [s]; parts: what lasts, if anything does, and the taps; lost: what was changed or left
+    out, in words; wanted, given (n,) [dB SL]: levels every `step` [s], root mean squares over
+    20 ms; kept: shares of the time in which they agree, for delays [s] of what is given (d,).
     """
 
+    duration: float
     parts: tuple[Part, ...]
     lost: tuple[str, ...]
     step: float
@@ -81,12 +82,6 @@ class CheckedContent:
     def kept_share(self) -> float:
         """Share of the time in which what is felt is within 3 dB of what is wanted, 0 to 1."""
         return float(self.kept.max())
-
-    @property
-    def promised_contrast_db(self) -> float | None:
-        """Of the part that has least above what quiet fingers feel; None without these."""
-        found = [each.answer.fingers[0].promised_contrast_db for each in self.parts]
-        return min((each for each in found if each is not None), default=None)
 
     def as_json(self) -> dict[str, Any]:
         """Return it as `era content check --json` prints it."""
@@ -111,8 +106,14 @@ class CheckedContent:
                 }
                 for each in self.parts
             ],
-            "promised_contrast_db": self.promised_contrast_db,
+            "promised_contrast_db": least_promise(self.parts),
         }
+
+
+def least_promise(parts: Sequence[Part]) -> float | None:
+    """The least promised contrast of parts [dB] to what quiet fingers feel; None without these."""
+    found = [each.answer.fingers[0].promised_contrast_db for each in parts]
+    return min((each for each in found if each is not None), default=None)
 
 
 def check_content(
@@ -154,7 +155,9 @@ def check_content(
         np.mean(np.abs(np.roll(given, -each) - wanted)[counts] <= TOLERANCE_DB) for each in delays
     ]
     lost = (*rendition.remarks, *_weaker(parts))
-    return CheckedContent(parts, lost, 1 / rate, wanted, given, delays / rate, np.array(kept))
+    return CheckedContent(
+        rendition.duration, parts, lost, 1 / rate, wanted, given, delays / rate, np.array(kept)
+    )
 
 
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     pattern = _as_tap(pattern)
     taps = _apart(pattern)
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    hertz = _hertz(np.array([each.sharpness for each in taps]))
+    hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
     clicks = tuple(
         Click(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
@@ -129,8 +129,8 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     remarks = list(pattern.remarks)
     if merged := sum(each.intensity > 0 for each in pattern.transients) - len(taps):
         remarks.append(
-            f"{merged} of {merged + len(taps)} taps are left out, as they are less than "
-            f"{1000 * _APART:.0f} ms from a stronger one"
+            f"{merged} of {merged + len(taps)} taps, less than {1000 * _APART:.0f} ms from a "
+            "stronger one"
         )
     if not shares.any():
         return Rendition(
@@ -144,7 +144,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
         )
     highest = float(shares.max())
     course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
-    hertz = _hertz(_along(pattern.sharpness, times))
+    hertz = sharpness_hz(along(pattern.sharpness, times))
     band = _band(_carrier(hertz, shares**2), frequencies)
     remarks += _lost(hertz, shares, band, clicks, frequencies)
     top = float(level.max()) + float(decibels(highest))
@@ -161,17 +161,17 @@ def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
 
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] of what lasts at times [s]."""
-    return _level_of(_along(pattern.intensity, times, beyond=0.0), level_db_sl)
+    return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
 
 
-def _along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
+def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
     """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
     moments, values = np.array(curve or ((0.0, 0.0),)).T
     return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
 
 
-def _hertz(sharpness: FloatArray) -> FloatArray:
-    """Frequencies of sharpness [Hz]."""
+def sharpness_hz(sharpness: FloatArray) -> FloatArray:
+    """Frequencies [Hz] of sharpness, 0 to 1."""
     return DULLEST_HZ + sharpness * (SHARPEST_HZ - DULLEST_HZ)
 
 
@@ -189,8 +189,8 @@ def _as_tap(pattern: Pattern) -> Pattern:
     highest = max((value for _, value in pattern.intensity), default=0.0)
     if pattern.transients or not highest or pattern.duration >= CLICK_DURATION:
         return pattern
-    sharpness = float(_along(pattern.sharpness, np.zeros(1))[0])
-    lost = f"lasts {1000 * pattern.duration:.0f} ms, less than a plate follows: it is a tap"
+    sharpness = float(along(pattern.sharpness, np.zeros(1))[0])
+    lost = f"{1000 * pattern.duration:.0f} ms, less than a plate follows: played as a tap"
     return replace(
         pattern,
         intensity=(),
@@ -240,12 +240,12 @@ def _lost(
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
         asked = hertz[shares > 0]
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts is lost: it is {asked.min():.0f} to "
-            f"{asked.max():.0f} Hz in the file and has one frequency here, of {band[0]:.0f} to "
+            f"sharpness of {100 * lost:.0f} % of what lasts: {asked.min():.0f} to "
+            f"{asked.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
             f"{band[1]:.0f} Hz"
         )
     if clicks:
-        yield f"what lasts pauses {1000 * DUCKING:.0f} ms before and after each of the taps"
+        yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:

@@ -61,7 +61,7 @@ class CheckedContent:
 
     duration [s]; parts: what lasts, if anything does, and the taps; lost: what was changed or left
     out, in words; wanted, given (n,) [dB SL]: levels every `step` [s], root mean squares over
-    20 ms; kept: shares of the time in which they agree, for delays [s] of what is given (d,).
+    20 ms; kept: shares of the time in which they agree, for delays of 0, 1, 2 ... steps.
     """
 
     duration: float
@@ -70,13 +70,12 @@ class CheckedContent:
     step: float
     wanted: FloatArray
     given: FloatArray
-    delays: FloatArray
     kept: FloatArray
 
     @property
     def delay(self) -> float:
         """By how much the plate is late [s]: with it most is kept."""
-        return float(self.delays[best_of(self.kept)])
+        return self.step * best_of(self.kept)
 
     @property
     def kept_share(self) -> float:
@@ -108,6 +107,13 @@ class CheckedContent:
             ],
             "promised_contrast_db": least_promise(self.parts),
         }
+
+
+def kept_shares(wanted: FloatArray, given: FloatArray, count: int) -> FloatArray:
+    """Shares of the time in which levels [dB] (n,) agree, for delays of what is given (count,)."""
+    counts = wanted > wanted.max() - RANGE_DB
+    late = [np.roll(given, -each)[counts] - wanted[counts] for each in range(count)]
+    return np.asarray(np.mean(np.abs(late) <= TOLERANCE_DB, axis=1))
 
 
 def least_promise(parts: Sequence[Part]) -> float | None:
@@ -149,15 +155,9 @@ def check_content(
     given = _level_at(table, at, quiet, _signals(parts, table, times), rate)
     power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
     wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
-    delays = np.arange(int(MAX_DELAY * rate) + 1)
-    counts = wanted > wanted.max() - RANGE_DB
-    kept = [
-        np.mean(np.abs(np.roll(given, -each) - wanted)[counts] <= TOLERANCE_DB) for each in delays
-    ]
+    kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
     lost = (*rendition.remarks, *_weaker(parts))
-    return CheckedContent(
-        rendition.duration, parts, lost, 1 / rate, wanted, given, delays / rate, np.array(kept)
-    )
+    return CheckedContent(rendition.duration, parts, lost, 1 / rate, wanted, given, kept)
 
 
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:

@@ -94,15 +94,14 @@ def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> Flo
     level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
     between them, from which each is set apart.
     """
-    starts, intensities = (
-        np.array([getattr(each, name) for each in pattern.transients])
-        for name in ("time", "intensity")
-    )
-    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(np.sort(starts), times))
+    taps = [each for each in pattern.transients if each.intensity > 0]
+    starts = np.array([each.time for each in taps])
+    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
+    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(starts, times))
     first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
-    number = np.repeat(np.arange(len(starts)), last - first)
+    number = np.repeat(np.arange(len(taps)), last - first)
     during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
-    np.maximum.at(level, during, _level_of(intensities, level_db_sl)[number])
+    np.maximum.at(level, during, levels[number])
     return level
 
 
@@ -132,25 +131,15 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
             f"{merged} of {merged + len(taps)} taps, less than {1000 * _APART:.0f} ms from a "
             "stronger one"
         )
-    if not shares.any():
-        return Rendition(
-            duration,
-            None,
-            level_db_sl,
-            _band(DULLEST_HZ, frequencies),
-            None,
-            clicks,
-            tuple(remarks),
-        )
-    highest = float(shares.max())
-    course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
-    hertz = sharpness_hz(along(pattern.sharpness, times))
-    band = _band(_carrier(hertz, shares**2), frequencies)
-    remarks += _lost(hertz, shares, band, clicks, frequencies)
-    top = float(level.max()) + float(decibels(highest))
-    return Rendition(
-        duration, course, top, band, _modulation(times, shares), clicks, tuple(remarks)
-    )
+    course, band, modulation = None, _band(DULLEST_HZ, frequencies), None
+    if highest := float(shares.max()):
+        course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
+        hertz = sharpness_hz(along(pattern.sharpness, times))
+        band = _band(_carrier(hertz, shares**2), frequencies)
+        modulation = _modulation(times, shares)
+        remarks += _lost(hertz, shares, band, clicks)
+        level_db_sl = float(level.max() + decibels(highest))
+    return Rendition(duration, course, level_db_sl, band, modulation, clicks, tuple(remarks))
 
 
 def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
@@ -186,15 +175,18 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
 
 def _as_tap(pattern: Pattern) -> Pattern:
     """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
-    highest = max((value for _, value in pattern.intensity), default=0.0)
-    if pattern.transients or not highest or pattern.duration >= CLICK_DURATION:
+    moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
+    sounds = np.maximum(values[1:], values[:-1]) > 0
+    length = float(np.diff(moments)[sounds].sum())
+    if pattern.transients or not values.any() or length >= CLICK_DURATION:
         return pattern
-    sharpness = float(along(pattern.sharpness, np.zeros(1))[0])
-    lost = f"{1000 * pattern.duration:.0f} ms, less than a plate follows: played as a tap"
+    start = float(moments[np.flatnonzero(values)[0]])
+    sharpness = float(along(pattern.sharpness, np.array([start]))[0])
+    lost = f"{1000 * length:.0f} ms, less than a plate follows: played as a tap"
     return replace(
         pattern,
         intensity=(),
-        transients=(Transient(0.0, highest, sharpness),),
+        transients=(Transient(start, float(values.max()), sharpness),),
         remarks=(*pattern.remarks, lost),
     )
 
@@ -229,11 +221,7 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 
 
 def _lost(
-    hertz: FloatArray,
-    shares: FloatArray,
-    band: Band,
-    clicks: Sequence[Click],
-    frequencies: FloatArray,
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
 ) -> Iterator[str]:
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])

@@ -52,12 +52,12 @@ def mixed(
     order = np.argsort(levels.sum(axis=0), kind="stable")
     sharpness = np.full((2, count), np.nan)
     sharpness[:, at[order]] = sharps[:, order]  # of equal places the last, the strongest, stays
-    intensity = np.sqrt(power) * _between(factor, knots)
-    sharpness += _between(addend, knots)
+    intensity = np.sqrt(power) * between(factor, knots)
+    sharpness += between(addend, knots)
     return _curve(knots, np.clip(intensity, 0, 1)), _curve(knots, np.clip(sharpness, 0, 1))
 
 
-def _between(curve: Curve, knots: FloatArray) -> FloatArray:
+def between(curve: Curve, knots: FloatArray) -> FloatArray:
     """Return a curve (2, n) after and before the ends of each stretch between knots."""
     times, values = np.array(curve).T
     width = np.diff(knots)

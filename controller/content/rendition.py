@@ -39,7 +39,6 @@ _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contra
 _MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
 _ROUNDING = 1e-9  # of times [s], and of counts of steps
 _TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
-_DEEP = 0.5  # amplitude of a modulation to its mean that is felt as a texture
 
 
 @dataclass(frozen=True)
@@ -56,9 +55,9 @@ class Rendition:
     """A pattern as stimuli of one finger.
 
     duration [s]; course: of what lasts, ducked around the clicks, None without any; level_db_sl: at
-    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second it comes and
-    goes for most of its duration, which its course has too; clicks: ascending, apart by their
-    duration and the ducking; remarks: what was changed or lost on the way, in words.
+    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second its course
+    comes and goes, None where that is not most of what changes; clicks: ascending, 60 ms
+    apart; remarks: what was changed or lost on the way, in words.
     """
 
     duration: float
@@ -237,17 +236,9 @@ def _lost(
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
-    """How often a second [Hz] shares come and go for most of their duration, None if they do not.
-
-    Slow is what is left after an average of 0.1 s, which holds nothing from 10 Hz on.
-    """
-    step = times[1]
-    slow = averaged(shares, step, 1 / MIN_MODULATION)
-    fast = shares - slow
-    depth = np.sqrt(2 * averaged(fast**2, step, 1 / MIN_MODULATION))
-    if np.count_nonzero(depth > _DEEP * slow) <= np.count_nonzero(slow > 0) / 2:
-        return None
-    hertz, power = np.fft.rfftfreq(len(fast), step), np.abs(np.fft.rfft(fast)) ** 2
+    """How often a second [Hz] shares come and go, where most of what changes is that."""
+    hertz = np.fft.rfftfreq(len(shares), times[1])
+    power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
     is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
     if power[is_texture].sum() <= power.sum() / 2:
         return None

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 
 import numpy as np
 
+from model.answer.course import Course
 from model.arguments import expect_number, shown
 from model.arrays import Point
 from model.config.points import in_metres
@@ -55,9 +56,10 @@ class Stimulus:
     level_db_sl: over its duration, onset included, on the plate as modelled; of a stimulus that
     lasts what nine of ten plates give; band_hz: lowest and highest frequency; duration [s]: None
     for one that lasts, a click has 0.04; modulation_hz: how often a second the strength of one that
-    lasts comes and goes, MIN_MODULATION to MAX_MODULATION, None for a steady one; is_limit: whether
-    it is as strong as the quiet fingers allow, up to that level; name: fingers of one name may be
-    given one vibration.
+    lasts, or has a course, comes and goes, MIN_MODULATION to MAX_MODULATION, None for a steady one;
+    is_limit: whether it is as strong as the quiet fingers allow, up to that level; name: fingers of
+    one name may be given one vibration; course: how strongly it is felt over its duration, which is
+    that of the course, level_db_sl at a share of 1.
     """
 
     level_db_sl: float = STRONG_DB_SL
@@ -66,6 +68,7 @@ class Stimulus:
     modulation_hz: float | None = None
     is_limit: bool = False
     name: str | None = None
+    course: Course | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
@@ -88,6 +91,17 @@ class Stimulus:
             raise InputError(f"name of a stimulus must be text, got {shown(self.name)}")
         if not isinstance(self.is_limit, bool):
             raise InputError(f"is_limit must be True or False, got {shown(self.is_limit)}")
+        if self.course is not None:
+            if not isinstance(self.course, Course):
+                raise InputError(
+                    "course must be one such as era.Course((0, 0.5), (1, 0)), got "
+                    f"{shown(self.course)}"
+                )
+            if self.duration not in (None, self.course.duration):
+                raise InputError(
+                    f"duration must be left out of a stimulus with a course, got {self.duration:g}"
+                )
+            object.__setattr__(self, "duration", self.course.duration)
         if self.duration is not None:
             expect_number(self.duration, what="duration", unit="seconds")
             if not MIN_DURATION <= self.duration <= MAX_DURATION:  # False for NaN
@@ -102,8 +116,10 @@ class Stimulus:
                     f"modulation_hz must be from {MIN_MODULATION:g} to {MAX_MODULATION:g} Hz, got "
                     f"{self.modulation_hz:g}"
                 )
-            if self.duration is not None:
-                raise InputError("modulation_hz must be left out of a stimulus with a duration")
+            if self.duration is not None and self.course is None:
+                raise InputError(
+                    "modulation_hz must be left out of a stimulus with a duration but no course"
+                )
 
 
 @dataclass(frozen=True)
@@ -169,7 +185,7 @@ class Finger:
         one, two = self.stimulus, other.stimulus
         if one is None or two is None:
             return False
-        if (one.duration, one.is_limit) != (two.duration, two.is_limit):
+        if (one.duration, one.is_limit, one.course) != (two.duration, two.is_limit, two.course):
             return False
         if self.sharing == other.sharing == ANY:
             return True

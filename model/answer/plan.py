@@ -345,12 +345,13 @@ class _Answering:
                 other = self.fingers[finger]
                 level = max(level, other.stimulus.level_db_sl if other.stimulus else level)
                 priority = max(priority, other.priority)
-            duration, limit = None, None
+            duration, limit, course = None, None, None
             if stimulus is not None:
-                duration = stimulus.duration
+                duration, course = stimulus.duration, stimulus.course
                 if stimulus.is_limit:
                     level, limit = min(level, FELT_DB_SL), level
-            streams.append(Stream(fingers, float(level), own, priority, duration, limit))
+            of_stimulus = duration, limit, course
+            streams.append(Stream(fingers, float(level), own, priority, *of_stimulus))
         if len(streams) == 1 and not plan.quiet:
             places = [self.fingers[finger].at for finger in streams[0].targets]
             background = self.table.background(places)

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.answer.course import Course
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, Point
 from model.choice import NEARLY
 from model.drive_modes import UNRESTRICTED
@@ -68,7 +69,7 @@ class Stream:
     bands: of the table's frequencies that it may have the first and one past the last, by row, for
     each band (one unless bands may be exchanged); duration [s]: over which the level is felt, None
     for one that lasts; limit_db_sl: up to which it is as strong as the others allow, None for the
-    level itself.
+    level itself; course: over the duration, whose highest share has the level.
     """
 
     targets: tuple[int, ...]
@@ -77,6 +78,7 @@ class Stream:
     priority: int = 0
     duration: float | None = None
     limit_db_sl: float | None = None
+    course: Course | None = None
 
 
 @dataclass(frozen=True, eq=False)

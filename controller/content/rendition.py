@@ -1,0 +1,265 @@
+"""Renditions: what a pattern becomes on a plate at a level, before anybody else's is known.
+
+Its reasons are in docs/how-to/play-a-file.md.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from controller.content.pattern import Curve, Pattern, Transient
+from model.answer.course import Course
+from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
+from model.arrays import FloatArray
+from model.choice import best_of
+from model.finger.perception import decibels
+from model.transients.base_motion import KNOT_STEP, rise
+
+Band: TypeAlias = tuple[float, float]
+"""Lowest and highest frequency [Hz]."""
+
+LEAST_DB_SL = 10.0
+"""Level of the faintest intensity, the least that Android's builder of envelopes guarantees."""
+
+DULLEST_HZ, SHARPEST_HZ = 65.0, 300.0
+"""Frequencies of sharpness 0 and 1, as the MPEG reference encoder reads AHAP."""
+
+CLICK_DURATION, DUCKING = 0.040, 0.030
+"""Of a transient [s], and while what lasts fades before it and returns after it."""
+
+SMOOTHING = 0.020
+"""Width at half height [s] of the raised cosine over which courses beside others are averaged."""
+
+_APART = 0.060  # s; between the starts of clicks at least, as at different fingers
+_BAND = 0.1  # on each side of a frequency
+_MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
+_MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
+_ROUNDING = 1e-9  # of times [s], and of counts of steps
+_TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
+
+
+@dataclass(frozen=True)
+class Click:
+    """A transient: when it starts [s], its level [dB SL] and its band [Hz]."""
+
+    time: float
+    level_db_sl: float
+    band: Band
+
+
+@dataclass(frozen=True)
+class Rendition:
+    """A pattern as stimuli of one finger.
+
+    duration [s]; course: of what lasts, ducked around the clicks, None without any; level_db_sl: at
+    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second its course
+    comes and goes, None where that is not most of what changes; clicks: ascending, 60 ms
+    apart; remarks: what was changed or lost on the way, in words.
+    """
+
+    duration: float
+    course: Course | None
+    level_db_sl: float
+    band: Band
+    modulation_hz: float | None
+    clicks: tuple[Click, ...]
+    remarks: tuple[str, ...]
+
+    def smoothed(self) -> "Rendition":
+        """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
+
+        Its modulation stays. It starts from rest and ends at rest, within its duration.
+        """
+        if self.course is None:
+            return self
+        times, shares = np.array(self.course.times), np.array(self.course.shares)
+        texture = np.zeros(len(times))
+        if self.modulation_hz is not None:
+            spectrum = np.fft.rfft(shares)
+            away = np.abs(np.fft.rfftfreq(len(shares), times[1]) - self.modulation_hz)
+            texture = np.fft.irfft(spectrum * (away <= _TEXTURE), len(shares))
+        shares = averaged(shares - texture, times[1], SMOOTHING) + texture
+        shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
+        course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
+        return replace(self, course=course)
+
+
+def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
+    """Levels [dB SL] that a pattern asks for at times [s] (n,), before anything of it is lost.
+
+    level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
+    between them, from which each is set apart.
+    """
+    taps = [each for each in pattern.transients if each.intensity > 0]
+    starts = np.array([each.time for each in taps])
+    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(starts, times))
+    return _with_taps(level, taps, level_db_sl, times)
+
+
+def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> Rendition:
+    """Map a pattern to stimuli of a level [dB SL] at intensity 1, on a table's frequencies [Hz].
+
+    Intensity i is 10 + i (level - 10) dB SL, 0 is silent; sharpness is a frequency in a band of
+    10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
+    energy is; transients are clicks, of those too close together the strongest: the others are left
+    to what lasts.
+    """
+    pattern = _as_tap(pattern)
+    taps = _apart(pattern)
+    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
+    hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
+    clicks = tuple(
+        Click(tap.time, level, _band(frequency, frequencies))
+        for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
+    )
+    starts = np.array([each.time for each in clicks])
+    duration = max(pattern.duration, *((starts + CLICK_DURATION).tolist()), KNOT_STEP)
+    times = np.linspace(0, duration, int(np.ceil(duration / KNOT_STEP - _ROUNDING)) + 1)
+    level = _lasting(pattern, level_db_sl, times)
+    kept = {*taps}
+    close = [each for each in pattern.transients if each.intensity > 0 and each not in kept]
+    level = _with_taps(level, close, level_db_sl, times)
+    shares = 10 ** ((level - level.max(initial=-1e3)) / 20) * _beside(starts, times)
+    remarks = list(pattern.remarks)
+    if close:
+        remarks.append(
+            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * _APART:.0f} ms from "
+            "a stronger one: left to what lasts"
+        )
+    course, band, modulation = None, _band(DULLEST_HZ, frequencies), None
+    if highest := float(shares.max()):
+        course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
+        of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
+        hertz = sharpness_hz(along(pattern.sharpness or of_taps, times))
+        band = _band(_carrier(hertz, shares**2), frequencies)
+        modulation = _modulation(times, shares)
+        remarks += _lost(hertz, shares, band, clicks)
+        level_db_sl = float(level.max() + decibels(highest))
+    return Rendition(duration, course, level_db_sl, band, modulation, clicks, tuple(remarks))
+
+
+def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
+    """Levels [dB SL] of intensities; -inf for 0."""
+    least = min(LEAST_DB_SL, level_db_sl)
+    return np.where(intensity > 0, least + intensity * (level_db_sl - least), -np.inf)
+
+
+def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
+    """Levels [dB SL] of what lasts at times [s]."""
+    return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
+
+
+def _with_taps(
+    level: FloatArray, taps: Sequence[Transient], level_db_sl: float, times: FloatArray
+) -> FloatArray:
+    """Levels [dB SL] at times [s], or those of taps, 40 ms each, where they are higher."""
+    starts = np.array([each.time for each in taps])
+    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
+    first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
+    number = np.repeat(np.arange(len(taps)), last - first)
+    during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
+    np.maximum.at(level, during, levels[number])
+    return level
+
+
+def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
+    """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
+    moments, values = np.array(curve or ((0.0, 0.0),)).T
+    return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
+
+
+def sharpness_hz(sharpness: FloatArray) -> FloatArray:
+    """Frequencies [Hz] of sharpness, 0 to 1."""
+    return DULLEST_HZ + sharpness * (SHARPEST_HZ - DULLEST_HZ)
+
+
+def _band(hertz: float, frequencies: FloatArray) -> Band:
+    """A band about a frequency [Hz] that has enough frequencies of a table."""
+    nearest = frequencies[np.argsort(np.abs(np.log(frequencies / hertz)))[:_MIN_FREQUENCIES]]
+    return (
+        min((1 - _BAND) * hertz, float(nearest.min())),
+        max((1 + _BAND) * hertz, float(nearest.max())),
+    )
+
+
+def _as_tap(pattern: Pattern) -> Pattern:
+    """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
+    moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
+    sounds = np.maximum(values[1:], values[:-1]) > 0
+    length = float(np.diff(moments)[sounds].sum())
+    if pattern.transients or not values.any() or length >= CLICK_DURATION:
+        return pattern
+    start = float(moments[np.flatnonzero(values)[0]])
+    sharpness = float(along(pattern.sharpness, np.array([start]))[0])
+    lost = f"{1000 * length:.0f} ms, less than a plate follows: played as a tap"
+    return replace(
+        pattern,
+        intensity=(),
+        transients=(Transient(start, float(values.max()), sharpness),),
+        remarks=(*pattern.remarks, lost),
+    )
+
+
+def _apart(pattern: Pattern) -> list[Transient]:
+    """The transients that are felt, ascending: the strongest first, those too close left out."""
+    kept, times = list[Transient](), list[float]()
+    for tap in sorted(pattern.transients, key=lambda each: -each.intensity):
+        at = bisect_left(times, tap.time)
+        around = times[max(at - 1, 0) : at + 1]
+        apart = min((abs(tap.time - each) for each in around), default=np.inf)
+        if tap.intensity > 0 and apart >= _APART - _ROUNDING:
+            kept.insert(at, tap)
+            times.insert(at, tap.time)
+    return kept
+
+
+def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
+    """Share that is left of what lasts at times [s] beside clicks from starts [s] on."""
+    bounded = np.concatenate([[-np.inf], starts, [np.inf]])
+    number = np.searchsorted(starts, times, side="right")
+    away = np.minimum(times - bounded[number] - CLICK_DURATION, bounded[number + 1] - times)
+    return np.asarray(np.clip(away / DUCKING, 0, 1))
+
+
+def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
+    """The frequency [Hz] about whose band most of the energy is: its mean there."""
+    tried = np.geomspace(DULLEST_HZ, SHARPEST_HZ, 60)
+    is_near = np.abs(hertz / tried[:, None] - 1) <= _BAND
+    best = is_near[best_of(is_near @ energy)]
+    return float(np.average(hertz[best], weights=energy[best]))
+
+
+def _lost(
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
+) -> Iterator[str]:
+    """What of what lasts is not played as the file has it."""
+    away = (hertz < band[0]) | (hertz > band[1])
+    if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
+        asked = hertz[shares > 0]
+        yield (
+            f"sharpness of {100 * lost:.0f} % of what lasts: {asked.min():.0f} to "
+            f"{asked.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
+            f"{band[1]:.0f} Hz"
+        )
+    if clicks:
+        yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"
+
+
+def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
+    """How often a second [Hz] shares come and go, where most of what changes is that."""
+    hertz = np.fft.rfftfreq(len(shares), times[1])
+    power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
+    is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
+    if power[is_texture].sum() <= power.sum() / 2:
+        return None
+    return float(hertz[is_texture][best_of(power[is_texture])])
+
+
+def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
+    """Values a step [s] apart, averaged by a raised cosine of a width [s] at half its height."""
+    count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
+    kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2
+    return np.convolve(values, kernel / kernel.sum())[count : count + len(values)]

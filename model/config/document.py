@@ -121,32 +121,49 @@ def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
     Raises ConfigError if it cannot be read, or is more than plain data.
     """
     source = str(path)
-    try:
-        with open(path, "rb", opener=regular_file) as stream:
-            content = stream.read(MAX_SIZE + 1)
-    except FileNotFoundError as error:
-        raise _whole(source, "no such file; check its name and folder") from error
-    except IsADirectoryError as error:
-        raise _whole(source, "is a folder; give the file in it") from error
-    except OSError as error:
-        raise _whole(source, f"cannot be read: {error.strerror}; give a YAML file") from error
-    except ValueError as error:
-        raise _whole(repr(source), f"is no file name: {error}") from error
+    content = read_bytes(
+        path, MAX_SIZE, is_for="a configuration has a few lines", give="a YAML file"
+    )
     if content.startswith(_ZIP):
         raise _whole(
             source,
             "is a .npz file, as localization tables are, or another archive; give the YAML file "
             "that it is for, as `era config init` writes them",
         )
-    if len(content) > MAX_SIZE:
-        raise _whole(source, "is larger than 1 MiB; a configuration has a few lines")
+    text = decoded(source, content)
+    return parse_document(source, text, if_empty=if_empty)
+
+
+def read_bytes(path: Path, max_size: int, *, is_for: str, give: str) -> bytes:
+    """Read a regular file that a user names; is_for, give: the remedy if it is none, or larger.
+
+    Raises ConfigError if it cannot be read, or is larger than max_size [bytes].
+    """
+    source = str(path)
     try:
-        text = content.decode("utf-8")
+        with open(path, "rb", opener=regular_file) as stream:
+            content = stream.read(max_size + 1)
+    except FileNotFoundError as error:
+        raise _whole(source, "no such file; check its name and folder") from error
+    except IsADirectoryError as error:
+        raise _whole(source, "is a folder; give the file in it") from error
+    except OSError as error:
+        raise _whole(source, f"cannot be read: {error.strerror}; give {give}") from error
+    except ValueError as error:
+        raise _whole(repr(source), f"is no file name: {error}") from error
+    if len(content) > max_size:
+        raise _whole(source, f"is larger than {max_size >> 20} MiB; {is_for}")
+    return content
+
+
+def decoded(source: str, content: bytes) -> str:
+    """Decode the UTF-8 text of a file; raises ConfigError with the line of what is none."""
+    try:
+        return content.decode("utf-8")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"
         raise ConfigError(source, [ConfigProblem(line, "", message)]) from error
-    return parse_document(source, text, if_empty=if_empty)
 
 
 def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Document:

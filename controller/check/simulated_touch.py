@@ -55,6 +55,14 @@ class SimulatedTouch:
     exposure_m_s2: float = 0.0
 
 
+def loaded_plate(table: LocalizationTable, contacts: Sequence[Position]) -> PlateInTime:
+    """A table's plate in time with fingers on it, if they weigh anything."""
+    if table.fingertip is None:
+        return table.in_time
+    loads = fingertip_loads(table.fingertip, contacts)
+    return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
+
+
 class TouchSimulator:
     """Plays effects as the controller does, along plain ramps, on the plate of a table in time.
 
@@ -97,7 +105,9 @@ class TouchSimulator:
         duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
         end, eras = since + duration, self.table.eras
         bases = ramped_pulse(layer.excitation, eras, ramp=layer.ramp, duration=end)
-        transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
+        transients = Transients(
+            loaded_plate(self.table, [at] if resting is None else [at, resting])
+        )
         felt = self._levels_at(transients, at, bases, length=duration, until=end)
         level = float(felt[round(since * SAMPLE_RATE)])
         resting_level = promised = None
@@ -115,14 +125,6 @@ class TouchSimulator:
             held_back_db=0.0 if answer.stroke_factor < 1 - NEARLY else expected.lowered_db,
             exposure_m_s2=exposures(self.table, answer)[0],
         )
-
-    def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:
-        """The table's plate in time with fingers on it, if they weigh anything."""
-        table = self.table
-        if table.fingertip is None:
-            return table.in_time
-        loads = fingertip_loads(table.fingertip, contacts)
-        return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
 
     def _levels_at(
         self,

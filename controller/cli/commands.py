@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from controller.api.summaries import SUMMARIES
+from controller.cli.content import content_app
 from controller.cli.daemon import (
     DASHBOARD,
     DashboardCommand,
@@ -125,6 +126,7 @@ def report(
 EXIT_STATUS = {**by_hand.EXIT_STATUS, InputError: 2}
 
 app = typer.Typer()
+app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)

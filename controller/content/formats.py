@@ -9,7 +9,9 @@ from pathlib import Path
 from controller.content.ahap import Ahap
 from controller.content.format import MAX_SIZE, ContentFormat, refusal, too_much
 from controller.content.haptic import Haptic
+from controller.content.hjif import Hjif
 from controller.content.pattern import Pattern
+from controller.content.wav import Wav
 from model.config.document import read_bytes
 from model.errors import InputError
 from registry.plugins import PluginRegistry, WrongResultError
@@ -20,7 +22,7 @@ _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     "era_haptics.content_formats",
     ContentFormat,
     error=InputError,
-    own={each.ending: each for each in (Ahap, Haptic)},
+    own={each.ending: each for each in (Ahap, Haptic, Hjif, Wav)},
     called=attrgetter("ending"),
     hint="; one of a package needs it installed, with an entry point in "
     "era_haptics.content_formats",

@@ -33,11 +33,12 @@ CLICK_DURATION, DUCKING = 0.040, 0.030
 SMOOTHING = 0.020
 """Width at half height [s] of the raised cosine over which courses beside others are averaged."""
 
+_APART = 0.060  # s; between the starts of clicks at least, as at different fingers
 _BAND = 0.1  # on each side of a frequency
 _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
 _MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
 _ROUNDING = 1e-9  # of times [s], and of counts of steps
-_DEEP = 0.5  # amplitude of a modulation to its mean that is felt as a texture
+_TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class Rendition:
     """A pattern as stimuli of one finger.
 
     duration [s]; course: of what lasts, ducked around the clicks, None without any; level_db_sl: at
-    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second it comes and
-    goes for most of its duration, which its course has too; clicks: ascending, apart by their
-    duration and the ducking; remarks: what was changed or lost on the way, in words.
+    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second its course
+    comes and goes, None where that is not most of what changes; clicks: ascending, 60 ms
+    apart; remarks: what was changed or lost on the way, in words.
     """
 
     duration: float
@@ -70,12 +71,17 @@ class Rendition:
     def smoothed(self) -> "Rendition":
         """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
 
-        It starts from rest and ends at rest, 20 ms each, within its duration.
+        Its modulation stays. It starts from rest and ends at rest, within its duration.
         """
         if self.course is None:
             return self
-        times = np.array(self.course.times)
-        shares = _averaged(np.array(self.course.shares), times[1], SMOOTHING)
+        times, shares = np.array(self.course.times), np.array(self.course.shares)
+        texture = np.zeros(len(times))
+        if self.modulation_hz is not None:
+            spectrum = np.fft.rfft(shares)
+            away = np.abs(np.fft.rfftfreq(len(shares), times[1]) - self.modulation_hz)
+            texture = np.fft.irfft(spectrum * (away <= _TEXTURE), len(shares))
+        shares = averaged(shares - texture, times[1], SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
         course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
         return replace(self, course=course)
@@ -84,14 +90,16 @@ class Rendition:
 def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] that a pattern asks for at times [s] (n,), before anything of it is lost.
 
-    level_db_sl: of intensity 1; -inf for nothing.
+    level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
+    between them, from which each is set apart.
     """
-    level, taps = _lasting(pattern, level_db_sl, times), pattern.transients
+    taps = [each for each in pattern.transients if each.intensity > 0]
     starts = np.array([each.time for each in taps])
+    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
+    level = _lasting(pattern, level_db_sl, times) + decibels(_beside(starts, times))
     first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
     number = np.repeat(np.arange(len(taps)), last - first)
     during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
-    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     np.maximum.at(level, during, levels[number])
     return level
 
@@ -103,9 +111,10 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
     energy is; transients are clicks, of those too close together the strongest.
     """
+    pattern = _as_tap(pattern)
     taps = _apart(pattern)
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    hertz = _hertz(np.array([each.sharpness for each in taps]))
+    hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
     clicks = tuple(
         Click(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
@@ -118,28 +127,18 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     remarks = list(pattern.remarks)
     if merged := sum(each.intensity > 0 for each in pattern.transients) - len(taps):
         remarks.append(
-            f"{merged} of {merged + len(taps)} taps are left out, as they are less than "
-            f"{1000 * (CLICK_DURATION + DUCKING):.0f} ms from a stronger one"
+            f"{merged} of {merged + len(taps)} taps, less than {1000 * _APART:.0f} ms from a "
+            "stronger one"
         )
-    if not shares.any():
-        return Rendition(
-            duration,
-            None,
-            level_db_sl,
-            _band(DULLEST_HZ, frequencies),
-            None,
-            clicks,
-            tuple(remarks),
-        )
-    highest = float(shares.max())
-    course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
-    hertz = _hertz(_along(pattern.sharpness, times))
-    band = _band(_carrier(hertz, shares**2), frequencies)
-    remarks += _lost(hertz, shares, band, clicks, frequencies)
-    top = float(level.max()) + float(decibels(highest))
-    return Rendition(
-        duration, course, top, band, _modulation(times, shares), clicks, tuple(remarks)
-    )
+    course, band, modulation = None, _band(DULLEST_HZ, frequencies), None
+    if highest := float(shares.max()):
+        course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
+        hertz = sharpness_hz(along(pattern.sharpness, times))
+        band = _band(_carrier(hertz, shares**2), frequencies)
+        modulation = _modulation(times, shares)
+        remarks += _lost(hertz, shares, band, clicks)
+        level_db_sl = float(level.max() + decibels(highest))
+    return Rendition(duration, course, level_db_sl, band, modulation, clicks, tuple(remarks))
 
 
 def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
@@ -150,17 +149,17 @@ def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
 
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] of what lasts at times [s]."""
-    return _level_of(_along(pattern.intensity, times, beyond=0.0), level_db_sl)
+    return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
 
 
-def _along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
+def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
     """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
     moments, values = np.array(curve or ((0.0, 0.0),)).T
     return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
 
 
-def _hertz(sharpness: FloatArray) -> FloatArray:
-    """Frequencies of sharpness [Hz]."""
+def sharpness_hz(sharpness: FloatArray) -> FloatArray:
+    """Frequencies [Hz] of sharpness, 0 to 1."""
     return DULLEST_HZ + sharpness * (SHARPEST_HZ - DULLEST_HZ)
 
 
@@ -173,6 +172,24 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
     )
 
 
+def _as_tap(pattern: Pattern) -> Pattern:
+    """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
+    moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
+    sounds = np.maximum(values[1:], values[:-1]) > 0
+    length = float(np.diff(moments)[sounds].sum())
+    if pattern.transients or not values.any() or length >= CLICK_DURATION:
+        return pattern
+    start = float(moments[np.flatnonzero(values)[0]])
+    sharpness = float(along(pattern.sharpness, np.array([start]))[0])
+    lost = f"{1000 * length:.0f} ms, less than a plate follows: played as a tap"
+    return replace(
+        pattern,
+        intensity=(),
+        transients=(Transient(start, float(values.max()), sharpness),),
+        remarks=(*pattern.remarks, lost),
+    )
+
+
 def _apart(pattern: Pattern) -> list[Transient]:
     """The transients that are felt, ascending: the strongest first, those too close left out."""
     kept, times = list[Transient](), list[float]()
@@ -180,7 +197,7 @@ def _apart(pattern: Pattern) -> list[Transient]:
         at = bisect_left(times, tap.time)
         around = times[max(at - 1, 0) : at + 1]
         apart = min((abs(tap.time - each) for each in around), default=np.inf)
-        if tap.intensity > 0 and apart >= CLICK_DURATION + DUCKING - _ROUNDING:
+        if tap.intensity > 0 and apart >= _APART - _ROUNDING:
             kept.insert(at, tap)
             times.insert(at, tap.time)
     return kept
@@ -203,44 +220,32 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 
 
 def _lost(
-    hertz: FloatArray,
-    shares: FloatArray,
-    band: Band,
-    clicks: Sequence[Click],
-    frequencies: FloatArray,
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
 ) -> Iterator[str]:
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
         asked = hertz[shares > 0]
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts is lost: it is {asked.min():.0f} to "
-            f"{asked.max():.0f} Hz in the file and has one frequency here, of {band[0]:.0f} to "
+            f"sharpness of {100 * lost:.0f} % of what lasts: {asked.min():.0f} to "
+            f"{asked.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
             f"{band[1]:.0f} Hz"
         )
     if clicks:
-        yield f"what lasts pauses {1000 * DUCKING:.0f} ms before and after each of the taps"
+        yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
-    """How often a second [Hz] shares come and go for most of their duration, None if they do not.
-
-    Slow is what is left after an average of 0.1 s, which holds nothing from 10 Hz on.
-    """
-    step = times[1]
-    slow = _averaged(shares, step, 1 / MIN_MODULATION)
-    fast = shares - slow
-    depth = np.sqrt(2 * _averaged(fast**2, step, 1 / MIN_MODULATION))
-    if np.count_nonzero(depth > _DEEP * slow) <= np.count_nonzero(slow > 0) / 2:
-        return None
-    hertz, power = np.fft.rfftfreq(len(fast), step), np.abs(np.fft.rfft(fast)) ** 2
+    """How often a second [Hz] shares come and go, where most of what changes is that."""
+    hertz = np.fft.rfftfreq(len(shares), times[1])
+    power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
     is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
     if power[is_texture].sum() <= power.sum() / 2:
         return None
     return float(hertz[is_texture][best_of(power[is_texture])])
 
 
-def _averaged(values: FloatArray, step: float, width: float) -> FloatArray:
+def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
     """Values a step [s] apart, averaged by a raised cosine of a width [s] at half its height."""
     count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
     kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2

@@ -1,0 +1,207 @@
+"""Check of content on the plate of a table: how much of what it asks for a finger will feel."""
+
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from controller.check.simulated_touch import Position, loaded_plate
+from controller.content.pattern import Pattern
+from controller.content.rendition import (
+    CLICK_DURATION,
+    SMOOTHING,
+    averaged,
+    level_wanted,
+    rendered,
+)
+from model.answer.answer import Answer
+from model.answer.fingers import Finger, Stimulus
+from model.answer.plan import answer
+from model.arrays import FloatArray
+from model.choice import best_of
+from model.drive_modes import DRIVE_MODES
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import decibels, over_threshold
+from model.table.table import LocalizationTable
+from model.transients.base_motion import KNOT_STEP, rise
+from model.transients.from_rest import from_rest
+from model.vibration.excitation import base_amplitudes
+
+TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
+"""What is within so many dB of what is wanted is kept; what is wanted counts within so many dB of
+its highest; a plate may be late by so long [s], the same for all of a file."""
+
+_AFTER = 0.1  # s; followed after the end
+_MIN_RATE, _RATE = 1250.0, 3.5  # Hz; and by the highest frequency that plays
+# Odd numbers of samples whose Fourier transforms are fast.
+_FAST = sorted(3**a * 5**b * 7**c for a, b, c in product(range(13), range(9), range(8)))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One stimulus of a content from a time [s] on, and its answer."""
+
+    start: float
+    stimulus: Stimulus
+    answer: Answer
+
+    @property
+    def frequency(self) -> float | None:
+        """Of its carrier [Hz]; None of several."""
+        return self.answer.layers[0].frequency
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedContent:
+    """Content at a finger as it will be felt.
+
+    duration [s]; parts: what lasts, if anything does, and the taps; lost: what was changed or left
+    out, in words; wanted, given (n,) [dB SL]: levels every `step` [s], root mean squares over
+    20 ms; kept: shares of the time in which they agree, for delays of 0, 1, 2 ... steps.
+    """
+
+    duration: float
+    parts: tuple[Part, ...]
+    lost: tuple[str, ...]
+    step: float
+    wanted: FloatArray
+    given: FloatArray
+    kept: FloatArray
+
+    @property
+    def delay(self) -> float:
+        """By how much the plate is late [s]: with it most is kept."""
+        return self.step * best_of(self.kept)
+
+    @property
+    def kept_share(self) -> float:
+        """Share of the time in which what is felt is within 3 dB of what is wanted, 0 to 1."""
+        return float(self.kept.max())
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `era content check --json` prints it."""
+        every = max(round(KNOT_STEP / self.step), 1)
+        wanted, given = (
+            [round(each, 2) if np.isfinite(each) else None for each in levels[::every].tolist()]
+            for levels in (self.wanted, self.given)
+        )
+        return {
+            "kept_share": self.kept_share,
+            "delay_s": self.delay,
+            "lost": [*self.lost],
+            "level_db_sl": {"wanted": wanted, "given": given, "step_s": every * self.step},
+            "parts": [
+                {
+                    "time_s": each.start,
+                    "duration_s": each.stimulus.duration,
+                    "level_db_sl": each.stimulus.level_db_sl,
+                    "frequency_hz": each.frequency,
+                    "band_hz": [*each.stimulus.band_hz],
+                    "promised_contrast_db": each.answer.fingers[0].promised_contrast_db,
+                }
+                for each in self.parts
+            ],
+            "promised_contrast_db": least_promise(self.parts),
+        }
+
+
+def kept_shares(wanted: FloatArray, given: FloatArray, count: int) -> FloatArray:
+    """Shares of the time in which levels [dB] (n,) agree, for delays of what is given (count,)."""
+    counts = wanted > wanted.max() - RANGE_DB
+    late = [np.roll(given, -each)[counts] - wanted[counts] for each in range(count)]
+    return np.asarray(np.mean(np.abs(late) <= TOLERANCE_DB, axis=1))
+
+
+def least_promise(parts: Sequence[Part]) -> float | None:
+    """The least promised contrast of parts [dB] to what quiet fingers feel; None without these."""
+    found = [each.answer.fingers[0].promised_contrast_db for each in parts]
+    return min((each for each in found if each is not None), default=None)
+
+
+def check_content(
+    pattern: Pattern,
+    table: LocalizationTable,
+    level_db_sl: float,
+    *,
+    at: Position,
+    quiet: Sequence[Position] = (),
+) -> CheckedContent:
+    """Play a pattern at a finger, in time on a table's plate with the fingers' weight.
+
+    level_db_sl: of intensity 1; at, quiet [m]: of the finger, and of others that are to feel
+    nothing, beside which it is smoothed. Raises InputError for fingers off the plate or too close.
+    """
+    rendition = rendered(pattern, level_db_sl, table.frequencies)
+    if quiet:
+        rendition = rendition.smoothed()
+    asked = [
+        (each.time, Stimulus(each.level_db_sl, each.band, CLICK_DURATION))
+        for each in rendition.clicks
+    ]
+    if rendition.course is not None:
+        lasting = Stimulus(rendition.level_db_sl, rendition.band, course=rendition.course)
+        asked.insert(0, (0.0, lasting))
+    answered = partial(answer, table, quiet=quiet, drive_mode=DRIVE_MODES[-1])
+    found = {stimulus: answered([Finger(at, stimulus)]) for _, stimulus in asked}
+    parts = tuple(Part(start, each, found[each]) for start, each in asked)
+    highest = max((each.frequency or 0.0 for each in parts), default=0.0)
+    rate = max(_MIN_RATE, _RATE * highest)
+    samples = (rendition.duration + _AFTER) * rate
+    times = np.arange((_FAST[bisect_left(_FAST, 2 * samples)] + 1) // 2) / rate
+    given = _level_at(table, at, quiet, _signals(parts, table, times), rate)
+    power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
+    wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
+    kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
+    lost = (*rendition.remarks, *_weaker(parts))
+    return CheckedContent(rendition.duration, parts, lost, 1 / rate, wanted, given, kept)
+
+
+def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:
+    """What moves the ERAs, in full strokes, (eras, n)."""
+    signals = np.zeros((len(table.eras), len(times)))
+    strokes = np.array([era.stroke for era in table.eras])
+    for part in parts:
+        (layer, course), tau = (part.answer.layers[0], part.stimulus.course), times - part.start
+        if course is None:
+            during = slice(*np.searchsorted(tau, [0.0, CLICK_DURATION + layer.ramp]))
+            tau = tau[during]
+            shares = rise(tau, layer.ramp) - rise(tau - CLICK_DURATION, layer.ramp)
+        else:
+            during, shares = slice(None), course.at(tau)
+        for frequency, bases in zip(*base_amplitudes(layer.excitation, table.eras), strict=True):
+            tone = shares * np.exp(2j * np.pi * frequency * tau)
+            signals[:, during] += ((bases / strokes)[:, None] * tone).imag
+    return signals
+
+
+def _level_at(
+    table: LocalizationTable,
+    at: Position,
+    quiet: Sequence[Position],
+    signals: FloatArray,
+    rate: float,
+) -> FloatArray:
+    """Level [dB SL] at a finger of what moves the ERAs: rms over 20 ms, mean over the fingertip."""
+    plate = loaded_plate(table, [at, *quiet])
+    shapes = plate.shapes_at(fingertip_points(*at, table.plate))
+    factors = np.ones(len(table.eras), dtype=complex)
+    moved = from_rest(plate, signals, shapes, sample_rate=rate, factors=factors)
+    power = 2 * over_threshold(moved, rate, table.threshold) ** 2
+    over = [averaged(each, 1 / rate, SMOOTHING) for each in power.T]
+    return decibels(fingertip_weights(*at, table.plate) @ np.sqrt(over))
+
+
+def _weaker(parts: Sequence[Part]) -> Iterator[str]:
+    """What is weaker than asked, in words."""
+    for what, some in (
+        ("what lasts", [each for each in parts if each.stimulus.course]),
+        ("taps", [each for each in parts if not each.stimulus.course]),
+    ):
+        lowered = [each.answer.fingers[0].lowered_db for each in some]
+        if count := np.count_nonzero(lowered):
+            who = what if len(some) == 1 else f"{count} of {len(some)} {what}"
+            yield f"{who} up to {max(lowered):.1f} dB weaker: all that the plate allows here"

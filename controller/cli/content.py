@@ -1,0 +1,152 @@
+"""`era content`: what of content that people have will be felt on a plate."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.commands.options import JsonOption, print_report
+from model.config.points import parse_point
+from model.counting import counted
+from model.finger.perception import STRONG_DB_SL
+from model.quantities import percent
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from controller.check.content_check import CheckedContent, Part
+
+content_app = typer.Typer(no_args_is_help=True, help="Check content: AHAP, .haptic, HJIF, WAV.")
+
+FAILED = 1
+
+
+@content_app.command()
+def check(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="A file of content, or the name of one that is known."),
+    ],
+    table_file: Annotated[
+        Path, typer.Option("--table", metavar="TABLE", help="Table file, e.g. T.npz.")
+    ],
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y", help="Position of the finger in metres; default: the middle."),
+    ] = None,
+    quiet: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y",
+            help="Position of a finger that must not feel it, in metres; repeatable.",
+        ),
+    ] = None,
+    level: Annotated[
+        float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
+    ] = STRONG_DB_SL,
+    channel: Annotated[
+        int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
+    ] = None,
+    least: Annotated[
+        float, typer.Option(metavar="SHARE", help="Least share that must be kept.", min=0, max=1)
+    ] = 0.8,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate in time what of a file a finger will feel, alone or beside quiet ones.
+
+    The kept share is that of the time in which the level at the skin is within 3 dB of what the
+    file asks, where that is within 20 dB of its highest: 1 says that all rises, taps and pauses are
+    felt as they were made. Levels are means over 20 ms; taps that are left out are lost, lost
+    sharpness is only mentioned. Exit status 1 if less than --least is kept.
+    """
+    from controller.check.content_check import check_content
+    from controller.content.formats import named_content, read_content
+    from model.commands.options import Stopwatch
+    from model.files.replacing import check_picture_name
+    from model.table.file import load_table
+
+    if picture is not None:
+        check_picture_name(picture)
+    table = load_table(table_file)
+    middle = table.plate.length / 2, table.plate.width / 2
+    place = middle if at is None else parse_point(at, what="--at")
+    others = [parse_point(each, what="--quiet") for each in quiet or []]
+    pattern = read_content(file if file.suffix else named_content(str(file)), channel)
+    with Stopwatch() as watch:
+        checked = check_content(pattern, table, level, at=place, quiet=others)
+    files = []
+    if picture is not None:
+        from controller.check.content_picture import content_figure
+        from model.figures import save_figure
+
+        save_figure(content_figure(pattern, checked), picture)
+        files = [str(picture)]
+    is_kept = checked.kept_share >= least
+    rows = [
+        *_lines(checked),
+        f"{file}: {percent(checked.kept_share)} kept, {'good' if is_kept else 'lost too much'}"
+        f"{'' if is_kept else f', at least {percent(least)} must be'}; "
+        f"{pattern.duration:.2f} s of content in {watch.elapsed:.1f} s",
+        *(f"wrote {name}" for name in files),
+    ]
+    answer = checked.as_json() | {
+        "at_m": [*place],
+        "quiet_m": [[*each] for each in others],
+        "least_share": least,
+        "files": files,
+        "check_time_s": watch.elapsed,
+    }
+    print_report(rows, answer, as_json=as_json)
+    if not is_kept:
+        raise typer.Exit(FAILED)
+
+
+_ROWS = 12
+
+
+def _lines(checked: "CheckedContent") -> Iterator[str]:
+    """Format levels over time, what plays at which frequency and promise, and what is lost."""
+    import numpy as np
+
+    yield "     time [s]   wanted   felt [dB SL]"
+    late = round(checked.delay / checked.step)
+    count = round(checked.duration / checked.step)
+    for some in np.array_split(np.arange(count), min(_ROWS, count)):
+        wanted, felt = checked.wanted[some].max(), checked.given[some + late].max()
+        since, until = checked.step * some[0], checked.step * (some[-1] + 1)
+        yield f"{since:6.2f} {until:6.2f} {_level(wanted)} {_level(felt)}"
+    yield f"felt {1000 * checked.delay:.0f} ms later"
+    lasting = [each for each in checked.parts if each.stimulus.course is not None]
+    taps = [each for each in checked.parts if each.stimulus.course is None]
+    for what, parts in (("what lasts", lasting), (counted(len(taps), "tap"), taps)):
+        if parts:
+            yield f"{what}: {_played(parts)}"
+    for each in checked.lost:
+        yield f"lost: {each}"
+
+
+def _level(db_sl: float) -> str:
+    """Format a level that is felt at all."""
+    return f"{db_sl:8.1f}" if db_sl > -10 else f"{'-':>8}"
+
+
+def _played(parts: "Sequence[Part]") -> str:
+    """Format frequencies, levels, and the least promise."""
+    from controller.check.content_check import least_promise
+
+    tones = [each.frequency for each in parts if each.frequency is not None]
+    levels = [each.answer.fingers[0].level_db_sl for each in parts]
+    promised = least_promise(parts)
+    beside = "" if promised is None else f", promised {promised:.1f} dB above quiet fingers"
+    return f"{_span(tones)} Hz, up to {max(levels):.1f} dB SL{beside}"
+
+
+def _span(values: "Sequence[float]") -> str:
+    """Format one value or the lowest and highest."""
+    low, high = f"{min(values):g}", f"{max(values):g}"
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,141 @@
+"""What of content will be felt, beside the plate in time solved piece by piece."""
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from controller.check.content_check import check_content, kept_shares
+from controller.check.simulated_touch import loaded_plate
+from controller.cli.commands import app
+from controller.content.pattern import Pattern, Transient
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import decibels, over_threshold
+from model.table.build import build_table
+from model.table.file import save_table
+from model.table.table import LocalizationTable
+from model.transients.base_motion import along_lines, raised_cosine
+from model.transients.measures import SAMPLE_RATE, Transients
+from paper_table import smooth_rig
+
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
+AT, QUIET = (0.11, 0.13), (0.21, 0.06)
+SWELL = Pattern(
+    0.4, ((0.0, 0.4), (0.3, 1.0), (0.4, 0.0)), ((0.0, 0.5),), (Transient(0.15, 1.0, 0.2),)
+)
+
+
+@cache
+def table() -> LocalizationTable:
+    """Frequencies 20 Hz apart, which is quick to solve."""
+    return build_table(smooth_rig(), frequencies=np.arange(60.0, 321.0, 20.0), drive_mode="phased")
+
+
+def test_felt_level_is_that_of_the_plate_in_time() -> None:
+    """A swell and a tap in it, also as terms of the bases, each between two knots by itself."""
+    found = check_content(SWELL, table(), 20.0, at=AT)
+    lasting, tap = found.parts
+    bases = []
+    for era in table().eras:
+        swell, click = (each.answer.layers[0].excitation[era.name] for each in found.parts)
+        ramp, omega = tap.answer.layers[0].ramp, 2 * math.pi * click.frequency
+        course = lasting.stimulus.course
+        assert course is not None
+        end = click.phasor * np.exp(0.04j * omega)
+        bases.append(
+            (
+                *along_lines(
+                    0.0,
+                    course.times[1],
+                    2 * math.pi * swell.frequency,
+                    [share * swell.phasor for share in course.shares],
+                ),
+                *raised_cosine(0.15, ramp, omega, 0, click.phasor),
+                *raised_cosine(0.19, ramp, omega, 0, -end),
+            )
+        )
+    transients = Transients(loaded_plate(table(), [AT]))
+    points = fingertip_points(*AT, table().plate)
+    moved = transients.acceleration(tuple(bases), points, duration=0.4)
+    felt = over_threshold(moved, SAMPLE_RATE, table().threshold)
+    for time in (0.06, 0.11, 0.17, 0.3):
+        around = np.arange(-159, 160)
+        window = np.cos(np.pi / 2 * around / 160) ** 2  # 20 ms wide at half its height
+        some = felt[round(time * SAMPLE_RATE) + around]
+        power = 2 * (window[:, None] * some**2).sum(axis=0) / window.sum()
+        expected = decibels(np.sqrt(power) @ fingertip_weights(*AT, table().plate))
+        assert found.given[round(time / found.step)] == pytest.approx(float(expected), abs=0.3)
+
+
+def test_what_lasts_has_its_level_and_taps_theirs() -> None:
+    """20 dB SL for a second, the plate's rise apart; then a tap of 15 dB SL alone."""
+    pattern = Pattern(
+        1.5, ((0.0, 1.0), (1.0, 1.0), (1.0, 0.0)), ((0.0, 0.5),), (Transient(1.3, 0.5, 0.5),)
+    )
+    found = check_content(pattern, table(), 20.0, at=AT)
+    middle = found.given[round(0.2 / found.step) : round(0.9 / found.step)]
+    assert np.median(middle) == pytest.approx(20.0, abs=1.0)
+    assert found.given[round(1.3 / found.step) :].max() == pytest.approx(15.0, abs=2.0)
+    assert found.kept_share > 0.9
+    assert found.delay <= 0.01
+
+
+def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
+    """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
+    wanted = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
+    given = np.roll(wanted + np.where(np.arange(100) < 10, 4.0, 2.0), 3)
+    assert kept_shares(wanted, given, 5)[3] == pytest.approx(0.75)
+    assert kept_shares(wanted, given, 5).argmax() == 3
+
+
+def test_taps_that_are_merged_are_lost() -> None:
+    """Two equal taps 50 ms apart are 90 ms, of which one is 40."""
+    taps = Transient(0.1, 1.0, 0.5), Transient(0.15, 1.0, 0.5)
+    found = check_content(Pattern(0.3, transients=taps), table(), 20.0, at=AT)
+    assert len(found.parts) == 1
+    assert 0.3 < found.kept_share < 0.7
+
+
+def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
+    """The course starts and ends at rest; each part has a promise, the least counts."""
+    found = check_content(SWELL, table(), 20.0, at=AT, quiet=[QUIET])
+    course = found.parts[0].stimulus.course
+    assert course is not None
+    assert course.shares[0] == course.shares[-1] == 0
+    promises = [each.answer.fingers[0].promised_contrast_db for each in found.parts]
+    assert found.as_json()["promised_contrast_db"] == min(each for each in promises if each)
+
+
+def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> None:
+    """Exit status 0 and 1 of the same content, its levels over time, and a picture."""
+    save_table(table(), tmp_path / "table.npz")
+    picture, place = tmp_path / "picture.png", "0.11,0.13"
+    arguments = [
+        "content",
+        "check",
+        "success",
+        "--table",
+        str(tmp_path / "table.npz"),
+        "--at",
+        place,
+    ]
+    result = CliRunner().invoke(app, [*arguments, "-o", str(picture), "--json"])
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found["kept_share"] >= 0.8
+    assert found["level_db_sl"]["step_s"] == pytest.approx(0.005, abs=0.001)
+    assert max(each for each in found["level_db_sl"]["given"] if each) > 15
+    assert [each["time_s"] for each in found["parts"]] == sorted(
+        each["time_s"] for each in found["parts"]
+    )
+    assert found["files"] == [str(picture)]
+    assert picture.stat().st_size > 0
+    result = CliRunner().invoke(app, [*arguments, "--least", "1", "--quiet", "0.21,0.06"])
+    assert result.exit_code == 1
+    assert "lost too much, at least 100 % must be" in result.stdout
+    assert "dB above quiet fingers" in result.stdout
